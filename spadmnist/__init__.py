@@ -1,0 +1,1 @@
+"""spadmnist: what a single-photon camera would have recorded."""

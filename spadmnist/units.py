@@ -1,0 +1,149 @@
+"""Quantities: SI floats inside, `"50 ns"` at the door.
+
+A quantity with a dimension is a number and a unit in one string; a bare number where a unit is needed is an
+error that shows what to write. A dimensionless quantity is bare or in per cent.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from decimal import Decimal, InvalidOperation
+
+# dimension (named by its SI unit) -> (what people call it, unit -> factor to SI, an example to show)
+_DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
+    "s": (
+        "time",
+        {"s": "1", "ms": "1e-3", "us": "1e-6", "µs": "1e-6", "μs": "1e-6", "ns": "1e-9", "ps": "1e-12"},
+        "50 ns",
+    ),
+    "Hz": ("rate", {"Hz": "1", "mHz": "1e-3", "kHz": "1e3", "MHz": "1e6", "GHz": "1e9"}, "100 Hz"),
+    "m": (
+        "length",
+        {"m": "1", "mm": "1e-3", "um": "1e-6", "µm": "1e-6", "μm": "1e-6", "nm": "1e-9"},
+        "555 nm",
+    ),
+    "m^2": (
+        "area",
+        {"m^2": "1", "mm^2": "1e-6", "um^2": "1e-12", "µm^2": "1e-12", "μm^2": "1e-12"},
+        "25 um^2",
+    ),
+    "lux": ("illuminance", {"lux": "1", "mlux": "1e-3", "ulux": "1e-6", "klux": "1e3"}, "5 mlux"),
+    "W/m^2": (
+        "irradiance",
+        {
+            "W/m^2": "1",
+            "mW/m^2": "1e-3",
+            "uW/m^2": "1e-6",
+            "W/cm^2": "1e4",
+            "mW/cm^2": "10",
+            "uW/cm^2": "1e-2",
+            "nW/cm^2": "1e-5",
+            "pW/cm^2": "1e-8",
+        },
+        "120 nW/cm^2",
+    ),
+    "rad": ("angle", {"rad": "1"}, "0.5 rad"),
+    "": ("number without a dimension", {"": "1", "%": "1e-2"}, "0.5 %"),
+}
+
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\S*)\s*")
+
+
+class Quantity(float):
+    """A finite number in SI units that remembers how it was written (`.text`) and its unit (`.unit`)."""
+
+    text: str
+    unit: str
+
+    def __new__(cls, value: float, text: str, unit: str) -> Quantity:
+        self = super().__new__(cls, value)
+        self.text = text
+        self.unit = unit
+        return self
+
+    def __getnewargs__(self) -> tuple[float, str, str]:  # type: ignore[override]
+        return float(self), self.text, self.unit
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def dimension_name(unit: str) -> str:
+    """What people call the dimension whose SI unit is `unit`: `"s"` -> `"time"`."""
+    return _DIMENSIONS[unit][0]
+
+
+def example(unit: str) -> str:
+    """A well-formed quantity of the dimension whose SI unit is `unit`."""
+    return _DIMENSIONS[unit][2]
+
+
+def allowed_units(unit: str) -> str:
+    """The units one may write for the dimension, in a row."""
+    names = [u for u in _DIMENSIONS[unit][1] if u and not u.startswith(("µ", "μ"))]
+    return ", ".join(names)
+
+
+def parse(value: object, unit: str) -> Quantity:
+    """Read a quantity whose SI unit is `unit` (`"s"`, `"Hz"`, `"m"`, `"m^2"`, `"lux"`, `"W/m^2"`, `""`).
+
+    Raises ValueError with a sentence that says what to write.
+    """
+    name, units, sample = _DIMENSIONS[unit]
+    if isinstance(value, Quantity) and value.unit == unit:
+        return value
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+    if isinstance(value, (int, float)):
+        if unit:
+            raise ValueError(
+                f'{value!r} has no unit; a {name} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
+            )
+        text = repr(value)
+    else:
+        text = value.strip()
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+    number, written = match.groups()
+    if written not in units:
+        if not written:
+            raise ValueError(
+                f'{value!r} has no unit; a {name} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
+            )
+        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+    try:
+        # exact decimal arithmetic, so that 1000 mlux and 1 lux are the same double
+        si = float(Decimal(number) * Decimal(units[written]))
+    except (InvalidOperation, OverflowError):
+        si = math.inf
+    if not math.isfinite(si):
+        raise ValueError(f"{value!r} is too large for a {name}")
+    return Quantity(si, text, unit)
+
+
+def _how(unit: str, sample: str) -> str:
+    if not unit:
+        return 'a bare number or per cent, for example 0.005 or "0.5 %"'
+    return f'a number and one of {allowed_units(unit)}, for example "{sample}"'
+
+
+def show(value: float, unit: str, digits: int = 4) -> str:
+    """A value in SI, for people: the unit is scaled so that the number lies between 1 and 1000 where it can.
+
+    >>> show(5e-8, "s")
+    '50 ns'
+    """
+    units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"}
+    if unit == "W/m^2":
+        units = {u: f for u, f in units.items() if u.endswith("/cm^2")}
+    if value == 0 or not math.isfinite(value) or len(units) == 1:
+        base = unit if unit in units else next(iter(units), "")
+        return f"{value:.{digits}g} {base}".strip()
+    by_size = sorted(units.items(), key=lambda item: item[1])
+    best = by_size[0]
+    for name, factor in by_size:
+        if abs(value) / factor >= 1 - 1e-9:
+            best = (name, factor)
+    return f"{value / best[1]:.{digits}g} {best[0]}"
