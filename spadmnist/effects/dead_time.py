@@ -1,0 +1,34 @@
+"""Dead time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import Conditions, Effect, parameter
+
+
+class DeadTime(Effect, stage="dead_time"):
+    """After a detection the pixel is blind while it is quenched and recharged; what comes then is lost.
+
+    Non-paralyzable: a lost event does not prolong the blindness. It acts on TR streams; in frames it acts under
+    `rules: device` alone (physics, Table 2 of the paper).
+    Source: Suonsivu et al., Alg. 1 lines 24-29; typical 1-100 ns (Table 1).
+    """
+
+    duration = parameter(
+        50e-9,
+        "s",
+        "time after a detection during which the pixel is blind",
+        symbol="tau_d",
+        bounds=(0, None),
+        off=0.0,
+        search=(1e-9, 1e-6),
+        per_pixel=True,
+    )
+
+    def blind_time(self) -> np.ndarray:
+        """s: one value, or one per pixel."""
+        return np.asarray(self.duration)
+
+    def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        return rate / (1 + rate * self.blind_time())

@@ -1,0 +1,1038 @@
+"""Where the images come from: MNIST, IDX files, folders, arrays, digits drawn here, uniform light.
+
+Each source is one class, chosen in a config by `scene.images: {source: NAME, ...}`; `load` gives the splits.
+Whatever a file contains, the outcome is the images or an InputError that names the file and what to do:
+nothing is executed or unpickled, and nothing is read beyond what the file itself can hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gzip
+import hashlib
+import math
+import os
+import sys
+import tempfile
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import IO, Annotated, Any, Literal, cast
+
+import numpy as np
+from numpy.lib import format as npy
+from pydantic import BaseModel, ConfigDict, Field
+
+from .errors import InputError
+
+MAX_BYTES = 8 * 2**30  # the images of one source; beyond it a header is taken for damaged or hostile
+_MAX_DEFLATE = 1032  # deflate, the packing of gzip and zip, gains at most this factor
+
+# SHA-256 of the unpacked files: packed copies differ from mirror to mirror
+MNIST_SHA256 = {
+    "train-images-idx3-ubyte": "ba891046e6505d7aadcbbe25680a0738ad16aec93bde7f9b65e87a2fc25776db",
+    "train-labels-idx1-ubyte": "65a50cbbf4e906d70832878ad85ccda5333a97f0f4c3dd2ef09a8a9eef7101c5",
+    "t10k-images-idx3-ubyte": "0fa7898d509279e482958e8ce81c8e77db3f2f8254e26661ceb7762c4d494ce7",
+    "t10k-labels-idx1-ubyte": "ff7bcfd416de33731a308c3f266cc351222c34898ecbeaf847f06e48f7ec33f2",
+}
+MNIST_MIRRORS = (
+    "https://ossci-datasets.s3.amazonaws.com/mnist/",
+    "https://storage.googleapis.com/cvdf-datasets/mnist/",
+)
+_MNIST_MAX_BYTES = 64 * 2**20  # no mirror may send more than this for one file
+
+# Pillow's other formats stay shut: some of them start programs (EPS calls Ghostscript)
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "GIF", "WEBP")
+_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"),
+    *(".pgm", ".ppm", ".pnm", ".pbm", ".gif", ".webp"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The images of one split; the arrays are read-only.
+
+    pixels       (n, rows, columns), or (n, channels, rows, columns) in colour; uint8, uint16 or float32, all
+                 from 0 to `white`; C-contiguous, except that repetitions of one image share its memory
+    labels       (n,) uint8, or None where the source has none
+    white        the grey level that the sensor's reference lux stands for
+    names        the file of each image, relative to the folder, where the source is a folder
+    label_names  the class folder that each label stands for, where the source is a folder with classes
+    ignored      how many files of the folder were left out because they are not images
+    """
+
+    pixels: np.ndarray
+    labels: np.ndarray | None
+    white: float
+    names: tuple[str, ...] | None = None
+    label_names: tuple[str, ...] | None = None
+    ignored: int = 0
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim not in (3, 4) or self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
+            raise ValueError(f"pixels must not be {self.pixels.dtype} of shape {self.pixels.shape}")
+        if self.labels is not None and (
+            self.labels.dtype != np.uint8 or self.labels.shape != self.pixels.shape[:1]
+        ):
+            raise ValueError(f"labels must not be {self.labels.dtype} of shape {self.labels.shape}")
+        for name in ("pixels", "labels"):
+            array = getattr(self, name)
+            if array is not None:
+                view = array.view()
+                view.flags.writeable = False
+                object.__setattr__(self, name, view)
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(rows, columns) of every image."""
+        rows, columns = self.pixels.shape[-2:]
+        return rows, columns
+
+    @cached_property
+    def sha256(self) -> str:
+        """The identity of the images: a digest of dtype, shape, pixels and labels.
+
+        Repetitions that share their memory are hashed once, whatever their number.
+        """
+        pixels = self.pixels[:1] if self.pixels.strides[0] == 0 else self.pixels
+        digest = hashlib.sha256(f"{pixels.dtype.name} {self.pixels.shape}".encode())
+        for image in pixels:
+            digest.update(np.ascontiguousarray(image).data)
+        if self.labels is not None:
+            digest.update(b"labels")
+            digest.update(np.ascontiguousarray(self.labels).data)
+        return digest.hexdigest()
+
+    def head(self, n: int | None) -> Images:
+        """The first `n` images (all where `n` is None), in memory of their own so that the rest can go."""
+        if n is None or n >= len(self):
+            return self
+        pixels = self.pixels[:n]
+        if pixels.strides[0] != 0:
+            pixels = pixels.copy()
+        labels = None if self.labels is None else self.labels[:n].copy()
+        names = None if self.names is None else self.names[:n]
+        return replace(self, pixels=pixels, labels=labels, names=names)
+
+    def describe(self) -> str:
+        """One line for people: `400 images of 28 x 28, uint8, 10 classes`."""
+        shape = " x ".join(str(n) for n in self.pixels.shape[1:])
+        parts = [f"{len(self)} images of {shape}", self.pixels.dtype.name]
+        if self.labels is not None:
+            parts.append(f"{len(np.unique(self.labels))} classes")
+        if self.ignored:
+            parts.append(f"{self.ignored} files that are not images left out")
+        return ", ".join(parts)
+
+
+def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) -> None:
+    """Raise InputError unless all images have the (rows, columns) `shape` of the sensor's layout.
+
+    `place` says where the images were named, for the message.
+    """
+    for split, part in images.items():
+        if part.size == tuple(shape):
+            continue
+        rows, columns = part.size
+        problem = (
+            f"{place}: the {split} images are {rows} x {columns} pixels (rows x columns), "
+            f"but the sensor's layout is {shape[0]} x {shape[1]}; "
+        )
+        if part.pixels.shape[1:3] == tuple(shape):
+            problem += "colour channels come before the rows: store np.moveaxis(images, -1, 1)"
+        else:
+            problem += "set sensor.layout to the size of the images, or give images of the sensor's size"
+        raise InputError(problem)
+
+
+class _Source(BaseModel):
+    """What every source shares. `load` is for callers; each source writes `_read` and `describe`."""
+
+    model_config = ConfigDict(
+        strict=True, extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
+
+    def load(
+        self,
+        shape: tuple[int, int],
+        images_dir: Path | None = None,
+        base: Path = Path("."),
+        limit: int | None = None,
+    ) -> dict[str, Images]:
+        """The splits, "train" first, then "test" where there is one; a single split is "train".
+
+        shape       (rows, columns) of the sensor's layout; only `uniform` makes its images by it
+        images_dir  the folder given on the command line, where image files are looked for
+        base        the folder of the config file, to which relative paths in it refer
+        limit       only the first images of each split
+
+        Raises InputError with the file and what to do.
+        """
+        if limit is not None and limit < 1:
+            raise InputError(f"a limit of {limit} images leaves nothing; give 1 or more")
+        try:
+            if images_dir is not None and not images_dir.is_dir():
+                raise InputError(f"{images_dir}: there is no such folder; correct --images-dir")
+            splits = self._read(shape, images_dir, base, limit)
+        except OSError as error:
+            place = error.filename or self.describe()
+            raise InputError(
+                f"{place}: cannot be opened ({error.strerror or _reason(error)}); "
+                "check the path and its permissions"
+            ) from error
+        except MemoryError as error:
+            raise InputError(
+                f"{self.describe()}: the images do not fit into memory; give fewer or smaller ones"
+            ) from error
+        kinds = [f"{part.pixels.shape[1:]} {part.pixels.dtype}" for part in splits.values()]
+        if len(set(kinds)) > 1:
+            raise InputError(
+                f"{self.describe()}: the train images are {kinds[0]}, the test images {kinds[1]}; "
+                "convert one so that both splits are of one size and kind"
+            )
+        return splits
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        raise NotImplementedError
+
+    def describe(self) -> str:
+        """The source in a few words, without reading anything."""
+        raise NotImplementedError
+
+
+def _reason(error: Exception) -> str:
+    """What another library says is wrong: one line, or only the kind of error where it says too much."""
+    text = " ".join(str(error).split())
+    return text if 0 < len(text) <= 150 else type(error).__name__
+
+
+def _data_dir() -> Path | None:
+    """The folder that SPADMNIST_DATA names, if it is set."""
+    value = os.environ.get("SPADMNIST_DATA")
+    if not value:
+        return None
+    if not Path(value).is_dir():
+        raise InputError(f"SPADMNIST_DATA={value}: there is no such folder; correct the variable or unset it")
+    return Path(value)
+
+
+def _find(path: str, folders: Sequence[Path | None], exists: Callable[[Path], bool]) -> Path:
+    """`path` in the first of the folders that has it; an absolute path stands for itself."""
+    places = list(dict.fromkeys(folder / path for folder in folders if folder is not None))
+    for place in places:
+        if exists(place):
+            return place
+    what = "folder" if exists is Path.is_dir else "file"
+    tried = " and no ".join(str(place) for place in places)
+    raise InputError(
+        f"scene.images: there is no {what} {tried}; "
+        "a relative path refers to --images-dir or, without it, to the folder of the config"
+    )
+
+
+# --- IDX files -------------------------------------------------------------------------------------------
+
+
+def read_idx(path: Path, ndim: int) -> np.ndarray:
+    """The uint8 array of `ndim` dimensions in an IDX file, packed by gzip or not (its content decides).
+
+    Raises InputError for anything but a whole, undamaged file; never reads more than the header declares.
+    """
+    try:
+        with open(path, "rb") as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            stream = gzip.GzipFile(fileobj=file) if packed else file
+            file_bytes = os.fstat(file.fileno()).st_size
+            most = file_bytes * _MAX_DEFLATE if packed else file_bytes
+            return _read_idx(cast(IO[bytes], stream), ndim, path, most)
+    except (gzip.BadGzipFile, zlib.error, EOFError) as error:
+        raise InputError(
+            f"{path}: its gzip data are damaged ({_reason(error)}); download or copy it again"
+        ) from error
+
+
+def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int) -> np.ndarray:
+    """The array in an unpacked stream that cannot hold more than `most` bytes."""
+    magic = bytes([0, 0, 8, ndim])
+    head = stream.read(4 + 4 * ndim)
+    if not head:
+        raise InputError(f"{path}: the file is empty; download or copy it again")
+    if head[:4] != magic:
+        raise InputError(
+            f"{path}: this is {_looks_like(head)}, not an IDX file of unsigned bytes in {ndim} "
+            f"dimension{'s' * (ndim > 1)} (it would begin with {magic.hex(' ')}); name the right file"
+        )
+    if len(head) < 4 + 4 * ndim:
+        raise InputError(f"{path}: the file ends inside its header; download or copy it again")
+    shape = tuple(int.from_bytes(head[i : i + 4], "big") for i in range(4, len(head), 4))
+    declared = f"its header declares {' x '.join(str(n) for n in shape)} bytes"
+    size = math.prod(shape)
+    if size == 0:
+        raise InputError(f"{path}: {declared}, that is nothing; give a file with at least one image")
+    if size > MAX_BYTES:
+        raise InputError(f"{path}: {declared}, more than the {MAX_BYTES} allowed; the file is damaged")
+    if size > most - len(head):
+        raise InputError(f"{path}: {declared}, more than the file can hold; download or copy it again")
+    data = np.empty(size, np.uint8)
+    view, filled = data.data, 0
+    while filled < size:
+        got = stream.readinto(view[filled:])  # type: ignore[attr-defined]
+        if not got:
+            raise InputError(f"{path}: {declared}, but only {filled} follow; download or copy it again")
+        filled += got
+    # reading past the end also makes gzip check its checksum
+    if stream.read(1):
+        raise InputError(f"{path}: {declared}, but more follow; the file is damaged or not what it says")
+    return data.reshape(shape)
+
+
+def _looks_like(head: bytes) -> str:
+    """What a file that begins with `head` seems to be."""
+    known = {
+        b"PK": "a zip archive",
+        b"\x1f\x8b": "a file that gzip packed twice",
+        b"\x89PNG": "a PNG image",
+        b"\xff\xd8": "a JPEG image",
+        b"\x93NUMPY": "a NumPy array",
+        b"\x89HDF": "an HDF5 file",
+        b"%PDF": "a PDF document",
+    }
+    for prefix, name in known.items():
+        if head.startswith(prefix):
+            return name
+    if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
+        return "an HTML page, perhaps a server's error page"
+    if len(head) >= 4 and head[:2] == b"\0\0" and head[2] in (8, 9, 11, 12, 13, 14):
+        return f"an IDX file of another kind (type {head[2]:#04x}, {head[3]} dimensions)"
+    return f"a file that begins with {head[:4].hex(' ')}"
+
+
+def _idx_sha256(array: np.ndarray) -> str:
+    """SHA-256 of the unpacked IDX file that holds the uint8 array: the format leaves no freedom."""
+    header = bytes([0, 0, 8, array.ndim]) + b"".join(n.to_bytes(4, "big") for n in array.shape)
+    digest = hashlib.sha256(header)
+    digest.update(array.data)
+    return digest.hexdigest()
+
+
+def _labelled(
+    images: np.ndarray, labels: np.ndarray | None, white: float, files: tuple[object, object]
+) -> Images:
+    """Images and labels of the two `files` together, if their numbers agree."""
+    if labels is not None and len(labels) != len(images):
+        raise InputError(
+            f"{files[1]}: it has {len(labels)} labels, but {files[0]} has {len(images)} images; "
+            "name two files that belong together"
+        )
+    return Images(images, labels, white)
+
+
+class Idx(_Source):
+    """IDX files as MNIST and its relatives use them, packed by gzip or not.
+
+    Relative paths refer to --images-dir; without it to SPADMNIST_DATA, then to the folder of the config.
+    """
+
+    source: Literal["idx"] = "idx"
+    train_images: str = Field(min_length=1, description="IDX file of images (n, rows, columns), bytes")
+    train_labels: str | None = Field(default=None, min_length=1, description="IDX file of labels (n,), bytes")
+    test_images: str | None = Field(
+        default=None, min_length=1, description="as train_images, for the test split"
+    )
+    test_labels: str | None = Field(
+        default=None, min_length=1, description="as train_labels, for the test split"
+    )
+    transpose: bool = Field(default=False, description="swap rows and columns, as EMNIST's files need")
+
+    def describe(self) -> str:
+        return f"IDX files {self.train_images}" + (f" and {self.test_images}" if self.test_images else "")
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        if self.test_labels and not self.test_images:
+            raise InputError(
+                f"scene.images.test_labels: {self.test_labels} labels nothing; give test_images too"
+            )
+        folders = [images_dir] if images_dir is not None else [_data_dir(), base]
+        splits = {}
+        for split, images_name, labels_name in (
+            ("train", self.train_images, self.train_labels),
+            ("test", self.test_images, self.test_labels),
+        ):
+            if images_name is None:
+                continue
+            images_file = _find(images_name, folders, Path.is_file)
+            labels_file = _find(labels_name, folders, Path.is_file) if labels_name else None
+            images = read_idx(images_file, 3)
+            labels = read_idx(labels_file, 1) if labels_file else None
+            part = _labelled(images, labels, 255.0, (images_file, labels_file)).head(limit)
+            if self.transpose:
+                part = replace(part, pixels=np.ascontiguousarray(part.pixels.swapaxes(1, 2)))
+            splits[split] = part
+        return splits
+
+
+# --- MNIST -----------------------------------------------------------------------------------------------
+
+
+class Mnist(_Source):
+    """MNIST, 60,000 training and 10,000 test images of 28 x 28, byte for byte.
+
+    Looked for in --images-dir or, without it, in SPADMNIST_DATA and in the user's cache, and downloaded into
+    the cache once. Every file's SHA-256 is checked.
+    """
+
+    source: Literal["mnist"] = "mnist"
+
+    def describe(self) -> str:
+        return "MNIST"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        folder = images_dir if images_dir is not None else _data_dir()
+        found = {name: _find_mnist(name, folder) if folder else None for name in MNIST_SHA256}
+        missing = [name for name, path in found.items() if path is None]
+        if images_dir is not None and missing:
+            raise InputError(
+                f"{images_dir}: MNIST's {', '.join(missing)} (or with .gz) are missing; put the files there, "
+                "or leave --images-dir out to have them downloaded"
+            )
+        arrays = [_checked_mnist(path, name) if path else _cached_mnist(name) for name, path in found.items()]
+        train_images, train_labels, test_images, test_labels = arrays
+        return {
+            "train": Images(train_images, train_labels, 255.0).head(limit),
+            "test": Images(test_images, test_labels, 255.0).head(limit),
+        }
+
+
+def _find_mnist(name: str, folder: Path) -> Path | None:
+    """MNIST's file under one of its usual names: packed or not, `.idx3` for `-idx3`, torchvision's folder."""
+    for place in (folder, folder / "MNIST" / "raw"):
+        for stem in (name, name.replace("-idx", ".idx")):
+            for path in (place / stem, place / f"{stem}.gz"):
+                if path.is_file():
+                    return path
+    return None
+
+
+def _checked_mnist(path: Path, name: str) -> np.ndarray:
+    array = read_idx(path, 3 if "images" in name else 1)
+    digest = _idx_sha256(array)
+    if digest != MNIST_SHA256[name]:
+        raise InputError(
+            f"{path}: this is not MNIST's {name}: its unpacked SHA-256 is {digest}, MNIST's is "
+            f"{MNIST_SHA256[name]}; fetch it again, or use {{source: idx, ...}} if other images are meant"
+        )
+    return array
+
+
+def _cached_mnist(name: str) -> np.ndarray:
+    """MNIST's file from the user's cache; downloaded if it is not there, or there but damaged."""
+    import pooch
+
+    path = Path(pooch.os_cache("spadmnist")) / "mnist" / f"{name}.gz"
+    if path.is_file():
+        with contextlib.suppress(InputError):
+            return _checked_mnist(path, name)
+    return _download_mnist(name, path)
+
+
+def _download_mnist(name: str, path: Path) -> np.ndarray:
+    """Fetch the file from the first mirror that sends the right one; only a verified one comes to `path`."""
+    import pooch
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    show = sys.stderr is not None and sys.stderr.isatty()
+    download = pooch.HTTPDownloader(progressbar=show, chunk_size=2**16, timeout=(10, 60))
+    failures = []
+    for mirror in MNIST_MIRRORS:
+        handle, part_name = tempfile.mkstemp(prefix=f"{name}.", suffix=".part", dir=path.parent)
+        part = Path(part_name)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                download(mirror + path.name, _AtMost(file, _MNIST_MAX_BYTES), None)
+            array = _checked_mnist(part, name)
+            os.replace(part, path)
+            return array
+        except InputError:
+            failures.append(f"{mirror}: it sends another file")
+        # the errors of requests are OSErrors, and long where they come from the network
+        except (OSError, ValueError) as error:
+            failures.append(f"{mirror}: {_reason(error)}")
+        finally:
+            part.unlink(missing_ok=True)
+    raise InputError(
+        f"MNIST's {path.name} could not be downloaded from any mirror ({'; '.join(failures)}); go online, "
+        "or fetch MNIST's four files elsewhere and name their folder by --images-dir or SPADMNIST_DATA"
+    )
+
+
+class _AtMost:
+    """A file to write to that refuses to grow beyond `most` bytes, so that no mirror can fill the disk."""
+
+    def __init__(self, file: IO[bytes], most: int):
+        self._file = file
+        self._left = most
+
+    def write(self, data: bytes) -> int:
+        self._left -= len(data)
+        if self._left < 0:
+            raise OSError("it sends far more than the file has")
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
+# --- folders of images -----------------------------------------------------------------------------------
+
+
+class Folder(_Source):
+    """A folder of images, grey or colour, all of one size and one kind.
+
+    With `train` and `test` folders in it these are the splits and all else is left out. Inside a split the
+    first folder is the class; labels count the classes of both splits in alphabetical order. The order of the
+    images is that of their paths. Hidden files and files that are not images by their suffix are left out.
+    Pixel values are taken as they are stored: EXIF orientation and colour profiles are ignored.
+    A relative path refers to --images-dir or, without it, to the folder of the config.
+    """
+
+    source: Literal["folder"] = "folder"
+    path: str = Field(min_length=1, description="the folder")
+    white: float | None = Field(
+        default=None, gt=0, description="the grey level of white; 255, or 65535 for 16 bits"
+    )
+
+    def describe(self) -> str:
+        return f"folder {self.path}"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        root = _find(self.path, [images_dir if images_dir is not None else base], Path.is_dir)
+        names, ignored = _image_files(root)
+        prefixes = {split: f"{split}/" for split in ("train", "test") if (root / split).is_dir()}
+        if list(prefixes) == ["test"]:
+            raise InputError(
+                f"{root}: it has a folder test but no folder train; add train, or set path to {root / 'test'}"
+            )
+        prefixes = prefixes or {"train": ""}
+        files = {split: [name for name in names if name.startswith(p)] for split, p in prefixes.items()}
+        ignored += len(names) - sum(map(len, files.values()))
+        classes = {split: _classes(root, prefixes[split], part) for split, part in files.items()}
+        label_names = sorted({name for part in classes.values() if part for name in part})
+        if len(label_names) > 256:
+            raise InputError(
+                f"{root}: it has {len(label_names)} class folders, at most 256 are allowed; merge some, "
+                "or put all images into one folder to go without labels"
+            )
+        number = {name: i for i, name in enumerate(label_names)}
+        splits = {}
+        for split, part in files.items():
+            if not part:
+                allowed = ", ".join(_SUFFIXES)
+                raise InputError(
+                    f"{root / prefixes[split]}: there is no image in it; put some there ({allowed})"
+                )
+            of_part = classes[split]
+            pixels = _read_folder(root, part[:limit], self.white)
+            splits[split] = Images(
+                pixels,
+                None if of_part is None else np.array([number[c] for c in of_part[:limit]], np.uint8),
+                _white(self.white, pixels.dtype),
+                tuple(part[:limit]),
+                None if of_part is None else tuple(label_names),
+                ignored if split == "train" else 0,
+            )
+        return splits
+
+
+def _white(given: float | None, dtype: np.dtype[Any]) -> float:
+    """The grey level of white: as given, or the largest that an integer type holds, or 1 for floats."""
+    if given is not None:
+        return float(given)
+    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
+
+
+def _image_files(root: Path) -> tuple[list[str], int]:
+    """The image files below `root`, as relative paths in their order, and the number of other files."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    names, others, seen = [], 0, set()
+    for folder, subfolders, files in os.walk(root, onerror=fail, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in seen:
+            raise InputError(f"{folder}: this folder is reached twice, by a link; remove the link")
+        seen.add(real)
+        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+        for name in files:
+            if name.startswith("."):
+                continue
+            path = Path(folder, name)
+            if path.suffix.lower() not in _SUFFIXES:
+                others += 1
+                continue
+            relative = path.relative_to(root).as_posix()
+            if not _is_text(relative):
+                raise InputError(f"{root}: the file name {relative!a} is not valid UTF-8; rename the file")
+            names.append(relative)
+    return sorted(names), others
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _classes(root: Path, prefix: str, names: list[str]) -> list[str] | None:
+    """The class of each file: its first folder after `prefix`. None where no file lies in one."""
+    inner = [PurePosixPath(name.removeprefix(prefix)).parts for name in names]
+    if all(len(parts) == 1 for parts in inner):
+        return None
+    for name, parts in zip(names, inner, strict=True):
+        if len(parts) == 1:
+            raise InputError(
+                f"{root / name}: it lies beside class folders, in none of them; move it into one"
+            )
+    return [parts[0] for parts in inner]
+
+
+def _read_folder(root: Path, names: list[str], white: float | None) -> np.ndarray:
+    """All images, (n, rows, columns) or (n, 3, rows, columns), after checking that they are alike."""
+    first = _decode(root / names[0])
+    if first.nbytes * len(names) > MAX_BYTES:
+        raise InputError(
+            f"{root}: {len(names)} images like {names[0]} take more than the {MAX_BYTES} bytes allowed; "
+            "give fewer (--limit) or smaller ones"
+        )
+    pixels = np.empty((len(names), *first.shape), first.dtype)
+    top = _white(white, first.dtype)
+    for i, name in enumerate(names):
+        image = _decode(root / name) if i else first
+        if (image.shape, image.dtype) != (first.shape, first.dtype):
+            raise InputError(
+                f"{root / name}: it is {_kind(image)}, but {names[0]} is {_kind(first)}; "
+                "all images must be of one size and kind: convert or remove those that differ"
+            )
+        if image.max() > top:
+            raise InputError(
+                f"{root / name}: it has the grey level {image.max()}, but white is {top:g}; raise white or "
+                "correct the image"
+            )
+        pixels[i] = image
+    return pixels
+
+
+def _kind(image: np.ndarray) -> str:
+    rows, columns = image.shape[-2:]
+    kind = "colour" if image.ndim == 3 else "grey"
+    return f"{rows} x {columns} pixels (rows x columns), {8 * image.itemsize}-bit {kind}"
+
+
+def _decode(path: Path) -> np.ndarray:
+    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour."""
+    from PIL import Image, UnidentifiedImageError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        try:
+            with Image.open(path, formats=_FORMATS) as image:
+                image.verify()  # PNG's checksums, which decoding leaves out
+            with Image.open(path, formats=_FORMATS) as image:
+                return _to_pixels(image, path)
+        except InputError:
+            raise
+        except UnidentifiedImageError as error:
+            raise InputError(
+                f"{path}: its content is none of {', '.join(_FORMATS)}; replace or remove it"
+            ) from error
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+            raise InputError(
+                f"{path}: it declares more than the {Image.MAX_IMAGE_PIXELS} pixels allowed; "
+                "make it smaller or remove it"
+            ) from error
+        # damaged files make decoders raise nearly anything: OSError, SyntaxError, struct.error, ...
+        except Exception as error:
+            raise InputError(
+                f"{path}: it cannot be read as an image ({_reason(error)}); replace or remove it"
+            ) from error
+
+
+def _to_pixels(image: Any, path: Path) -> np.ndarray:
+    """The pixels of an open Pillow image, or InputError where they would not be what the file says."""
+    # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
+    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
+        raise InputError(f"{path}: it holds {image.n_frames} images; store each in a file of its own")
+    mode = image.mode
+    # Pillow would quietly drop the lower eight bits
+    deep = not mode.startswith("I") and any(";16" in str(tile) for tile in image.tile)
+    if deep or mode not in ("1", "L", "LA", "I", "I;16", "I;16B", "I;16L", "P", "PA", "RGB", "RGBA"):
+        kind = "more than 8 bits per channel" if deep else f"pixels of the kind {mode}"
+        raise InputError(
+            f"{path}: it has {kind}; convert it to 8-bit RGB or to 8-bit or 16-bit grey, or use source array"
+        )
+    if image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255):
+        raise InputError(f"{path}: parts of it are transparent; put it on a background and store it without")
+    if mode.startswith("I"):
+        pixels = np.asarray(image)
+        if pixels.min() < 0 or pixels.max() > 65535:
+            raise InputError(f"{path}: its grey levels do not fit into 16 bits; scale them to 0 to 65535")
+        return pixels.astype(np.uint16)
+    if mode in ("1", "L", "LA"):
+        return np.asarray(image.convert("L"))
+    return np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
+
+
+# --- arrays ----------------------------------------------------------------------------------------------
+
+# (images, labels) of the train and the test split, as they are called in .npz files
+_NPZ_NAMES = (
+    (("train_images", "train_labels"), ("test_images", "test_labels")),
+    (("x_train", "y_train"), ("x_test", "y_test")),
+    (("images", "labels"),),
+)
+
+
+class Array(_Source):
+    """A NumPy file: `.npy` with images, or `.npz` with images and labels.
+
+    Images are (n, rows, columns) or (n, channels, rows, columns). The names in an `.npz` are train_images,
+    train_labels, test_images, test_labels, or x_train, y_train, x_test, y_test, or images and labels.
+    A relative path refers to --images-dir or, without it, to the folder of the config.
+    """
+
+    source: Literal["array"] = "array"
+    path: str = Field(min_length=1, description=".npy or .npz file")
+    white: float | None = Field(
+        default=None,
+        gt=0,
+        description="the grey level of white; 255 for uint8, 65535 for uint16, 1 for floats",
+    )
+
+    def describe(self) -> str:
+        return f"array {self.path}"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        path = _find(self.path, [images_dir if images_dir is not None else base], Path.is_file)
+        with open(path, "rb") as file:
+            head = file.read(6)
+            file.seek(0)
+            if head == b"\x93NUMPY":
+                images = _read_npy(file, path.stat().st_size, str(path))
+                return {"train": self._split(images, None, limit, (str(path), None))}
+            if head[:2] == b"PK":
+                return self._read_npz(file, path, limit)
+        seems = _looks_like(head) if head else "an empty file"
+        raise InputError(
+            f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez"
+        )
+
+    def _read_npz(self, file: IO[bytes], path: Path, limit: int | None) -> dict[str, Images]:
+        try:
+            archive = zipfile.ZipFile(file)
+        except Exception as error:  # damaged directories make zipfile raise nearly anything
+            raise InputError(
+                f"{path}: the archive is damaged ({_reason(error)}); copy or store it again"
+            ) from error
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        names = next((pairs for pairs in _NPZ_NAMES if pairs[0][0] in members), None)
+        if names is None:
+            allowed = " or ".join(pairs[0][0] for pairs in _NPZ_NAMES)
+            held = ", ".join(sorted(members)[:10]) or "nothing"
+            raise InputError(f"{path}: it holds {held}, but no {allowed}; rename the arrays")
+        wanted = [members[name] for pair in names for name in pair if name in members]
+        if sum(info.file_size for info in wanted) > MAX_BYTES:
+            raise InputError(
+                f"{path}: its arrays declare more than the {MAX_BYTES} bytes allowed; store fewer images"
+            )
+        splits, file_bytes = {}, path.stat().st_size
+        for split, (images_name, labels_name) in zip(("train", "test"), names, strict=False):
+            if images_name not in members:
+                continue
+            places = (f"{path}: {images_name}", f"{path}: {labels_name}")
+            images = _read_member(archive, members[images_name], file_bytes, places[0])
+            labels = None
+            if labels_name in members:
+                labels = _read_member(archive, members[labels_name], file_bytes, places[1])
+            splits[split] = self._split(images, labels, limit, places)
+        return splits
+
+    def _split(
+        self,
+        images: np.ndarray,
+        labels: np.ndarray | None,
+        limit: int | None,
+        places: tuple[str, str | None],
+    ) -> Images:
+        if labels is not None:
+            labels = _to_labels(labels, str(places[1]))
+        pixels, white = _to_images(images, self.white, places[0])
+        return _labelled(pixels, labels, white, places).head(limit)
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:
+    if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InputError(
+            f"{place} is encrypted or packed in an unusual way; store it by np.savez or np.savez_compressed"
+        )
+    if info.file_size > file_bytes * _MAX_DEFLATE:
+        raise InputError(
+            f"{place} declares {info.file_size} bytes, more than the file can hold; store it again"
+        )
+    try:
+        with archive.open(info) as stream:
+            return _read_npy(stream, info.file_size, place)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # as above
+        raise InputError(f"{place} is damaged ({_reason(error)}); copy or store the file again") from error
+
+
+def _read_npy(stream: IO[bytes], size: int, place: str) -> np.ndarray:
+    """The array in a `.npy` stream of `size` bytes; its header is checked against that before it is read."""
+    try:
+        version = npy.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"format version {version[0]}.{version[1]}, which plain numbers never need")
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+    # the header is a Python literal, and NumPy's reader of it raises nearly anything when it is damaged
+    except Exception as error:
+        raise InputError(
+            f"{place}: its header is damaged ({_reason(error)}); store it again by np.save"
+        ) from error
+    if dtype.kind not in "biuf":
+        raise InputError(f"{place}: it holds {dtype}, not plain numbers; store uint8, uint16 or float32")
+    declared, held = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if declared > MAX_BYTES:
+        raise InputError(
+            f"{place}: it declares {declared} bytes, {MAX_BYTES} are allowed; store fewer images"
+        )
+    if declared != held or min(shape, default=0) < 0:
+        raise InputError(
+            f"{place}: it declares {shape} {dtype}, {declared} bytes, but {held} follow; store it again"
+        )
+    stream.seek(0)
+    try:
+        return npy.read_array(stream, allow_pickle=False)
+    except ValueError as error:
+        raise InputError(
+            f"{place}: it ends too early ({_reason(error)}); store it again by np.save"
+        ) from error
+
+
+def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.ndarray, float]:
+    """The array as uint8, uint16 or float32 images, every value checked, and the grey level of white."""
+    if array.ndim not in (3, 4):
+        raise InputError(
+            f"{place}: its shape is {array.shape}; "
+            "store images as (n, rows, columns) or (n, channels, rows, columns)"
+        )
+    if array.size == 0:
+        raise InputError(f"{place}: its shape is {array.shape}, that is nothing; give at least one image")
+    dtype: np.dtype[Any]
+    if array.dtype.kind == "b":
+        array, dtype = np.where(array, np.uint8(255), np.uint8(0)), np.dtype(np.uint8)
+    elif array.dtype.kind == "f":
+        dtype = np.dtype(np.float32)
+    elif array.dtype.kind == "u" and array.itemsize <= 2:
+        dtype = np.dtype(np.uint8 if array.itemsize == 1 else np.uint16)
+    elif white is None:
+        # 0 to 255 as often as not, so guessing white would make such images nearly black
+        raise InputError(
+            f"{place}: it holds {array.dtype}, which leaves white open; set white (255 or 65535)"
+        )
+    else:
+        dtype = np.dtype(np.uint8 if white <= 255 else np.uint16)
+    top = _white(white, dtype)
+    allowed = min(top, 65535.0) if dtype.kind == "u" else top
+    # a NaN makes both comparisons false
+    if not (array.min() >= 0 and array.max() <= allowed):
+        for i, image in enumerate(array):
+            wrong = image[~((image >= 0) & (image <= allowed))]
+            if wrong.size:
+                raise InputError(
+                    f"{place}: image {i} (counted from 0) has the value {wrong[0]}, allowed is 0 to "
+                    f"{allowed:g}; correct it, or set white to the grey level of white"
+                )
+    return np.ascontiguousarray(array, dtype), top
+
+
+def _to_labels(array: np.ndarray, place: str) -> np.ndarray:
+    """Labels (n,) or (n, 1) of any integer type as (n,) uint8."""
+    if array.ndim == 2 and array.shape[1] == 1:
+        array = array[:, 0]
+    if array.ndim != 1 or array.dtype.kind not in "biu":
+        raise InputError(
+            f"{place}: it is {array.dtype} {array.shape}; labels are one integer per image, (n,)"
+        )
+    if array.size and not (array.min() >= 0 and array.max() <= 255):
+        wrong = array[(array < 0) | (array > 255)][0]
+        raise InputError(f"{place}: it has the label {wrong}; labels are 0 to 255: number the classes from 0")
+    return array.astype(np.uint8)
+
+
+# --- digits drawn here -----------------------------------------------------------------------------------
+
+
+class Digits(_Source):
+    """Handwritten-looking digits, white on black as in MNIST, drawn here: they need no download.
+
+    Labels run 0, 1, ... 9, 0, ... Each image depends on the seed, the split and its index alone.
+    """
+
+    source: Literal["digits"] = "digits"
+    train: int = Field(default=400, ge=1, le=1_000_000, description="number of training images")
+    test: int = Field(default=100, ge=0, le=1_000_000, description="number of test images; 0: no test split")
+    rows: int = Field(default=28, ge=8, le=4096, description="rows of pixels")
+    columns: int = Field(default=28, ge=8, le=4096, description="columns of pixels")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="another seed, other handwriting")
+
+    def describe(self) -> str:
+        return f"{self.train} + {self.test} digits drawn from seed {self.seed}"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        splits = {}
+        for stream, (split, number) in enumerate((("train", self.train), ("test", self.test))):
+            number = min(number, limit or number)
+            if not number:
+                continue
+            if number * self.rows * self.columns > MAX_BYTES:
+                raise InputError(
+                    f"scene.images: {number} digits of {self.rows} x {self.columns} pixels take more than "
+                    f"the {MAX_BYTES} bytes allowed; ask for fewer or smaller ones"
+                )
+            pixels = np.empty((number, self.rows, self.columns), np.uint8)
+            for i in range(number):
+                pixels[i] = draw_digit(i % 10, (self.seed, stream, i), self.rows, self.columns)
+            splits[split] = Images(pixels, (np.arange(number) % 10).astype(np.uint8), 255.0)
+        return splits
+
+
+def _arc(x: float, y: float, rx: float, ry: float, start: float, stop: float) -> list[tuple[float, float]]:
+    """Points on an ellipse; angles in degrees, clockwise from the right (y points down)."""
+    steps = math.ceil(abs(stop - start) / 22)
+    angles = [math.radians(start + (stop - start) * i / steps) for i in range(steps + 1)]
+    return [(x + rx * math.cos(a), y + ry * math.sin(a)) for a in angles]
+
+
+@functools.cache
+def _glyphs() -> tuple[tuple[np.ndarray, ...], ...]:
+    """For each digit the ways to write it, each (segments, 2 ends, x and y) in a box of about 1 x 1."""
+    ways: list[list[list[list[tuple[float, float]]]]] = [
+        [[_arc(0.5, 0.5, 0.36, 0.5, -100, 260)]],
+        [
+            [[(0.5, 0.0), (0.5, 1.0)]],
+            [[(0.27, 0.24), (0.5, 0.0), (0.5, 1.0)]],
+        ],
+        [[[*_arc(0.5, 0.28, 0.34, 0.28, 195, 395), (0.5, 0.7), (0.13, 1.0), (0.9, 1.0)]]],
+        [[[*_arc(0.46, 0.25, 0.32, 0.25, 205, 445), *_arc(0.46, 0.74, 0.37, 0.26, -85, 150)]]],
+        [
+            [[(0.66, 1.0), (0.66, 0.0), (0.1, 0.66), (0.92, 0.66)]],
+            [[(0.2, 0.03), (0.13, 0.52), (0.8, 0.5)], [(0.8, 0.0), (0.72, 1.0)]],
+        ],
+        [[[(0.84, 0.0), (0.3, 0.0), (0.22, 0.44), *_arc(0.46, 0.68, 0.36, 0.32, -125, 145)]]],
+        [[[(0.68, 0.0), (0.42, 0.2), (0.24, 0.45), *_arc(0.48, 0.71, 0.31, 0.29, 180, 535)]]],
+        [
+            [[(0.12, 0.02), (0.86, 0.0), (0.6, 0.45), (0.42, 1.0)]],
+            [[(0.12, 0.02), (0.86, 0.0), (0.6, 0.45), (0.42, 1.0)], [(0.34, 0.52), (0.82, 0.5)]],
+        ],
+        [[_arc(0.5, 0.25, 0.29, 0.25, 90, 450), _arc(0.5, 0.75, 0.34, 0.25, -90, 270)]],
+        [[[*_arc(0.48, 0.29, 0.31, 0.29, 0, -360), (0.76, 0.6), (0.66, 1.0)]]],
+    ]
+    return tuple(
+        tuple(np.array([ends for stroke in strokes for ends in pairwise(stroke)]) for strokes in digit)
+        for digit in ways
+    )
+
+
+def draw_digit(digit: int, key: Sequence[int], rows: int, columns: int) -> np.ndarray:
+    """One digit in a hand that `key` decides: (rows, columns) uint8, white (255) on black.
+
+    As in MNIST it is fitted into a centred box of 20/28 of the image.
+    """
+    # raw bits: their stream never changes with NumPy's version, that of its distributions may
+    raw = np.random.Philox(np.random.SeedSequence(tuple(key))).random_raw(16)
+    u = iter((raw / 2.0**63 - 1.0).tolist())  # from -1 to 1
+    ways = _glyphs()[digit]
+    segments = ways[int((next(u) + 1) / 2 * len(ways)) % len(ways)]
+    x, y = segments[..., 0] - 0.5, segments[..., 1] - 0.5
+
+    # an unsteady hand: a slow wave along each axis; then width, slant and turn
+    x, y = (
+        x + 0.05 * next(u) * np.sin(5 * y + 3 * next(u)) + 0.04 * next(u) * np.sin(4 * x + 3 * next(u)),
+        y + 0.05 * next(u) * np.sin(5 * x + 3 * next(u)) + 0.03 * next(u) * np.sin(4 * y + 3 * next(u)),
+    )
+    x = x * (0.86 + 0.16 * next(u)) - y * (0.12 + 0.22 * next(u))
+    turn = 0.14 * next(u)
+    x, y = x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)
+
+    unit = min(rows, columns) / 28
+    radius = unit * (1.15 + 0.4 * next(u))
+    box = 20 * unit - 2 * radius
+    scale = box / max(np.ptp(x), np.ptp(y))
+    x = (x - (x.min() + x.max()) / 2) * scale + (columns - 1) / 2 + 0.8 * unit * next(u)
+    y = (y - (y.min() + y.max()) / 2) * scale + (rows - 1) / 2 + 0.8 * unit * next(u)
+
+    column, row = np.arange(columns), np.arange(rows)[:, None]
+    nearest = np.full((rows, columns), np.inf)
+    for (x0, x1), (y0, y1) in zip(x.tolist(), y.tolist(), strict=True):
+        dx, dy = x1 - x0, y1 - y0
+        along = ((column - x0) * dx + (row - y0) * dy) / (dx * dx + dy * dy)
+        along = np.minimum(np.maximum(along, 0.0), 1.0)
+        nearest = np.minimum(nearest, (column - x0 - along * dx) ** 2 + (row - y0 - along * dy) ** 2)
+    ink = (radius - np.sqrt(nearest)) / unit / 1.3 + 0.5  # an edge as soft as MNIST's
+    return np.rint(255 * np.clip(ink, 0.0, 1.0)).astype(np.uint8)
+
+
+# --- uniform light ---------------------------------------------------------------------------------------
+
+
+class Uniform(_Source):
+    """Uniform images of the sensor's own size, repetitions of one: for flat and dark recordings."""
+
+    source: Literal["uniform"] = "uniform"
+    repetitions: int = Field(default=10, ge=1, le=2**31 - 1, description="number of images")
+    grey: int = Field(
+        default=255, ge=0, le=255, description="grey level; 255, white, is the scene's full light"
+    )
+
+    def describe(self) -> str:
+        return f"{self.repetitions} uniform images of grey {self.grey}"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        number = min(self.repetitions, limit or self.repetitions)
+        image = np.full((1, *shape), self.grey, np.uint8)
+        return {"train": Images(np.broadcast_to(image, (number, *shape)), None, 255.0)}
+
+
+ImageSource = Annotated[
+    Mnist | Idx | Folder | Array | Digits | Uniform,
+    Field(discriminator="source"),
+]

@@ -1,0 +1,783 @@
+"""Numba kernels on ragged rows: the counter-based random numbers and the loops over events.
+
+Every kernel is plain IEEE arithmetic without fused or reordered operations (`fastmath` is off) and with its own
+logarithm, so that the bytes do not depend on the width of the SIMD unit or on the machine's mathematical library.
+
+A *row* is one pixel of one image. `offsets` has one entry more than there are rows; the events of row `r` are
+`times[offsets[r]:offsets[r + 1]]`, ascending. Times are seconds since the start of the exposure.
+
+The per-image functions (leading underscore) are shared: the staged line calls them stage by stage over a batch of
+images, `paper_line` calls them image by image so that everything stays in the processor's cache. Both therefore
+give the same events, bit for bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+
+# `error_model="numpy"` drops the check for division by zero, which would keep LLVM from vectorising.
+_jit = njit(cache=True, error_model="numpy", nogil=True)
+_inline = njit(cache=True, error_model="numpy", nogil=True, inline="always")
+
+
+@intrinsic
+def _bits(typingctx: Any, x: Any) -> Any:
+    """The 64 bits of a double."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(types.uint64))
+
+    return types.uint64(types.float64), codegen
+
+
+@intrinsic
+def _double(typingctx: Any, x: Any) -> Any:
+    """The double that has these 64 bits."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(types.float64))
+
+    return types.float64(types.uint64), codegen
+
+
+# --- random numbers ---------------------------------------------------------------------------------------------
+# Philox4x32-10 (Salmon, Moraes, Dror, Shaw, SC 2011): a block of 128 random bits is a function of a 64-bit key and a
+# 128-bit counter. Here the counter is (block, image low, image high, stream word); see streams.py for the keys.
+
+BATCH = 128  # exponentials that are made at a time: long enough to fill the SIMD unit, short enough for a dim image
+
+_M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+_MASK = np.uint64(0xFFFFFFFF)
+_32 = np.uint64(32)
+_12 = np.uint64(12)
+_20 = np.uint64(20)
+_ONE_BITS = np.uint64(0x3FF0000000000000)
+_SQRT_HALF_SHIFT = np.uint64(0x3FF0000000000000 - 0x3FE6A09E00000000)
+_SQRT_HALF_BITS = np.uint64(0x3FE6A09E00000000)
+_MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
+_MAGIC_BITS = np.uint64(0x4330000000000000)  # 2^52: adding it leaves an integer in the low bits of the mantissa
+_MAGIC = 4503599627370496.0
+
+
+@_inline
+def _philox(block, image, key0, key1, word):  # type: ignore[no-untyped-def]
+    """Two 64-bit random words for the counter (block, image, word) under the key."""
+    c0 = np.uint64(block) & _MASK
+    c1 = np.uint64(image) & _MASK
+    c2 = np.uint64(image) >> _32
+    c3 = np.uint64(word)
+    k0 = np.uint64(key0)
+    k1 = np.uint64(key1)
+    for _ in range(10):
+        p0 = _M0 * c0
+        p1 = _M1 * c2
+        c0, c1, c2, c3 = (p1 >> _32) ^ c1 ^ k0, p1 & _MASK, (p0 >> _32) ^ c3 ^ k1, p0 & _MASK
+        k0 = (k0 + _W0) & _MASK
+        k1 = (k1 + _W1) & _MASK
+    return (c0 << _32) | c1, (c2 << _32) | c3
+
+
+@_inline
+def _log(x):  # type: ignore[no-untyped-def]
+    """Natural logarithm of a positive, normal double; error below 1 ulp (the algorithm of fdlibm's e_log.c).
+
+    The integer exponent becomes a double by way of 2^52, since SIMD units before AVX-512 cannot convert it.
+    """
+    ix = _bits(x) + _SQRT_HALF_SHIFT
+    k = _double((ix >> np.uint64(52)) | _MAGIC_BITS) - (_MAGIC + 1023.0)
+    f = _double((ix & _MANTISSA) + _SQRT_HALF_BITS) - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    w = z * z
+    t1 = w * (3.999999999940941908e-01 + w * (2.222219843214978396e-01 + w * 1.531383769920937332e-01))
+    t2 = z * (
+        6.666666666666735130e-01
+        + w * (2.857142874366239149e-01 + w * (1.818357216161805012e-01 + w * 1.479819860511658591e-01))
+    )
+    r = t2 + t1
+    half_square = 0.5 * f * f
+    return k * 6.93147180369123816490e-01 - (
+        (half_square - (s * (half_square + r) + k * 1.90821492927058770002e-10)) - f
+    )
+
+
+@_inline
+def _exponential(word):  # type: ignore[no-untyped-def]
+    """A standard exponential from 64 random bits: -log of an odd multiple of 2^-53, so never 0 and never infinite."""
+    u = _double((word >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
+    return -_log(u)
+
+
+@_jit
+def _exponentials(block, image, key0, key1, word, out):  # type: ignore[no-untyped-def]
+    """Fill `out[:BATCH]` with the exponentials of the blocks from `block` on; `out[BATCH]` becomes +inf, a stop."""
+    half = BATCH // 2
+    for i in range(half):
+        a, b = _philox(np.uint64(block) + np.uint64(i), image, key0, key1, word)
+        out[i] = _exponential(a)
+        out[half + i] = _exponential(b)
+    out[BATCH] = np.inf
+
+
+@_jit
+def exponentials(count, image, key):  # type: ignore[no-untyped-def]
+    """The first `count` standard exponentials of a stream (float64), as the arrivals of an image use them."""
+    out = np.empty(count)
+    buffer = np.empty(BATCH + 1)
+    block = 0
+    for start in range(0, count, BATCH):
+        _exponentials(block, image, key[0], key[1], key[2], buffer)
+        stop = min(count, start + BATCH)
+        out[start:stop] = buffer[: stop - start]
+        block += BATCH // 2
+    return out
+
+
+@_jit
+def logarithm(x):  # type: ignore[no-untyped-def]
+    """Natural logarithm of an array of positive doubles: the same bits on every machine."""
+    out = np.empty(x.size)
+    for i in range(x.size):
+        out[i] = _log(x[i])
+    return out
+
+
+# --- arrivals and afterpulses -------------------------------------------------------------------------------------
+
+
+@_inline
+def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, delays, found):  # type: ignore[no-untyped-def]
+    """Which of a row's `count` events have a child.
+
+    Each has one with probability 1 - exp(-hazard), independently. Instead of a draw for each event, a unit-rate
+    Poisson process runs along the row and on into the next ones; `left` is the distance to its next point. This is
+    exact: an event is hit where a point falls into its stretch of length `hazard`, and the process starts afresh
+    behind it. Block k of the stream gives the k-th distance and the k-th child's delay (in units of its mean).
+
+    Fills `parents` (indices within the row) and `delays` from `found` on. Returns (left, block, found).
+    """
+    first = 0
+    _, delay = _philox(block, image, key0, key1, word)
+    while first < count:
+        stretch = (count - first) * hazard
+        if left >= stretch:
+            left -= stretch
+            break
+        index = min(first + int(left / hazard), count - 1)
+        parents[found] = index
+        delays[found] = _exponential(delay)
+        found += 1
+        first = index + 1
+        block += 1
+        distance, delay = _philox(block, image, key0, key1, word)
+        left = _exponential(distance)
+    return left, block, found
+
+
+@_jit
+def _candidates(
+    rates, exposure, image, key, hazards, lifetime, dead_times, child_key, times, offsets, buffer, parents, delays
+):  # type: ignore[no-untyped-def]
+    """Draw one image: a Poisson process in every pixel, with its afterpulses among them.
+
+    One unit-rate Poisson process runs along the image, pixel after pixel, each pixel being `rate * exposure` long:
+    one exponential an event and none for an empty pixel. The distance is counted from each pixel's own start, so
+    that no precision is lost in a large image.
+
+    Afterpulses (paper, Alg. 1, lines 14-18): each event has one with probability 1 - exp(-hazard), at dead time +
+    lifetime * Exp(1) after it; what would fall at or after the exposure's end does not exist.
+
+    Fills `times` and `offsets[:pixels + 1]`; `parents` and `delays` are room for one row's children. Returns the
+    number of events, or -1 where they do not fit: the caller makes room and draws the image again, which gives the
+    same events, since a draw is a function of its place alone.
+    """
+    last_moment = np.nextafter(exposure, 0.0)
+    room = np.int64(times.size) - BATCH - 1
+    child_room = np.int64(parents.size)
+    block = np.uint64(0)
+    _exponentials(block, image, key[0], key[1], key[2], buffer)
+    position = buffer[0]
+    draw = np.uint64(1)
+    child_block = np.uint64(0)
+    a, _ = _philox(child_block, image, child_key[0], child_key[1], child_key[2])
+    left = _exponential(a)
+    k = np.uint64(0)
+    offsets[0] = 0
+    for pixel in range(np.uint64(rates.size)):
+        rate = rates[pixel]
+        length = rate * exposure
+        if position < length:
+            start = k
+            period = 1.0 / rate
+            before = position
+            while True:
+                while position < length:
+                    # rounding must not push an event to the very end, which does not belong to the exposure
+                    times[k] = min(position * period, last_moment)
+                    k += np.uint64(1)
+                    before = position
+                    position += buffer[draw]
+                    draw += np.uint64(1)
+                if position != np.inf:
+                    break
+                # the stop behind the buffer: draw on. Between two stops at most BATCH events are written
+                if np.int64(k) > room:
+                    return -1
+                block += np.uint64(BATCH // 2)
+                _exponentials(block, image, key[0], key[1], key[2], buffer)
+                position = before + buffer[0]
+                draw = np.uint64(1)
+            hazard = hazards[pixel]
+            if hazard > 0.0:
+                count = np.int64(k - start)
+                stretch = count * hazard
+                if left >= stretch:
+                    left -= stretch
+                else:
+                    if count > child_room or np.int64(k) + count > room:
+                        return -1
+                    left, child_block, found = _row_parents(
+                        count, hazard, left, child_block, image, child_key[0], child_key[1], child_key[2], parents, delays, 0
+                    )
+                    # the children stand apart until all are known, for their parents' places must stay
+                    for child in range(found):
+                        parent = start + np.uint64(parents[child])
+                        delays[child] = times[parent] + (dead_times[pixel] + lifetime * delays[child])
+                    for child in range(found):
+                        time = delays[child]
+                        if time < exposure:
+                            place = start + np.uint64(parents[child]) + np.uint64(1)
+                            while place < k and times[place] <= time:
+                                place += np.uint64(1)
+                            for later in range(k - place):
+                                times[k - later] = times[k - later - np.uint64(1)]
+                            times[place] = time
+                            k += np.uint64(1)
+        position -= length
+        offsets[pixel + np.uint64(1)] = k
+    return np.int64(k)
+
+
+@_jit
+def _expected(rates, exposure):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for p in range(rates.size):
+        total += rates[p]
+    return total * exposure
+
+
+@_inline
+def _room(expected):  # type: ignore[no-untyped-def]
+    """Entries that nearly always suffice for so many expected events (what does not fit is drawn again)."""
+    return int(1.02 * expected + 8.0 * np.sqrt(expected)) + 2 * BATCH + 64
+
+
+@_jit
+def arrivals(rates, exposure, images, key):  # type: ignore[no-untyped-def]
+    """A Poisson process in every row.
+
+    rates: (images, pixels) 1/s; images: (images,) uint64, the numbers that key the draws; key: (3,) uint64.
+    Returns (times (events,) s, offsets (images * pixels + 1,) int64).
+    """
+    n, pixels = rates.shape
+    times = np.empty(_room(_expected(rates.ravel(), exposure)))
+    offsets = np.zeros(n * pixels + 1, np.int64)
+    image_offsets = np.zeros(pixels + 1, np.int64)
+    image_times = np.empty(1024)
+    buffer = np.empty(BATCH + 1)
+    none = np.zeros(pixels)
+    parents = np.empty(1, np.int64)
+    delays = np.empty(1)
+    used = 0
+    for i in range(n):
+        count = -1
+        room = _room(_expected(rates[i], exposure))
+        while count < 0:
+            if image_times.size < room:
+                image_times = np.empty(room)
+            count = _candidates(
+                rates[i], exposure, images[i], key, none, 0.0, none, key, image_times, image_offsets, buffer, parents, delays
+            )
+            room *= 2
+        times = _grown(times, used, used + count)
+        times[used : used + count] = image_times[:count]
+        for p in range(pixels):
+            offsets[i * pixels + p + 1] = used + image_offsets[p + 1]
+        used += count
+    return times[:used].copy(), offsets
+
+
+@_jit
+def _grown(array, used, needed):  # type: ignore[no-untyped-def]
+    """`array`, or a larger copy of its first `used` entries where `needed` do not fit."""
+    if needed <= array.size:
+        return array
+    larger = np.empty(max(needed, 2 * array.size), array.dtype)
+    larger[:used] = array[:used]
+    return larger
+
+
+@_jit
+def children(offsets, hazards, images, key):  # type: ignore[no-untyped-def]
+    """Which events have a child: each one with probability 1 - exp(-hazard of its pixel).
+
+    offsets: (images * pixels + 1,); hazards: (pixels,). Returns (parent (children,) int64, index of the event;
+    delay (children,) in units of its mean), in the order of the parents.
+    """
+    pixels = hazards.size
+    parents = np.empty(256, np.int64)
+    delays = np.empty(256)
+    found = 0
+    for i in range(images.size):
+        block = np.uint64(0)
+        a, _ = _philox(block, images[i], key[0], key[1], key[2])
+        left = _exponential(a)
+        for p in range(pixels):
+            row = i * pixels + p
+            count = offsets[row + 1] - offsets[row]
+            stretch = count * hazards[p]
+            if hazards[p] > 0.0 and count > 0:
+                if left >= stretch:
+                    left -= stretch
+                    continue
+                parents = _grown(parents, found, found + count)
+                delays = _grown(delays, found, found + count)
+                before = found
+                left, block, found = _row_parents(
+                    count, hazards[p], left, block, images[i], key[0], key[1], key[2], parents, delays, found
+                )
+                for child in range(before, found):
+                    parents[child] += offsets[row]
+    return parents[:found].copy(), delays[:found].copy()
+
+
+@_jit
+def uniforms(offsets, pixels, images, key):  # type: ignore[no-untyped-def]
+    """A number from (0, 1) for each event, drawn image by image. Returns (events,) float64."""
+    out = np.empty(offsets[-1])
+    for i in range(images.size):
+        start = offsets[i * pixels]
+        for j in range(offsets[(i + 1) * pixels] - start):
+            a, _ = _philox(np.uint64(j), images[i], key[0], key[1], key[2])
+            out[start + j] = _double((a >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
+    return out
+
+
+@_jit
+def row_totals(values, offsets):  # type: ignore[no-untyped-def]
+    """Sum of each row's entries, as float64; exact for integers up to 2^53."""
+    out = np.zeros(offsets.size - 1)
+    for row in range(offsets.size - 1):
+        total = np.uint64(0)
+        for i in range(offsets[row], offsets[row + 1]):
+            total += np.uint64(values[i])
+        out[row] = total
+    return out
+
+
+@_jit
+def merge(times, offsets, extra, extra_rows):  # type: ignore[no-untyped-def]
+    """Sort further events into their rows.
+
+    extra: (m,) s, any order; extra_rows: (m,) int64, ascending. Returns (times, offsets, origin): `origin` says
+    where each event came from, i for `times[i]` and len(times) + j for `extra[j]`.
+    """
+    total = times.size + extra.size
+    merged = np.empty(total)
+    origin = np.empty(total, np.int64)
+    new_offsets = np.empty_like(offsets)
+    new_offsets[0] = 0
+    k = 0
+    j = 0
+    for row in range(offsets.size - 1):
+        start = k
+        for i in range(offsets[row], offsets[row + 1]):
+            merged[k] = times[i]
+            origin[k] = i
+            k += 1
+        while j < extra.size and extra_rows[j] == row:
+            place = k
+            while place > start and merged[place - 1] > extra[j]:
+                merged[place] = merged[place - 1]
+                origin[place] = origin[place - 1]
+                place -= 1
+            merged[place] = extra[j]
+            origin[place] = times.size + j
+            k += 1
+            j += 1
+        new_offsets[row + 1] = k
+    return merged, new_offsets, origin
+
+
+# --- the pixel's memory -------------------------------------------------------------------------------------------
+
+
+@_inline
+def _record(times, start, stop, dead_time, out, used):  # type: ignore[no-untyped-def]
+    """Copy the events of a row that are more than the dead time after the last one copied (paper, lines 24-29)."""
+    last = -np.inf
+    for i in range(np.uint64(start), np.uint64(stop)):
+        time = times[i]
+        if time - last > dead_time:
+            out[used] = time
+            used += np.uint64(1)
+            last = time
+    return used
+
+
+@_jit
+def non_paralyzable(times, offsets, dead_times):  # type: ignore[no-untyped-def]
+    """Remove what a non-paralyzable dead time hides. dead_times: (pixels,) s. Returns the kept indices (int64)."""
+    pixels = dead_times.size
+    kept = np.empty(times.size, np.int64)
+    k = 0
+    for row in range(offsets.size - 1):
+        dead_time = dead_times[row % pixels]
+        last = -np.inf
+        for i in range(offsets[row], offsets[row + 1]):
+            if times[i] - last > dead_time:
+                kept[k] = i
+                k += 1
+                last = times[i]
+    return kept[:k].copy()
+
+
+@_jit
+def take(offsets, kept):  # type: ignore[no-untyped-def]
+    """The offsets of the rows when only the events `kept` (ascending indices) remain."""
+    new = np.zeros_like(offsets)
+    k = 0
+    for row in range(offsets.size - 1):
+        while k < kept.size and kept[k] < offsets[row + 1]:
+            k += 1
+        new[row + 1] = k
+    return new
+
+
+@_jit
+def avalanches(times, pixel, parent, order, dead_times, frame_period, frame_time):  # type: ignore[no-untyped-def]
+    """What fires under `rules: device`: one pass in time order.
+
+    An event fires if its parent fired (parent -1: it has none) and its pixel is not blind. With `frame_period` = 0
+    the pixel is blind for its dead time after it fires; otherwise it fires at most once a frame, live again at the
+    next one, and nothing fires between frames.
+
+    times, pixel, parent: (events,) of one group of pixels; pixel indexes `dead_times`; order: indices by ascending
+    time. Returns (events,) bool.
+    """
+    fired = np.zeros(times.size, np.bool_)
+    last = np.full(dead_times.size, -np.inf)
+    for k in range(order.size):
+        i = order[k]
+        if parent[i] >= 0 and not fired[parent[i]]:
+            continue
+        time = times[i]
+        p = pixel[i]
+        if frame_period > 0.0:
+            frame, since = _frame_of(time, frame_period)
+            if frame != last[p] and since < frame_time:
+                fired[i] = True
+                last[p] = frame
+        elif time - last[p] > dead_times[p]:
+            fired[i] = True
+            last[p] = time
+    return fired
+
+
+# --- clocks and frames --------------------------------------------------------------------------------------------
+
+
+@_inline
+def _nearest(x):  # type: ignore[no-untyped-def]
+    """The integer nearest to 0 <= x < 2^52, as uint64 (ties to even)."""
+    return _bits(x + _MAGIC) & _MANTISSA
+
+
+@_inline
+def _frame_of(time, frame_period):  # type: ignore[no-untyped-def]
+    """(frame, seconds since its start) of a moment; the number of the frame is a double."""
+    frame = np.floor(time / frame_period)
+    since = time - frame * frame_period
+    if since < 0.0:
+        since = 0.0
+    return frame, since
+
+
+@_jit
+def nearest_ticks(times, tick, out):  # type: ignore[no-untyped-def]
+    """Round to the nearest multiple of the tick (paper, lines 30-32). `out` is unsigned and of the size of `times`."""
+    for i in range(times.size):
+        out[i] = _nearest(times[i] / tick)
+
+
+@_inline
+def _row_frames(frame, first, start, stop, bits, row, out, used):  # type: ignore[no-untyped-def]
+    """One row's frames from the frame number (from 1 on; 0: in none) and the stamp of each of its events.
+
+    Sets the row's bits (most significant first) and appends the first stamp of each frame that has an event.
+    Without a branch on 'is it the first of its frame', which is a coin toss at bright light: what is not the first
+    is overwritten by the next. Returns (sum of the appended stamps, used).
+    """
+    waited = first[start] - first[start]  # zero of the stamps' own type: the sum of integer ticks is exact
+    last = np.uint64(0)
+    word = np.uint64(0)
+    word_number = np.uint64(0)
+    for i in range(np.uint64(start), np.uint64(stop)):
+        stamp = first[i]
+        f = max(np.uint64(frame[i]), last)
+        out[used] = stamp
+        number = (f + np.uint64(63)) >> np.uint64(6)
+        if number != word_number:
+            _flush(word, word_number, bits, row)
+            word = np.uint64(0)
+            word_number = number
+        word |= np.uint64(1) << ((np.uint64(0) - f) & np.uint64(63))
+        new = f != last
+        waited += stamp if new else stamp - stamp
+        used += np.uint64(new)
+        last = f
+    _flush(word, word_number, bits, row)
+    return waited, used
+
+
+@_inline
+def _flush(word, number, bits, row):  # type: ignore[no-untyped-def]
+    """Write 64 frames' bits, the `number`-th such word from 1 on (0: there is none yet)."""
+    if number > 0:
+        base = np.uint64(8) * (number - np.uint64(1))
+        for byte in range(min(np.uint64(8), np.uint64(bits.shape[1]) - base)):
+            bits[row, base + byte] = np.uint8(word >> (np.uint64(56) - np.uint64(8) * byte))
+
+
+@_jit
+def frame_readout(times, offsets, frames, frame_time, frame_period, tick, none, out):  # type: ignore[no-untyped-def]
+    """Bin events into frames: bits, and the first stamp of every frame that has an event.
+
+    `tick` > 0: stamps are integers (the nearest tick, at most `none` - 1); `tick` = 0: seconds. `out` gives their
+    type and has room for one more than there are events.
+    Returns (bits (rows, ceil(frames / 8)) uint8, offsets of the stamps (rows + 1,), ones (rows,) int32,
+    waited (rows,) s: the sum over all frames of the first stamp, or of the frame time where there is none).
+    """
+    rows = offsets.size - 1
+    bits = np.zeros((rows, (frames + 7) // 8), np.uint8)
+    first_offsets = np.zeros(rows + 1, np.int64)
+    ones = np.zeros(rows, np.int32)
+    waited = np.empty(rows)
+    longest = 1
+    for row in range(rows):
+        longest = max(longest, offsets[row + 1] - offsets[row])
+    frame = np.empty(longest, np.uint32)
+    first = np.empty(longest, out.dtype)
+    used = np.uint64(0)
+    for row in range(rows):
+        start = offsets[row]
+        count = offsets[row + 1] - start
+        waited[row] = frames * frame_time
+        if count:
+            before = used
+            _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first)
+            w, used = _row_frames(frame, first, 0, count, bits, row, out, used)
+            ones[row] = used - before
+            waited[row] = _waited(w, ones[row], frames, frame_time, tick)
+        first_offsets[row + 1] = used
+    return bits, first_offsets, ones, waited
+
+
+@_inline
+def _waited(stamps, ones, frames, frame_time, tick):  # type: ignore[no-untyped-def]
+    if tick > 0.0:
+        return stamps * tick + (frames - ones) * frame_time
+    return stamps + (frames - ones) * frame_time
+
+
+@_jit
+def _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first):  # type: ignore[no-untyped-def]
+    """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on."""
+    last_frame = np.float64(frames)
+    if tick > 0.0:
+        most = np.float64(none - 1)
+        for i in range(np.uint64(count)):
+            f, since = _frame_of(times[np.uint64(start) + i], frame_period)
+            # the very last moment may round up to a frame that does not exist
+            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            first[i] = _nearest(min(since / tick, most))
+    else:
+        for i in range(np.uint64(count)):
+            f, since = _frame_of(times[np.uint64(start) + i], frame_period)
+            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            first[i] = since
+
+
+# --- the paper's line, image by image -----------------------------------------------------------------------------
+
+
+@_jit
+def paper_line(
+    rates,
+    exposure,
+    images,
+    key,
+    hazards,
+    lifetime,
+    child_key,
+    dead_times,
+    tick,
+    frames,
+    frame_time,
+    frame_period,
+    none,
+    want_tr,
+    want_frames,
+    ticks,
+    firsts,
+):  # type: ignore[no-untyped-def]
+    """Detection to readout under `rules: paper`, for a sensor with nothing but afterpulsing, dead time and a TDC.
+
+    The same per-image functions as the staged line, run one image at a time in buffers that stay in the cache.
+    `ticks` and `firsts` are empty arrays that give the types of the stamps.
+
+    Returns (ticks, offsets, counts (rows,) int32, span (rows,) s from the first to the last stamp,
+    bits, firsts, first offsets, ones, waited): as `non_paralyzable` + `nearest_ticks` and `frame_readout` give them.
+    """
+    n, pixels = rates.shape
+    rows = n * pixels
+    offsets = np.zeros(rows + 1, np.int64)
+    first_offsets = np.zeros(rows + 1, np.int64)
+    counts = np.zeros(rows, np.int32)
+    span = np.zeros(rows)
+    ones = np.zeros(rows if want_frames else 0, np.int32)
+    waited = np.empty(rows if want_frames else 0)
+    bits = np.zeros((rows if want_frames else 0, (frames + 7) // 8), np.uint8)
+
+    image_offsets = np.empty(pixels + 1, np.int64)
+    buffer = np.empty(BATCH + 1)
+    times = np.empty(1)
+    recorded = np.empty(1)
+    frame = np.empty(1, np.uint32)
+    first = np.empty(1, firsts.dtype)
+    parents = np.empty(1, np.int64)
+    delays = np.empty(1)
+    used = 0
+    first_used = np.uint64(0)
+    everything = _room(_expected(rates.ravel(), exposure))
+    if want_tr:
+        ticks = np.empty(everything, ticks.dtype)
+    if want_frames:
+        firsts = np.empty(everything, firsts.dtype)
+    for i in range(n):
+        total = -1
+        room = _room(_expected(rates[i], exposure))
+        while total < 0:
+            if times.size < room:
+                times = np.empty(room)
+                recorded = np.empty(room)
+                frame = np.empty(room, np.uint32)
+                first = np.empty(room, firsts.dtype)
+                parents = np.empty(room, np.int64)
+                delays = np.empty(room)
+            total = _candidates(
+                rates[i], exposure, images[i], key, hazards, lifetime, dead_times, child_key, times, image_offsets, buffer, parents, delays
+            )
+            room *= 2
+        if want_tr:
+            ticks = _grown(ticks, used, used + total)
+            _image_tr(times, image_offsets, dead_times, tick, recorded, ticks, used, i * pixels, offsets, counts, span)
+            used = offsets[(i + 1) * pixels]
+        if want_frames:
+            firsts = _grown(firsts, np.int64(first_used), np.int64(first_used) + total + 1)
+            _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
+            first_used = _image_frames(
+                frame, first, image_offsets, i * pixels, frames, frame_time, tick, bits, firsts, first_used, first_offsets, ones, waited
+            )
+    return ticks[:used], offsets, counts, span, bits, firsts[: np.int64(first_used)], first_offsets, ones, waited
+
+
+@_jit
+def _image_tr(times, image_offsets, dead_times, tick, recorded, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
+    """The TR readout of one image: dead time, then the stamps, appended to `ticks` from `used` on."""
+    k = np.uint64(0)
+    for p in range(np.uint64(dead_times.size)):
+        row = np.uint64(first_row) + p
+        before = k
+        k = _record(times, image_offsets[p], image_offsets[p + np.uint64(1)], dead_times[p], recorded, k)
+        counts[row] = k - before
+        offsets[row + np.uint64(1)] = np.uint64(used) + k
+    for j in range(k):
+        ticks[np.uint64(used) + j] = _nearest(recorded[j] / tick)
+    for p in range(np.uint64(dead_times.size)):
+        row = np.uint64(first_row) + p
+        if counts[row] > 1:
+            span[row] = (ticks[offsets[row + np.uint64(1)] - 1] - ticks[offsets[row]]) * tick
+
+
+@_jit
+def _image_frames(
+    frame, first, image_offsets, first_row, frames, frame_time, tick, bits, firsts, used, first_offsets, ones, waited
+):  # type: ignore[no-untyped-def]
+    """The frames of one image, its stamps appended to `firsts` from `used` on."""
+    empty = frames * frame_time
+    used = np.uint64(used)
+    start = image_offsets[0]
+    for p in range(np.uint64(image_offsets.size - 1)):
+        row = np.uint64(first_row) + p
+        stop = image_offsets[p + np.uint64(1)]
+        if stop > start:
+            before = used
+            w, used = _row_frames(frame, first, start, stop, bits, row, firsts, used)
+            ones[row] = used - before
+            waited[row] = _waited(w, np.int64(used - before), frames, frame_time, tick)
+            start = stop
+        else:
+            waited[row] = empty
+        first_offsets[row + np.uint64(1)] = used
+    return used
+
+
+@_jit
+def spans(times, offsets):  # type: ignore[no-untyped-def]
+    """(counts (rows,) int32, last minus first entry of each row (rows,) float64; 0 where there are fewer than two)."""
+    rows = offsets.size - 1
+    counts = np.zeros(rows, np.int32)
+    span = np.zeros(rows)
+    for row in range(rows):
+        n = offsets[row + 1] - offsets[row]
+        counts[row] = n
+        if n > 1:
+            span[row] = times[offsets[row + 1] - 1] - times[offsets[row]]
+    return counts, span
+
+
+# --- ragged columns on disk ---------------------------------------------------------------------------------------
+
+
+@_jit
+def row_differences(values, offsets):  # type: ignore[no-untyped-def]
+    """Each entry minus the one before it in its row; the first of a row as it is. The same type."""
+    out = np.empty_like(values)
+    for row in range(offsets.size - 1):
+        start = offsets[row]
+        stop = offsets[row + 1]
+        if stop > start:
+            out[start] = values[start]
+            for i in range(start + 1, stop):
+                out[i] = values[i] - values[i - 1]
+    return out
+
+
+@_jit
+def row_sums(differences, offsets):  # type: ignore[no-untyped-def]
+    """The inverse of `row_differences`."""
+    out = np.empty_like(differences)
+    for row in range(offsets.size - 1):
+        start = offsets[row]
+        stop = offsets[row + 1]
+        if stop > start:
+            out[start] = differences[start]
+            for i in range(start + 1, stop):
+                out[i] = out[i - 1] + differences[i]
+    return out

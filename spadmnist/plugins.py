@@ -1,0 +1,451 @@
+"""Plug-ins: a class in a file that declares its own parameters. Putting the file there is the registration.
+
+`Plugin` is the base of effects (`spadmnist.effects.Effect`) and of reconstruction methods
+(`spadmnist.reconstruct.Method`). A subclass of one of those is known by its name in snake case as soon as its file
+has been imported: by `discover` (the package's own folders and the entry points of group `spadmnist.plugins`) or by
+`load_file` (`--plugin FILE.py`). There is no list of them anywhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import inspect
+import pkgutil
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from . import units
+from .errors import EffectError, InputError, did_you_mean
+
+FOLDERS = ("spadmnist.effects",)
+ENTRY_POINTS = "spadmnist.plugins"
+
+
+# --- parameters ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What an effect says of one of its parameters. Numbers are SI; `unit` is that of `spadmnist.units`."""
+
+    default: Any
+    unit: str
+    about: str
+    symbol: str = ""
+    bounds: tuple[float | None, float | None] = (None, None)
+    open_bounds: bool = False  # the bounds themselves are not allowed
+    off: float | bool | None = None
+    search: tuple[float, float] | None = None
+    per_pixel: bool = False
+    by_wavelength: bool = False
+    required: bool = False
+    name: str = ""
+
+    def allowed(self) -> str:
+        """`"between 0 and 1"`, for people."""
+        low, high = self.bounds
+        edge = "more than" if self.open_bounds else "at least"
+        if low is not None and high is not None:
+            return f"between {units.show(low, self.unit)} and {units.show(high, self.unit)}"
+        if low is not None:
+            return f"{edge} {units.show(low, self.unit)}"
+        if high is not None:
+            return f"at most {units.show(high, self.unit)}"
+        return "any number"
+
+    def check(self, value: float) -> None:
+        """Raises ValueError where a value lies outside the bounds."""
+        low, high = self.bounds
+        outside = (low is not None and (value < low or (self.open_bounds and value == low))) or (
+            high is not None and (value > high or (self.open_bounds and value == high))
+        )
+        if outside or not np.isfinite(value):
+            raise ValueError(f"{units.show(value, self.unit)} is not possible; {self.name} is {self.allowed()}")
+
+
+def parameter(
+    default: Any,
+    unit: str,
+    about: str,
+    *,
+    symbol: str = "",
+    bounds: tuple[float | None, float | None] = (None, None),
+    open_bounds: bool = False,
+    off: float | bool | None = None,
+    search: tuple[float, float] | None = None,
+    per_pixel: bool = False,
+    by_wavelength: bool = False,
+    required: bool = False,
+) -> Any:
+    """Declare a parameter in the body of a plug-in's class.
+
+    unit: an SI unit of `spadmnist.units` (`"s"`, `"Hz"`, `""`, ...) or `"bool"`; default, bounds, off, search: SI.
+    off: the value at which the effect vanishes. bounds: what is possible. search: where a fit looks.
+    per_pixel: it may be a map from a file or a distribution; by_wavelength: it may be a table over the wavelength.
+    """
+    return Parameter(
+        default, unit, about, symbol, bounds, open_bounds, off, search, per_pixel, by_wavelength, required
+    )
+
+
+# --- values as a config gives them --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ByWavelength:
+    """A table over the wavelength (m), interpolated linearly between its entries."""
+
+    wavelengths: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def at(self, wavelength: float) -> float:
+        """Raises InputError outside the table."""
+        if not self.wavelengths[0] <= wavelength <= self.wavelengths[-1]:
+            raise InputError(
+                f"the wavelength {units.show(wavelength, 'm')} lies outside the table, which goes from "
+                f"{units.show(self.wavelengths[0], 'm')} to {units.show(self.wavelengths[-1], 'm')}; "
+                "add an entry for it to the table"
+            )
+        return float(np.interp(wavelength, self.wavelengths, self.values))
+
+
+@dataclass(frozen=True)
+class MapFile:
+    """One value per pixel from a `.npy` file, (rows, columns) or (pixels,)."""
+
+    path: Path
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Drawn once for a chip: `normal` (mean, sigma), `lognormal` (median, sigma), or a `mixture` of shares."""
+
+    kind: str
+    numbers: tuple[float, ...] = ()
+    parts: tuple[tuple[float, Distribution], ...] = ()
+
+    def draw(self, rng: np.random.Generator, pixels: int) -> np.ndarray:
+        """(pixels,) values in SI."""
+        if self.kind == "normal":
+            return rng.normal(self.numbers[0], self.numbers[1], pixels)
+        if self.kind == "lognormal":
+            return self.numbers[0] * np.exp(self.numbers[1] * rng.standard_normal(pixels))
+        which = np.searchsorted(np.cumsum([share for share, _ in self.parts]), rng.random(pixels), side="right")
+        drawn = np.stack([part.draw(rng, pixels) for _, part in self.parts])
+        return drawn[np.minimum(which, len(self.parts) - 1), np.arange(pixels)]
+
+
+_DISTRIBUTIONS = {"normal": ("mean", "sigma"), "lognormal": ("median", "sigma")}
+
+Problem = Callable[[tuple[Any, ...], str], None]  # (path below the value, sentence)
+
+
+def read_value(declared: Parameter, raw: Any, base: Path, problem: Problem) -> Any:
+    """Turn a config's value into a float, bool, `ByWavelength`, `MapFile` or `Distribution`.
+
+    base: the folder of the config file. Every mistake goes to `problem`; then None is returned.
+    """
+    if declared.unit == "bool":
+        if isinstance(raw, bool):
+            return raw
+        problem((), f"{raw!r} is not a switch; write true or false")
+        return None
+    if isinstance(raw, Mapping):
+        return _read_mapping(declared, raw, base, problem)
+    return _read_number(declared, raw, (), problem)
+
+
+def _read_number(declared: Parameter, raw: Any, path: tuple[Any, ...], problem: Problem) -> float | None:
+    try:
+        value = units.parse(raw, declared.unit)
+        declared.check(value)
+    except ValueError as error:
+        problem(path, str(error))
+        return None
+    return float(value)
+
+
+def _read_mapping(declared: Parameter, raw: Mapping[Any, Any], base: Path, problem: Problem) -> Any:
+    keys = set(raw)
+    if keys == {"file"}:
+        if not declared.per_pixel:
+            problem((), f"{declared.name} is one number for the whole array; a map is not allowed here")
+            return None
+        if not isinstance(raw["file"], str):
+            problem(("file",), f"{raw['file']!r} is not a file name")
+            return None
+        return MapFile((base / raw["file"]).resolve())
+    if keys & {"normal", "lognormal", "mixture"}:
+        if not declared.per_pixel:
+            problem((), f"{declared.name} is one number for the whole array; a distribution is not allowed here")
+            return None
+        return _read_distribution(declared, raw, (), problem)
+    if declared.by_wavelength:
+        return _read_table(declared, raw, problem)
+    forms = ["one value"]
+    if declared.per_pixel:
+        forms += ["{file: map.npy}", "{normal: {mean, sigma}}", "{lognormal: {median, sigma}}", "{mixture: [...]}"]
+    problem((), f"{dict(raw)!r} is none of the forms that {declared.name} takes: {', '.join(forms)}")
+    return None
+
+
+def _read_table(declared: Parameter, raw: Mapping[Any, Any], problem: Problem) -> ByWavelength | None:
+    entries = []
+    good = bool(raw)
+    if not raw:
+        problem((), "the table is empty; write for example {500 nm: 0.42, 700 nm: 0.16}")
+    for key, value in raw.items():
+        try:
+            wavelength = units.parse(key, "m")
+        except ValueError as error:
+            problem((key,), f"{error} (a table goes over the wavelength)")
+            good = False
+            continue
+        number = _read_number(declared, value, (key,), problem)
+        good = good and number is not None
+        entries.append((float(wavelength), number or 0.0))
+    entries.sort()
+    if good and len({w for w, _ in entries}) < len(entries):
+        problem((), "a wavelength stands in the table twice")
+        good = False
+    return ByWavelength(tuple(w for w, _ in entries), tuple(v for _, v in entries)) if good else None
+
+
+def _read_distribution(
+    declared: Parameter, raw: Any, path: tuple[Any, ...], problem: Problem
+) -> Distribution | None:
+    kinds = [k for k in raw if k in (*_DISTRIBUTIONS, "mixture")] if isinstance(raw, Mapping) else []
+    extra = [k for k in raw if k not in (*kinds, "share")] if isinstance(raw, Mapping) else []
+    if len(kinds) != 1 or extra:
+        problem(path, f"{raw!r} is not a distribution; write one of normal, lognormal, mixture")
+        return None
+    kind = kinds[0]
+    body = raw[kind]
+    if kind == "mixture":
+        return _read_mixture(declared, body, (*path, kind), problem)
+    names = _DISTRIBUTIONS[kind]
+    if not isinstance(body, Mapping) or set(body) != set(names):
+        problem((*path, kind), f"{body!r} does not give {' and '.join(names)}, which {kind} needs")
+        return None
+    centre = _read_number(declared, body[names[0]], (*path, kind, names[0]), problem)
+    width = Parameter(0.0, "" if kind == "lognormal" else declared.unit, "", bounds=(0, None), name="sigma")
+    sigma = _read_number(width, body["sigma"], (*path, kind, "sigma"), problem)
+    return None if centre is None or sigma is None else Distribution(kind, (centre, sigma))
+
+
+def _read_mixture(declared: Parameter, body: Any, path: tuple[Any, ...], problem: Problem) -> Distribution | None:
+    if not isinstance(body, list) or not body:
+        problem(path, "a mixture is a list of distributions, each with its share")
+        return None
+    share_of = Parameter(0.0, "", "", bounds=(0, 1), name="share")
+    parts = []
+    for i, item in enumerate(body):
+        if not isinstance(item, Mapping) or "share" not in item:
+            problem((*path, i), "each part of a mixture needs a share, for example {share: 0.03, normal: {...}}")
+            return None
+        share = _read_number(share_of, item["share"], (*path, i, "share"), problem)
+        part = _read_distribution(declared, item, (*path, i), problem)
+        if share is None or part is None:
+            return None
+        parts.append((share, part))
+    total = sum(share for share, _ in parts)
+    if abs(total - 1) > 1e-9:
+        problem(path, f"the shares add up to {total:g}, not to 1")
+        return None
+    return Distribution("mixture", (), tuple(parts))
+
+
+def settle(declared: Parameter, value: Any, pixels: int, key: str) -> Any:
+    """The value an effect computes with: a float, a bool, a `ByWavelength`, or (pixels,) float64.
+
+    key: what a distribution is drawn from (chip seed, effect and parameter in one string). Drawn values outside
+    the bounds are set to the bound. Raises InputError where a map is unreadable, of another shape or out of bounds.
+    """
+    if isinstance(value, Distribution):
+        digest = hashlib.sha256(key.encode()).digest()
+        rng = np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
+        low, high = declared.bounds
+        return np.clip(value.draw(rng, pixels), low, high)
+    if isinstance(value, MapFile):
+        return _read_map(declared, value.path, pixels)
+    return value
+
+
+def _read_map(declared: Parameter, path: Path, pixels: int) -> np.ndarray:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read as a .npy map ({error}); write one with numpy.save") from None
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.size != pixels:
+        shape = getattr(values, "shape", None)
+        raise InputError(
+            f"{path}: the map has shape {shape} and type {getattr(values, 'dtype', None)}, "
+            f"but {declared.name} needs one number for each of the {pixels} pixels"
+        )
+    flat = values.astype(np.float64).ravel()
+    for index in np.flatnonzero(~np.isfinite(flat))[:1]:
+        raise InputError(f"{path}: entry {index} of the map is {flat[index]}; every pixel needs a finite number")
+    for index in (int(flat.argmin()), int(flat.argmax())):
+        try:
+            declared.check(float(flat[index]))
+        except ValueError as error:
+            raise InputError(f"{path}: entry {index} of the map: {error}") from None
+    return flat
+
+
+# --- plug-ins -----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Registry:
+    """The classes of one kind, by name."""
+
+    kind: str
+    classes: dict[str, type[Plugin]] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[str]:
+        discover()
+        return iter(sorted(self.classes))
+
+    def find(self, name: str) -> type[Any]:
+        """Raises KeyError with a sentence where there is none of that name."""
+        discover()
+        if name not in self.classes:
+            raise KeyError(
+                f"{name} is not {'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}."
+                f"{did_you_mean(name, self.classes)} (spadmnist {self.kind}s lists all)"
+            )
+        return self.classes[name]
+
+    def add(self, cls: type[Plugin]) -> None:
+        known = self.classes.get(cls.name)
+        if known is not None and source_file(known) != source_file(cls):
+            raise EffectError(
+                f"{source_file(cls)}: the {self.kind} {cls.name} is already there, in {source_file(known)}; "
+                "give the class another name"
+            )
+        self.classes[cls.name] = cls
+
+
+class Plugin:
+    """Base of everything that a user can add in one file."""
+
+    registry: ClassVar[Registry]
+    name: ClassVar[str]
+    parameters: ClassVar[dict[str, Parameter]] = {}
+
+    def __init_subclass__(cls, abstract: bool = False, **keywords: Any):
+        super().__init_subclass__(**keywords)
+        declared = dict(cls.parameters)
+        for key, value in list(vars(cls).items()):
+            if isinstance(value, Parameter):
+                declared[key] = Parameter(**{**value.__dict__, "name": key})
+                setattr(cls, key, value.default)
+        cls.parameters = declared
+        if not abstract:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+            cls.registry.add(cls)
+
+    def __init__(self, **values: Any):
+        for key, value in values.items():
+            if key not in self.parameters:
+                raise TypeError(f"{self.name} has no parameter {key}.{did_you_mean(key, self.parameters)}")
+            setattr(self, key, value)
+
+    @classmethod
+    def summary(cls) -> str:
+        """The first line of the docstring."""
+        return (inspect.getdoc(cls) or "").split("\n")[0]
+
+
+def source_file(cls: type) -> str:
+    """The file in which a class stands."""
+    module = sys.modules.get(cls.__module__)
+    return getattr(module, "__file__", None) or "<interactive>"
+
+
+_discovered = False
+_loaded: dict[Path, str] = {}
+
+
+def discover() -> None:
+    """Import every module of the package's plug-in folders, and what is installed under the entry point."""
+    global _discovered
+    if _discovered:
+        return
+    _discovered = True
+    for folder in FOLDERS:
+        package = importlib.import_module(folder)
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{folder}.{module.name}")
+    importlib.import_module("spadmnist.reconstruct")
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        try:
+            entry.load()
+        except Exception as error:
+            raise EffectError(
+                f"the installed plug-in {entry.name} ({entry.value}) cannot be loaded: "
+                f"{type(error).__name__}: {error}; mend it or uninstall it"
+            ) from error
+
+
+def load_file(path: str | Path) -> None:
+    """Run a user's plug-in file (`--plugin FILE.py`), once. Raises EffectError with file and line."""
+    discover()
+    file = Path(path).resolve()
+    if file in _loaded:
+        return
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise EffectError(f"{path}: the plug-in cannot be read ({error})") from None
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    name = f"spadmnist_plugin_{file.stem}_{digest[:12]}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise EffectError(f"{path}: a plug-in is a Python file; its name ends in .py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except EffectError:
+        del sys.modules[name]
+        raise
+    except BaseException as error:
+        del sys.modules[name]
+        raise EffectError(f"{_place(error, file)}: the plug-in cannot be loaded: {_what(error)}") from error
+    _loaded[file] = text
+
+
+def loaded_files() -> dict[Path, str]:
+    """The plug-in files loaded by `load_file`, with their texts."""
+    return dict(_loaded)
+
+
+def blame(effect: Plugin, error: BaseException) -> EffectError:
+    """An error that a plug-in's own code raised, as a sentence with the plug-in, its file and the line."""
+    file = source_file(type(effect))
+    return EffectError(f"{_place(error, Path(file))}: the {effect.registry.kind} {effect.name} failed: {_what(error)}")
+
+
+def _what(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _place(error: BaseException, file: Path) -> str:
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"{file}:{error.lineno}"
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename) == file]
+    return f"{file}:{lines[-1]}" if lines else str(file)

@@ -1,0 +1,128 @@
+"""TR, STR and QIS: what a sensor hands out of one and the same avalanches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import kernels
+from .errors import SpadError
+from .events import Events
+
+READOUTS = ("tr", "str", "qis")
+
+
+def unsigned_for(largest: float, what: str) -> type[np.unsignedinteger]:
+    """The unsigned type (32 or 64 bits) that holds integers up to `largest`. Raises SpadError where none does."""
+    if largest < 2**32:
+        return np.uint32
+    if largest < 2**52:
+        return np.uint64
+    raise SpadError(
+        f"{what} would reach {largest:.3g} ticks, beyond what a time stamp can hold; "
+        "shorten the exposure or take a coarser TDC resolution"
+    )
+
+
+def no_detection(frame_time: float, tick: float) -> int:
+    """The stamp that means 'none' in STR: ceil(frame time / tick), beyond every real stamp."""
+    ratio = frame_time / tick
+    return round(ratio) if abs(ratio - round(ratio)) < 1e-6 * max(1.0, ratio * 1e-6) else math.ceil(ratio)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames of many rows, a row being one pixel of one image.
+
+    bits: (rows, ceil(frames / 8)) uint8: is there a detection? Most significant bit first.
+    first: for each bit set, in order, the first stamp since the start of its frame; None where STR is not recorded.
+    frames: their number; frame_time: s.
+    """
+
+    bits: np.ndarray
+    first: Events | None
+    frames: int
+    frame_time: float
+    pixels: int
+
+    def unpacked(self) -> np.ndarray:
+        """(images, frames, pixels) uint8, 0 or 1: QIS."""
+        bits = np.unpackbits(self.bits, axis=1, count=self.frames)
+        return bits.reshape(-1, self.pixels, self.frames).transpose(0, 2, 1)
+
+    def stamps(self) -> np.ndarray:
+        """(images, frames, pixels) float64, s since the start of the frame; the frame time where there is none: STR."""
+        if self.first is None:
+            raise SpadError("STR was not recorded")
+        out = np.full((self.bits.shape[0], self.frames), self.frame_time)
+        out[np.unpackbits(self.bits, axis=1, count=self.frames).view(bool)] = self.first.times
+        return out.reshape(-1, self.pixels, self.frames).transpose(0, 2, 1)
+
+    def images(self, start: int, stop: int) -> Frames:
+        rows = slice(start * self.pixels, stop * self.pixels)
+        first = None if self.first is None else self.first.images(start, stop)
+        return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What the sensor made of some images: the streams, and per row what reconstructions need of them.
+
+    counts: recorded detections N; span: s from the first to the last stamp, 0 where N < 2; ones: frames with a
+    detection; waited: s, the sum over all frames of the first stamp, or of the frame time where there is none.
+    Each (rows,), None where its readout was not asked for.
+    """
+
+    pixels: int
+    tr: Events | None = None
+    counts: np.ndarray | None = None
+    span: np.ndarray | None = None
+    frames: Frames | None = None
+    ones: np.ndarray | None = None
+    waited: np.ndarray | None = None
+
+    def images(self, start: int, stop: int) -> Recorded:
+        """The images `start` to `stop` alone."""
+        rows = slice(start * self.pixels, stop * self.pixels)
+
+        def cut(column: np.ndarray | None) -> np.ndarray | None:
+            return None if column is None else column[rows]
+
+        return Recorded(
+            self.pixels,
+            None if self.tr is None else self.tr.images(start, stop),
+            cut(self.counts),
+            cut(self.span),
+            None if self.frames is None else self.frames.images(start, stop),
+            cut(self.ones),
+            cut(self.waited),
+        )
+
+    @staticmethod
+    def join(parts: list[Recorded]) -> Recorded:
+        """Several batches, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        one = parts[0]
+
+        def joined(name: str) -> np.ndarray | None:
+            return None if getattr(one, name) is None else np.concatenate([getattr(p, name) for p in parts])
+
+        frames = None
+        if one.frames is not None:
+            every = [p.frames for p in parts if p.frames is not None]
+            first = None if one.frames.first is None else Events.join([f.first for f in every if f.first is not None])
+            bits = np.concatenate([f.bits for f in every])
+            frames = Frames(bits, first, one.frames.frames, one.frames.frame_time, one.pixels)
+        tr = None if one.tr is None else Events.join([p.tr for p in parts if p.tr is not None])
+        return Recorded(one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited"))
+
+
+def spans(events: Events) -> tuple[np.ndarray, np.ndarray]:
+    """(detections, s from the first to the last stamp) of each row."""
+    if events.ticks is None:
+        return kernels.spans(events.times, events.offsets)
+    counts, span = kernels.spans(events.ticks, events.offsets)
+    return counts, span * events.tick

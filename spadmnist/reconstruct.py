@@ -1,0 +1,234 @@
+"""The six flux reconstructions: from what a pixel recorded to one number.
+
+Each method is one class; `spadmnist methods` lists them. A method sees only per-pixel sums of the raw stream
+(`spadmnist.readout.Recorded`), so that it never needs the events themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from . import kernels
+from .plugins import Plugin, Registry
+from .readout import Recorded
+
+# what a method may ask for (columns of Recorded) -> the readout that it comes from
+COLUMNS = {"counts": "tr", "span": "tr", "ones": "qis", "waited": "str"}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an estimator is told of sensor and recording.
+
+    pdp: nominal PDP at the scene's wavelength (q); exposure, frame_time: s; dead_time: nominal, s, 0 without one;
+    tick: s, 0 without a converter; frames: their number.
+    """
+
+    pdp: float
+    exposure: float
+    dead_time: float
+    tick: float
+    frames: int
+    frame_time: float
+
+
+class Method(Plugin, abstract=True):
+    """Base of every reconstruction.
+
+    columns: what it needs of `Recorded`; unit: of the image; normalised: divided by the training median for use.
+    """
+
+    registry: ClassVar[Registry] = Registry("method")
+    columns: ClassVar[tuple[str, ...]]
+    unit: ClassVar[str] = "1/s"
+    normalised: ClassVar[bool] = True
+
+    @classmethod
+    def readouts(cls) -> tuple[str, ...]:
+        """The readouts that must be recorded."""
+        return tuple(sorted({COLUMNS[c] for c in cls.columns}))
+
+    def estimate(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
+        """The image from the columns, float64; `+inf` where a saturated pixel has no finite estimate."""
+        raise TypeError(f"{self.name} must define estimate")
+
+    def saturated(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
+        """Where the formula had no answer of its own and a rule stands in."""
+        return np.zeros(columns[0].shape, bool)
+
+    def stored_when_saturated(self, settings: Settings) -> float:
+        """What a dataset stores where `estimate` is infinite."""
+        return np.inf
+
+    def image(self, recorded: Recorded, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+        """What a dataset stores: ((rows,) float32, (rows,) bool: where it was saturated)."""
+        columns = [getattr(recorded, name) for name in self.columns]
+        if len(columns) == 1 and columns[0].dtype.kind in "iu":
+            # a function of one small integer: worked out once for each value that occurs
+            values = np.arange(int(columns[0].max(initial=0)) + 1)
+            table, where = self._finite(settings, values)
+            return table.astype(np.float32)[columns[0]], where[columns[0]]
+        # no detection, no information: 0, and most pixels of a dim image need no arithmetic
+        seen = np.flatnonzero(columns[0])
+        values = np.zeros(columns[0].shape, np.float32)
+        where = np.zeros(columns[0].shape, bool)
+        values[seen], where[seen] = self._finite(settings, *(column[seen] for column in columns))
+        return values, where
+
+    def _finite(self, settings: Settings, *columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = self.estimate(settings, *columns)
+        values = np.where(np.isposinf(values), self.stored_when_saturated(settings), values)
+        return values, self.saturated(settings, *columns)
+
+
+class Counts(Method):
+    """Detections over exposure: N / (q T).
+
+    No detection gives 0. Source: Suonsivu et al., eq. 4a.
+    """
+
+    columns = ("counts",)
+
+    def estimate(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+        return counts / (settings.pdp * settings.exposure)
+
+
+class PassiveFreeRunning(Method):
+    """Detections over live time: N / (q (T - N tau_d)).
+
+    No detection gives 0. Where no live time is left the estimate is infinite; a dataset stores its value at
+    N_max - 1/2 detections, N_max = T / tau_d, and counts such pixels. Source: Suonsivu et al., eq. 4b.
+    """
+
+    columns = ("counts",)
+
+    def estimate(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+        live = settings.exposure - counts * settings.dead_time
+        with np.errstate(divide="ignore"):
+            return np.where(live > 0, counts / (settings.pdp * np.where(live > 0, live, 1.0)), np.inf)
+
+    def saturated(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+        return settings.exposure - counts * settings.dead_time <= 0
+
+    def stored_when_saturated(self, settings: Settings) -> float:
+        if settings.dead_time <= 0:
+            return np.inf
+        return float(self.estimate(settings, np.asarray(settings.exposure / settings.dead_time - 0.5)))
+
+
+class InterPhoton(Method):
+    """Detections between the first and the last over the live time between them: (N - 1) / (q (X_N - X_1 - (N - 1) tau_d)).
+
+    Fewer than two detections give 0. Rounded stamps can leave no live time: it is taken as at least half a tick per
+    interval, and such pixels are counted. Source: Suonsivu et al., eq. 4c.
+    """
+
+    columns = ("counts", "span")
+
+    def _live(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
+        return span - (counts - 1) * settings.dead_time
+
+    def _least(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+        # without a converter two stamps still lie a rounding error apart
+        half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.exposure)
+        return np.maximum(counts - 1, 1) * half
+
+    def estimate(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
+        live = np.maximum(self._live(settings, counts, span), self._least(settings, counts))
+        return np.where(counts >= 2, (counts - 1) / (settings.pdp * live), 0.0)
+
+    def saturated(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
+        return (counts >= 2) & (self._live(settings, counts, span) < self._least(settings, counts))
+
+
+class StrFlux(Method):
+    """Frames with a detection over the time waited for it: sum 1(D_i != T_f) / (q sum D_i).
+
+    No detection gives 0. Where every stamp is 0, each counts as half a tick. Source: Suonsivu et al., eq. 5.
+    """
+
+    columns = ("ones", "waited")
+
+    @classmethod
+    def readouts(cls) -> tuple[str, ...]:
+        return ("str",)  # the bits are those of the STR frames
+
+    def estimate(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
+        half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.frame_time)
+        return ones / (settings.pdp * np.where(waited > 0, waited, settings.frames * half))
+
+    def saturated(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
+        return waited <= 0
+
+
+class QisCounts(Method):
+    """Frames with a detection: S = sum B_t.
+
+    Never normalised. Source: Suonsivu et al., eq. 6a.
+    """
+
+    columns = ("ones",)
+    unit = "1"
+    normalised = False
+
+    def estimate(self, settings: Settings, ones: np.ndarray) -> np.ndarray:
+        return ones.astype(np.float64)
+
+
+class QisLinear(Method):
+    """Detections that the frames with one stand for: -M ln(1 - S / M).
+
+    S = M is taken as M - 1/2, and such pixels are counted. Never normalised. Source: Suonsivu et al., eq. 6b.
+    """
+
+    columns = ("ones",)
+    unit = "1"
+    normalised = False
+
+    def estimate(self, settings: Settings, ones: np.ndarray) -> np.ndarray:
+        empty = np.where(ones < settings.frames, 1.0 - ones / settings.frames, 0.5 / settings.frames)
+        # + 0.0: the image of an empty pixel is 0, not -0
+        return -settings.frames * kernels.logarithm(empty.ravel()).reshape(empty.shape) + 0.0
+
+    def saturated(self, settings: Settings, ones: np.ndarray) -> np.ndarray:
+        return ones >= settings.frames
+
+
+def find(name: str) -> Method:
+    """The method of that name. Raises KeyError with a sentence."""
+    return Method.registry.find(name)()
+
+
+def median_of_nonzero(chunks: Callable[[], Iterable[np.ndarray]]) -> float | None:
+    """The exact median of all non-zero values (float32, not negative), in memory that does not grow with their number.
+
+    chunks: gives the values anew at each call, in any order; it is called twice. Non-negative floats are ordered as
+    their bits are, so the upper and then the lower 16 bits of the two middle values are found by counting.
+    Returns None where every value is zero.
+    """
+    upper = np.zeros(1 << 16, np.int64)
+    for chunk in chunks():
+        bits = np.ascontiguousarray(chunk, np.float32).view(np.uint32).ravel()
+        upper += np.bincount(bits[bits != 0] >> 16, minlength=1 << 16)
+    total = int(upper.sum())
+    if total == 0:
+        return None
+    ranks = sorted({(total - 1) // 2, total // 2})
+    running = np.cumsum(upper)
+    bins = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
+    lower = {b: np.zeros(1 << 16, np.int64) for b in bins}
+    for chunk in chunks():
+        bits = np.ascontiguousarray(chunk, np.float32).view(np.uint32).ravel()
+        bits = bits[bits != 0]
+        for b, counted in lower.items():
+            counted += np.bincount(bits[bits >> 16 == b] & 0xFFFF, minlength=1 << 16)
+    middle: list[Any] = []
+    for rank, b in zip(ranks, bins, strict=True):
+        inside = rank - (int(running[b - 1]) if b else 0)
+        low = int(np.searchsorted(np.cumsum(lower[b]), inside, side="right"))
+        middle.append(float(np.array([(b << 16) | low], np.uint32).view(np.float32)[0]))
+    return sum(middle) / len(middle)

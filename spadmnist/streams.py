@@ -1,0 +1,62 @@
+"""Where random numbers come from: streams named by what they are for, never by a place in a list.
+
+One seed gives the same numbers for any number of workers, any order and any interruption, and any image can be made
+alone: a draw is a function of (seed, light level's value, split, image, what it is for).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+BLOCK = 32  # images that share one numpy generator, for effects that do not count their draws
+
+
+@dataclass(frozen=True)
+class Streams:
+    """The random streams of some images at one light level.
+
+    seed: the config's; level: text that identifies the light level's value; split: "train" or "test";
+    images: (n,) uint64, the images' indices within the split.
+    """
+
+    seed: int
+    level: str
+    split: str
+    images: np.ndarray
+    _keys: dict[str, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+
+    def _digest(self, name: str) -> bytes:
+        return hashlib.sha256(f"{self.seed}/{self.level}/{self.split}/{name}".encode()).digest()
+
+    def key(self, name: str) -> np.ndarray:
+        """(3,) uint64, each below 2^32: key and stream word for the counter-based kernels."""
+        known = self._keys.get(name)
+        if known is None:
+            known = np.frombuffer(self._digest(name)[:12], "<u4").astype(np.uint64)
+            self._keys[name] = known
+        return known
+
+    def of(self, images: np.ndarray) -> Streams:
+        """The same streams for other images."""
+        return Streams(self.seed, self.level, self.split, images, self._keys)
+
+    def generator(self, name: str) -> np.random.Generator:
+        """A numpy generator of its own for this block of images.
+
+        The images are one whole block (`BLOCK` of them, or the last ones of the split).
+        """
+        first = int(self.images[0])
+        assert first % BLOCK == 0 and len(self.images) <= BLOCK, "generators belong to whole blocks of images"
+        words = np.frombuffer(self._digest(f"{name}/block {first // BLOCK}"), "<u4")
+        return np.random.Generator(np.random.SFC64(np.random.SeedSequence(words.tolist())))
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What an effect with `counted = True` gets as `rng`: the key of its own stream and the images' numbers."""
+
+    key: np.ndarray
+    images: np.ndarray

@@ -1,0 +1,678 @@
+"""The store: what is written is read back, by others as well; what is damaged or hostile is refused."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import pickle
+import random
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+from pathlib import Path
+
+import h5py
+import numcodecs.blosc
+import numcodecs.zstd
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from zarr.core.group import GroupMetadata
+from zarr.core.metadata.v3 import ArrayV3Metadata
+
+from spadmnist import store
+from spadmnist.errors import InputError, SpadError
+from spadmnist.store import Column, ShardReader, append_columns, exists, write_groups, write_shard
+
+FORMATS = ["zarr", "hdf5"]
+IMAGE = ("image", "y", "x")
+
+
+def some_columns(images: int = 7, seed: int = 1) -> dict[str, Column]:
+    """A small shard with one array of every kind; some chunks are zeros, the last ones are not full."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(3, (images, 4, 5)).astype(np.uint16)
+    counts[:2] = 0
+    total = int(counts.sum())
+    offsets = np.concatenate([[0], np.cumsum(counts.sum(axis=(1, 2)))]).astype(np.uint64)
+    return {
+        "tr/ticks": Column(
+            rng.exponential(1e6, total).astype(np.uint32),
+            ("event",),
+            "10 ps",
+            "detection times",
+            "ticks",
+            50,
+            {"tick": 1e-11, "coding": "difference to the detection before, in the pixel"},
+        ),
+        "tr/counts": Column(counts, IMAGE, "1", "detections of a pixel", "counts", 2),
+        "tr/offsets": Column(offsets, ("offset",), "1", "first detection of an image", "floats"),
+        "frames/bits": Column(
+            rng.integers(0, 2, (images, 4, 5, 13), dtype=np.uint8), (*IMAGE, "byte"), "1", "frames", "bits", 3
+        ),
+        "frames/first": Column(np.zeros(0, np.uint32), ("first_event",), "10 ps", "first ones", "ticks", 50),
+        "index": Column(np.arange(images, dtype=np.int64), ("image",), "1", "place in the split", "floats"),
+    }
+
+
+def more_columns(images: int = 7) -> dict[str, Column]:
+    rng = np.random.default_rng(2)
+    return {
+        "reconstruction/counts": Column(
+            rng.random((images, 4, 5)).astype(np.float32), IMAGE, "1/s", "flux", "floats", 4
+        ),
+        "reconstruction/exact": Column(rng.random((images, 4, 5)), IMAGE, "1/s", "flux", "floats"),
+        "frames/sum": Column(np.ones((images, 4, 5), np.int8), IMAGE, "1", "ones", "bits"),
+    }
+
+
+ATTRIBUTES = {"lux": 2.56, "images": 7, "range": [0, 7], "readouts": ["tr", "qis"], "level": "2560 mlux"}
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()
+    }
+
+
+def digests(root: Path) -> dict[str, dict[str, object]]:
+    return {
+        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in tree(root).items()
+    }
+
+
+def check(reader: ShardReader, columns: dict[str, Column]) -> None:
+    assert reader.names == tuple(sorted(columns))
+    for name, column in columns.items():
+        data = reader.read(name)
+        assert data.dtype == column.data.dtype and data.shape == column.data.shape
+        assert np.array_equal(data, column.data)
+        assert (reader.dims(name), reader.unit(name)) == (column.dims, column.unit)
+        assert (reader.about(name), reader.array_attributes(name)) == (column.about, dict(column.attributes))
+        length = len(column.data)
+        for start, stop in [(0, 0), (length // 3, length // 2), (length // 2, length), (length, length)]:
+            assert np.array_equal(reader.read(name, start, stop), column.data[start:stop])
+
+
+# --- round trips -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_is_written_is_read_back(tmp_path: Path, format: str) -> None:
+    columns = some_columns() | more_columns()
+    assert not exists(tmp_path, "5mlux/train/0000", format)
+    files = write_shard(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES, format)
+    assert exists(tmp_path, "5mlux/train/0000", format)
+    assert files == digests(tmp_path)
+    assert list(store.temporary(tmp_path).iterdir()) == []
+    reader = ShardReader(tmp_path, "5mlux/train/0000", format)
+    check(reader, columns)
+    assert reader.attributes == ATTRIBUTES
+    check(pickle.loads(pickle.dumps(reader)), columns)
+    with pytest.raises(InputError, match=r"there is no array 'tr/tick'; there are .*tr/ticks"):
+        reader.read("tr/tick")
+    with pytest.raises(IndexError, match="rows 3 to 900 were asked for; it has rows 0 to"):
+        reader.read("tr/ticks", 3, 900)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint64", "int64", "float32", "float64", ">u4"])
+@pytest.mark.parametrize("shape", [(0,), (1,), (10,), (12, 2), (0, 3), (4, 0)])
+def test_types_and_shapes(tmp_path: Path, format: str, dtype: str, shape: tuple[int, ...]) -> None:
+    data = np.random.default_rng(3).integers(0, 200, shape).astype(dtype)
+    if dtype == "uint64" and data.size:
+        data.flat[0] = 2**64 - 1
+    columns = {
+        f"{codec}/a": Column(
+            data,
+            ("a", "b")[: len(shape)] if codec != "ticks" else ("p", "q")[: len(shape)],
+            "1",
+            "numbers",
+            codec,
+            4,
+        )
+        for codec in ("ticks", "counts", "bits", "floats")
+        if codec == "ticks" or len(shape) == 1
+    }
+    write_shard(tmp_path, "s", columns, {}, format)
+    reader = ShardReader(tmp_path, "s", format)
+    for name in columns:
+        assert np.array_equal(reader.read(name), data)
+        assert reader.shape(name) == shape
+
+
+def test_zarr_python_reads_the_same(tmp_path: Path) -> None:
+    columns = some_columns() | more_columns()
+    write_shard(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES, "zarr")
+    group = zarr.open_group(tmp_path / "data.zarr/5mlux/train/0000", mode="r", use_consolidated=False)
+    assert dict(group.attrs) == ATTRIBUTES
+    for name, column in columns.items():
+        array = group[name]
+        assert isinstance(array, zarr.Array)
+        assert np.array_equal(array[...], column.data) and array.dtype == column.data.dtype
+        assert array.metadata.dimension_names == column.dims  # type: ignore[union-attr]
+        assert dict(array.attrs) == {**column.attributes, "units": column.unit, "long_name": column.about}
+
+
+def test_metadata_is_what_zarr_python_itself_would_write(tmp_path: Path) -> None:
+    write_shard(tmp_path, "s", some_columns() | more_columns(), ATTRIBUTES, "zarr")
+    for name, text in tree(tmp_path / "data.zarr").items():
+        if not name.endswith("zarr.json"):
+            continue
+        document = json.loads(text)
+        if document["node_type"] == "group":
+            assert GroupMetadata.from_dict(dict(document)).to_dict() == document
+            continue
+        again = json.loads(json.dumps(ArrayV3Metadata.from_dict(dict(document)).to_dict()))
+        if document["data_type"] in ("uint8", "int8"):  # one byte has no order: zarr-python leaves that out
+            for codecs in (d["codecs"][0]["configuration"]["codecs"] for d in (document, again)):
+                codecs[0].pop("configuration", None)
+        assert again == document
+
+
+def test_xarray_opens_it_without_a_warning(tmp_path: Path) -> None:
+    columns = some_columns() | more_columns()
+    groups = {"": {"title": "a dataset"}, "5mlux": {"lux": 0.005}, "5mlux/train": {}}
+    files = write_groups(tmp_path, groups, "zarr")
+    for i in range(2):
+        files |= write_shard(tmp_path, f"5mlux/train/000{i}", columns, ATTRIBUTES, "zarr")
+    assert files == digests(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = xr.open_datatree(tmp_path / "data.zarr", engine="zarr", consolidated=False)
+        assert whole.attrs == {"title": "a dataset"} and whole["5mlux"].attrs == {"lux": 0.005}
+        for name, column in columns.items():
+            array = whole[f"5mlux/train/0001/{name}"]
+            assert np.array_equal(array, column.data) and array.dims == column.dims
+            assert array.attrs["units"] == column.unit and array.attrs["long_name"] == column.about
+        part = xr.open_zarr(tmp_path / "data.zarr/5mlux/train/0000/tr", consolidated=False)
+        assert np.array_equal(part.ticks, columns["tr/ticks"].data)
+
+
+def test_hdf5_has_dimension_scales(tmp_path: Path) -> None:
+    columns = some_columns() | more_columns()
+    write_shard(tmp_path, "s", columns, ATTRIBUTES, "hdf5")
+    with h5py.File(tmp_path / "data/s.h5") as file:
+        assert file.attrs["level"] == "2560 mlux" and list(file.attrs["readouts"]) == ["tr", "qis"]
+        for name, column in columns.items():
+            assert np.array_equal(file[name][...], column.data)
+            assert file[name].attrs["units"] == column.unit
+            assert not column.data.size or file[name].fletcher32
+            if name == "index":
+                continue
+            for axis, dim in zip(file[name].dims, column.dims, strict=True):
+                assert axis[0].name.rpartition("/")[2] == dim
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pytest.importorskip("h5netcdf", reason="xarray reads HDF5 with h5netcdf, which is not installed")
+        part = xr.open_dataset(tmp_path / "data/s.h5", engine="h5netcdf", group="tr")
+        assert part.counts.dims == IMAGE and np.array_equal(part.ticks, columns["tr/ticks"].data)
+
+
+# --- the same bytes ----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("format", FORMATS)
+def test_same_input_same_bytes(tmp_path: Path, format: str) -> None:
+    """In another process, with other thread counts, a second later and in another order of the columns."""
+    program = textwrap.dedent(
+        """
+        import sys
+        sys.path.insert(0, sys.argv[1])
+        from test_store import ATTRIBUTES, some_columns
+        from spadmnist.store import write_shard
+        columns = some_columns(300)
+        if sys.argv[4] == "reversed":
+            columns = dict(reversed(columns.items()))
+        write_shard(sys.argv[2], "s", columns, ATTRIBUTES, sys.argv[3])
+        """
+    )
+    write_shard(tmp_path / "here", "s", some_columns(300), ATTRIBUTES, format)
+    time.sleep(1.1)
+    for threads, order in (("1", "as is"), ("4", "reversed")):
+        command = [
+            sys.executable,
+            "-c",
+            program,
+            str(Path(__file__).parent),
+            str(tmp_path / threads),
+            format,
+            order,
+        ]
+        environment = os.environ | {"BLOSC_NTHREADS": threads, "TZ": "Asia/Tokyo"}
+        subprocess.run(command, env=environment, check=True)
+        assert tree(tmp_path / threads) == tree(tmp_path / "here")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_appending_is_writing_all_at_once(tmp_path: Path, format: str) -> None:
+    first, more = some_columns(), more_columns()
+    write_shard(tmp_path / "once", "s", first | more, ATTRIBUTES, format)
+    files = write_shard(tmp_path / "twice", "s", first, ATTRIBUTES, format)
+    files |= append_columns(tmp_path / "twice", "s", more, format)
+    assert tree(tmp_path / "twice") == tree(tmp_path / "once")
+    assert files == digests(tmp_path / "twice")
+    append_columns(tmp_path / "twice", "s", more, format)  # again: the same is replaced by the same
+    assert tree(tmp_path / "twice") == tree(tmp_path / "once")
+    assert list(store.temporary(tmp_path / "twice").iterdir()) == []
+    with pytest.raises(ValueError, match="dimension 'image' has size 9 in .* and 7 in"):
+        append_columns(tmp_path / "twice", "s", {"frames/other": more_columns(9)["frames/sum"]}, format)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_writing_again_replaces(tmp_path: Path, format: str) -> None:
+    write_shard(tmp_path / "a", "s", some_columns(9) | more_columns(9), {}, format)
+    write_shard(tmp_path / "a", "s", some_columns(), {}, format)
+    write_shard(tmp_path / "b", "s", some_columns(), {}, format)
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+# --- what cannot be stored ---------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"data": np.zeros(3, complex)}, "complex128"),
+        ({"data": np.float64(1)}, "0 axes"),
+        ({"dims": ("a", "b")}, "one name per axis"),
+        ({"unit": "seconds since 1970"}, "calendar time"),
+        ({"unit": "seconds"}, "calendar time"),
+        ({"about": ""}, "say in `about`"),
+        ({"codec": "zip"}, "'zip' is not a codec; choose one of ticks"),
+        ({"rows_per_chunk": 0}, "must be 1 or more"),
+        ({"attributes": {"units": "s"}}, "meaning of its own"),
+        ({"attributes": {"x": float("nan")}}, "allowed are text"),
+        ({"attributes": {"x": {}}}, "allowed are text"),
+        ({"attributes": {"x": [1, "a"]}}, "allowed are text"),
+        ({"attributes": {"x": True}}, "allowed are text"),
+    ],
+)
+def test_a_column_that_cannot_be_stored(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    fields: dict[str, object] = {
+        "data": np.zeros(3),
+        "dims": ("a",),
+        "unit": "1",
+        "about": "x",
+        "codec": "floats",
+    }
+    with pytest.raises(ValueError, match=message):
+        write_shard(tmp_path, "s", {"x": Column(**(fields | change))}, {}, "zarr")  # type: ignore[arg-type]
+    assert tree(tmp_path) == {}
+
+
+def test_names_that_cannot_be_stored(tmp_path: Path) -> None:
+    good = Column(np.zeros(3), ("a",), "1", "x", "floats")
+    for name in ("", "..", "a/../b", "/a", ".a", "a//b", "zarr.json", "a\nb", "a.", "ä"):
+        with pytest.raises(ValueError, match="cannot be a name on disk"):
+            write_shard(tmp_path, "s", {name: good}, {}, "zarr")
+        with pytest.raises(ValueError, match="cannot be a name on disk"):
+            write_shard(tmp_path, name, {"x": good}, {}, "zarr")
+    for columns in (
+        {"a": Column(np.zeros((3, 3)), ("a", "b"), "1", "x", "floats")},
+        {"x": good, "x/y": good},
+    ):
+        with pytest.raises(ValueError, match="rename one of them"):
+            write_shard(tmp_path, "s", columns, {}, "zarr")
+    with pytest.raises(ValueError, match="'tiff' is not a format"):
+        write_shard(tmp_path, "s", {"x": good}, {}, "tiff")
+
+
+# --- damage ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("format", FORMATS)
+def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: str) -> None:
+    """Flipped bits, cut files and missing files: reading refuses, or gives exactly what was written; the hash
+    shows it in any case."""
+    columns = some_columns() | more_columns()
+    files = write_shard(tmp_path, "s", columns, ATTRIBUTES, format)
+    rng = random.Random(4)
+    refused = 0
+    for trial in range(400):
+        name = rng.choice(sorted(files))
+        path = tmp_path / name
+        before = path.read_bytes()
+        if trial % 10 == 0:
+            path.unlink()
+        elif trial % 10 == 1:
+            path.write_bytes(before[: rng.randrange(len(before))])
+        else:
+            damaged = bytearray(before)
+            damaged[rng.randrange(len(before))] ^= 1 << rng.randrange(8)
+            path.write_bytes(damaged)
+        assert not path.exists() or hashlib.sha256(path.read_bytes()).hexdigest() != files[name]["sha256"]
+        try:
+            reader = ShardReader(tmp_path, "s", format)
+            for column in reader.names:
+                data = reader.read(column)
+                assert column not in columns or np.array_equal(data, columns[column].data)
+        except InputError as error:
+            refused += 1
+            assert "spadmnist verify" in str(error) and str(tmp_path) in str(error)
+        path.write_bytes(before)
+    check(ShardReader(tmp_path, "s", format), columns)
+    assert refused > 200  # the others hit what no reader looks at: texts, padding, HDF5's free space
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_every_flip_in_data_is_refused(tmp_path: Path, format: str) -> None:
+    column = Column(np.arange(1000, dtype=np.uint32), ("event",), "10 ps", "times", "ticks", 400)
+    file = next(name for name in write_shard(tmp_path, "s", {"a": column}, {}, format) if name[-1] in "05")
+    path = tmp_path / file
+    before = path.read_bytes()
+    places = [(at, size) for at, size in ShardReader(tmp_path, "s", format)._array("a").places]
+    reader = ShardReader(tmp_path, "s", format)
+    reader.read("a")
+    for at, size in places:
+        for position in range(at, at + size, 7):
+            damaged = bytearray(before)
+            damaged[position] ^= 1 << (position % 8)
+            path.write_bytes(damaged)
+            with pytest.raises(
+                InputError, match=r"a: .*; the file was changed or damaged: `spadmnist verify"
+            ):
+                reader.read("a")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_links_are_refused(tmp_path: Path, format: str) -> None:
+    write_shard(tmp_path / "out", "a/s", some_columns(), {}, format)
+    where = tmp_path / "out" / ("data.zarr" if format == "zarr" else "data")
+    inside = (
+        ["a/s/tr/ticks/c.0", "a/s/tr/ticks", "a/s/tr", "a/s", "a"] if format == "zarr" else ["a/s.h5", "a"]
+    )
+    for name in inside:
+        shutil.move(where / name, tmp_path / "elsewhere")
+        (where / name).symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(InputError, match="symbolic link"):
+            ShardReader(tmp_path / "out", "a/s", format).read("tr/ticks")
+        if name == "a":
+            with pytest.raises(SpadError, match="symbolic link"):
+                write_shard(tmp_path / "out", "a/t", some_columns(), {}, format)
+        (where / name).unlink()
+        shutil.move(tmp_path / "elsewhere", where / name)
+    ShardReader(tmp_path / "out", "a/s", format).read("tr/ticks")
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious/file").touch()
+    shutil.rmtree(store.temporary(tmp_path / "out"))
+    store.temporary(tmp_path / "out").symlink_to(tmp_path / "precious")
+    with pytest.raises(SpadError, match="symbolic link"):
+        store.sweep(store.temporary(tmp_path / "out"))
+    assert (tmp_path / "precious/file").exists()
+
+
+def bomb(kind: str) -> tuple[bytes, str]:
+    """A valid chunk of 1 GiB of zeros in a few kB (the array says: 4,000 bytes), and its codec."""
+    zeros = np.zeros(1 << 30, np.uint8)
+    if kind == "zstd":
+        return numcodecs.zstd.compress(zeros, 1, True), "floats"
+    packed = numcodecs.blosc.compress(zeros, b"zstd", 1, numcodecs.blosc.BITSHUFFLE, 0, 4)
+    return packed + store._crc32c(packed), "ticks"
+
+
+@pytest.mark.parametrize("kind", ["zstd", "blosc"])
+def test_a_bomb_is_refused_before_it_grows(tmp_path: Path, kind: str) -> None:
+    chunk, codec = bomb(kind)
+    column = Column(np.arange(1000, dtype=np.uint32), ("event",), "1", "numbers", codec)
+    write_shard(tmp_path, "s", {"a": column}, {}, "zarr")
+    table = struct.pack("<QQ", 0, len(chunk))
+    (tmp_path / "data.zarr/s/a/c.0").write_bytes(chunk + table + store._crc32c(table))
+    program = textwrap.dedent(
+        """
+        import resource, sys
+        from spadmnist.errors import InputError
+        from spadmnist.store import ShardReader
+        reader = ShardReader(sys.argv[1], "s", "zarr")
+        try:
+            reader.read("a")
+        except InputError as error:
+            assert "declares 1073741824 bytes where the array has 4000" in str(error), error
+            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        """
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program, tmp_path], check=True, capture_output=True, text=True
+    )
+    assert int(ran.stdout) < 300_000  # kB
+
+
+def test_an_hdf5_bomb_is_refused_before_it_grows(tmp_path: Path) -> None:
+    """A chunk that inflates to more than the data set says."""
+    import zlib
+
+    from numcodecs.fletcher32 import Fletcher32
+
+    data = bytes(Fletcher32().encode(zlib.compress(bytes(1 << 26), 1)))
+    into = np.empty(4000, np.uint8)
+    with pytest.raises(store._Damaged, match="does not have the 4000 bytes"):
+        store._decode_hdf5(data, into, 4)
+
+
+def test_hostile_descriptions_are_refused(tmp_path: Path) -> None:
+    column = Column(np.arange(1000, dtype=np.uint32), ("event",), "1", "numbers", "ticks", 100)
+    write_shard(tmp_path, "s", {"a": column}, {}, "zarr")
+    path = tmp_path / "data.zarr/s/a/zarr.json"
+    text = path.read_text()
+    document = json.loads(text)
+    for key, value in [
+        ("shape", [10**15]), ("shape", [-5]), ("shape", [1.5]), ("shape", [True]), ("shape", "x"), ("shape", []),
+        ("data_type", "bytes"), ("data_type", ["uint32"]), ("fill_value", 7), ("codecs", []), ("codecs", None),
+        ("attributes", {}), ("attributes", None), ("dimension_names", [None]), ("dimension_names", ["../x"]),
+        ("extra", 1), ("storage_transformers", ["x"]), ("zarr_format", 2),
+    ]:  # fmt: skip
+        path.write_text(json.dumps(document | {key: value}))
+        with pytest.raises(InputError, match="zarr.json: "):
+            ShardReader(tmp_path, "s", "zarr").read("a")
+    for wrong in ("", "[]", "[" * 100_000, "{", "nonsense", "9" * 5000, " " * (2 << 20), '{"shape": NaN}'):
+        path.write_text(wrong)
+        with pytest.raises(InputError, match="zarr.json: "):
+            ShardReader(tmp_path, "s", "zarr").read("a")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(InputError, match="not a file"):
+        ShardReader(tmp_path, "s", "zarr").read("a")
+
+
+def test_hostile_hdf5_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    path, secret = tmp_path / "data/s.h5", tmp_path / "secret"
+    secret.write_bytes(b"secret" * 100)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["a"] = np.arange(10)
+
+    def external_storage(file: h5py.File) -> None:
+        file.create_dataset("a", (10,), "u1", external=[(str(secret), 0, 10)])
+
+    def external_link(file: h5py.File) -> None:
+        file["a"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/a")
+
+    def link_of_a_group(file: h5py.File) -> None:
+        file["g"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/")
+
+    def soft_link(file: h5py.File) -> None:
+        file["b"] = np.arange(3)
+        file["a"] = h5py.SoftLink("/b")
+
+    def virtual(file: h5py.File) -> None:
+        layout = h5py.VirtualLayout((10,), "i8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "a", (10,))
+        file.create_virtual_dataset("a", layout)
+
+    def circle(file: h5py.File) -> None:
+        file.create_group("g")["g"] = file["/"]
+
+    def huge(file: h5py.File) -> None:
+        file.create_dataset(
+            "a", (1 << 40,), "u1", chunks=(1 << 20,), shuffle=True, compression=1, fletcher32=True
+        )
+        file["a"].attrs.update({"units": "1", "long_name": "x"})
+        file["e"] = np.zeros(1)
+        file["e"].make_scale("e")
+        file["a"].dims[0].attach_scale(file["e"])
+
+    def text(file: h5py.File) -> None:
+        file["a"] = "text"
+
+    def no_checksum(file: h5py.File) -> None:
+        file["a"] = np.arange(10)
+
+    for make in (
+        external_storage,
+        external_link,
+        link_of_a_group,
+        soft_link,
+        virtual,
+        circle,
+        huge,
+        text,
+        no_checksum,
+    ):
+        with h5py.File(path, "w") as file:
+            make(file)
+        with pytest.raises(InputError, match=r"s\.h5: .*spadmnist verify"):
+            ShardReader(tmp_path, "s", "hdf5").read("a")
+    path.write_bytes(b"not HDF5")
+    with pytest.raises(InputError, match=r"s\.h5: .*HDF5 cannot read it"):
+        ShardReader(tmp_path, "s", "hdf5").read("a")
+
+
+# --- the disk ----------------------------------------------------------------------------------------------
+def test_a_file_is_committed_whole(tmp_path: Path) -> None:
+    path, tmp = tmp_path / "out/manifest.json", tmp_path / "out/.spadmnist/tmp"
+    assert store.commit_file(path, b"one", tmp) == {
+        "bytes": 3, "sha256": hashlib.sha256(b"one").hexdigest()
+    }  # fmt: skip
+    store.commit_file(path, b"two", tmp)
+    assert path.read_bytes() == b"two" and list(tmp.iterdir()) == []
+    (tmp / "left/over").mkdir(parents=True)
+    (tmp / "file").touch()
+    assert store.sweep(tmp) == 2 and list(tmp.iterdir()) == []
+    assert store.sweep(tmp_path / "nowhere") == 0
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
+    program = textwrap.dedent(
+        """
+        import sys
+        sys.path.insert(0, sys.argv[1])
+        from test_store import ATTRIBUTES, more_columns, some_columns
+        from spadmnist.store import append_columns, write_shard
+        columns, more = some_columns(40), more_columns(40)
+        print("ready", flush=True)
+        for i in range(100000):
+            write_shard(sys.argv[2], f"s{i % 3}", columns, ATTRIBUTES, sys.argv[3])
+            append_columns(sys.argv[2], f"s{i % 3}", more, sys.argv[3])
+        """
+    )
+    columns, more = some_columns(40), more_columns(40)
+    rng = random.Random(5)
+    whole = 0
+    for _ in range(5):
+        command = [sys.executable, "-c", program, str(Path(__file__).parent), str(tmp_path), format]
+        writer = subprocess.Popen(command, stdout=subprocess.PIPE)
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        time.sleep(rng.uniform(0.02, 0.3))
+        writer.send_signal(signal.SIGKILL)
+        writer.wait()
+        writer.stdout.close()
+        for i in range(3):
+            if exists(tmp_path, f"s{i}", format):
+                whole += 1
+                reader = ShardReader(tmp_path, f"s{i}", format)
+                present = {name: c for name, c in (columns | more).items() if name in reader.names}
+                assert set(columns) <= set(present)
+                check(reader, present)
+    assert whole
+    store.sweep(store.temporary(tmp_path))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {".spadmnist", "data.zarr" if format == "zarr" else "data"}
+
+
+def random_shard(size: int) -> dict[str, Column]:
+    data = np.random.default_rng(6).integers(0, 2**32, size // 4, dtype=np.uint32)
+    return {"a": Column(data, ("event",), "1", "noise", "ticks", 1 << 14)}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_full_disk(tmp_path: Path, format: str) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("mounting a small tmpfs needs root")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True
+    ).returncode:
+        pytest.skip("mounting a tmpfs is not allowed here")
+    try:
+        write_shard(disk, "first", random_shard(200_000), {}, format)
+        before = tree(disk)
+        with pytest.raises(SpadError) as caught:
+            write_shard(disk, "second", random_shard(2_000_000), {}, format)
+        assert str(caught.value) == (
+            f"{disk / store.location('second', format)}: cannot write up to 2 MB here: No space left on device; "
+            "free some space (or choose another place with -o) and type the same command again; "
+            "what is complete is kept"
+        )
+        with pytest.raises(SpadError, match="free some space"):
+            append_columns(
+                disk, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format
+            )
+        with pytest.raises(SpadError, match="free some space"):
+            store.commit_file(disk / "manifest.json", os.urandom(2_000_000), store.temporary(disk))
+        assert tree(disk) == before and list(store.temporary(disk).iterdir()) == []
+        assert not exists(disk, "second", format)
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_limit_on_file_size(tmp_path: Path, format: str) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(SpadError, match=r"up to 2 MB here: File too large; raise the limit .* is kept"):
+            write_shard(tmp_path, "s", random_shard(2_000_000), {}, format)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not exists(tmp_path, "s", format) and tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize("code", [errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO])
+def test_other_failures_of_the_disk(tmp_path: Path, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(handle: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    (tmp_path / ".spadmnist/tmp").mkdir(parents=True)
+    (tmp_path / "data.zarr").mkdir()
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(SpadError, match=rf"s: cannot write .*{os.strerror(code)}; .* is kept"):
+        write_shard(tmp_path, "s", some_columns(), {}, "zarr")
+    assert tree(tmp_path) == {}
+
+
+def test_a_name_that_is_too_long(tmp_path: Path) -> None:
+    with pytest.raises(SpadError, match="name too long; choose a place with a shorter name"):
+        write_shard(tmp_path, "s" * 300, some_columns(), {}, "zarr")
+
+
+def test_a_reader_works_after_a_fork(tmp_path: Path) -> None:
+    columns = some_columns()
+    for format in FORMATS:
+        write_shard(tmp_path, "s", columns, {}, format)
+        reader = ShardReader(tmp_path, "s", format)
+        reader.read("tr/ticks", 0, 3)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # other tests have started threads
+            child = os.fork()
+        if child == 0:
+            try:
+                check(reader, columns)
+            except BaseException:
+                os._exit(1)
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
