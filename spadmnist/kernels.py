@@ -48,6 +48,8 @@ def _double(typingctx: Any, x: Any) -> Any:
 # Philox4x32-10 (Salmon, Moraes, Dror, Shaw, SC 2011): a block of 128 random bits is a function of a 64-bit key and a
 # 128-bit counter. Here the counter is (block, image low, image high, stream word); see streams.py for the keys.
 
+_TILE = 16384.0  # expected events of the pixels that the fused line takes at a time
+
 BATCH = 128  # exponentials that are made at a time: long enough to fill the SIMD unit, short enough for a dim image
 
 _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
@@ -180,10 +182,36 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
 
 
 @_jit
+def _begin_image(image, key, child_key, buffer, places, distances):  # type: ignore[no-untyped-def]
+    """Where the draws of an image start. places: (block, draw, child block); distances: to the next event, child."""
+    _exponentials(np.uint64(0), image, key[0], key[1], key[2], buffer)
+    places[0] = 0
+    places[1] = 1
+    places[2] = 0
+    distances[0] = buffer[0]
+    a, _ = _philox(np.uint64(0), image, child_key[0], child_key[1], child_key[2])
+    distances[1] = _exponential(a)
+
+
+@_jit
 def _candidates(
-    rates, exposure, image, key, hazards, lifetime, dead_times, child_key, times, offsets, buffer, parents, delays
+    rates,
+    exposure,
+    image,
+    key,
+    hazards,
+    lifetime,
+    dead_times,
+    child_key,
+    times,
+    offsets,
+    buffer,
+    places,
+    distances,
+    parents,
+    delays,
 ):  # type: ignore[no-untyped-def]
-    """Draw one image: a Poisson process in every pixel, with its afterpulses among them.
+    """Draw the next pixels of an image: a Poisson process in each, with its afterpulses among them.
 
     One unit-rate Poisson process runs along the image, pixel after pixel, each pixel being `rate * exposure` long:
     one exponential an event and none for an empty pixel. The distance is counted from each pixel's own start, so
@@ -193,19 +221,18 @@ def _candidates(
     lifetime * Exp(1) after it; what would fall at or after the exposure's end does not exist.
 
     Fills `times` and `offsets[:pixels + 1]`; `parents` and `delays` are room for one row's children. Returns the
-    number of events, or -1 where they do not fit: the caller makes room and draws the image again, which gives the
-    same events, since a draw is a function of its place alone.
+    number of events, or -1 where they do not fit: the caller makes room and draws these pixels again, which gives
+    the same events, since a draw is a function of its place alone. `buffer`, `places` and `distances` hold where the
+    draws stand (see `_begin_image`) and are moved on.
     """
     last_moment = np.nextafter(exposure, 0.0)
     room = np.int64(times.size) - BATCH - 1
     child_room = np.int64(parents.size)
-    block = np.uint64(0)
-    _exponentials(block, image, key[0], key[1], key[2], buffer)
-    position = buffer[0]
-    draw = np.uint64(1)
-    child_block = np.uint64(0)
-    a, _ = _philox(child_block, image, child_key[0], child_key[1], child_key[2])
-    left = _exponential(a)
+    block = places[0]
+    draw = places[1]
+    child_block = places[2]
+    position = distances[0]
+    left = distances[1]
     k = np.uint64(0)
     offsets[0] = 0
     for pixel in range(np.uint64(rates.size)):
@@ -260,6 +287,11 @@ def _candidates(
                             k += np.uint64(1)
         position -= length
         offsets[pixel + np.uint64(1)] = k
+    places[0] = block
+    places[1] = draw
+    places[2] = child_block
+    distances[0] = position
+    distances[1] = left
     return np.int64(k)
 
 
@@ -287,27 +319,39 @@ def arrivals(rates, exposure, images, key):  # type: ignore[no-untyped-def]
     n, pixels = rates.shape
     times = np.empty(_room(_expected(rates.ravel(), exposure)))
     offsets = np.zeros(n * pixels + 1, np.int64)
-    image_offsets = np.zeros(pixels + 1, np.int64)
-    image_times = np.empty(1024)
     buffer = np.empty(BATCH + 1)
+    places = np.empty(3, np.uint64)
+    distances = np.empty(2)
     none = np.zeros(pixels)
     parents = np.empty(1, np.int64)
     delays = np.empty(1)
     used = 0
     for i in range(n):
+        row = i * pixels
         count = -1
-        room = _room(_expected(rates[i], exposure))
         while count < 0:
-            if image_times.size < room:
-                image_times = np.empty(room)
+            _begin_image(images[i], key, key, buffer, places, distances)
             count = _candidates(
-                rates[i], exposure, images[i], key, none, 0.0, none, key, image_times, image_offsets, buffer, parents, delays
+                rates[i],
+                exposure,
+                images[i],
+                key,
+                none,
+                0.0,
+                none,
+                key,
+                times[used:],
+                offsets[row:],
+                buffer,
+                places,
+                distances,
+                parents,
+                delays,
             )
-            room *= 2
-        times = _grown(times, used, used + count)
-        times[used : used + count] = image_times[:count]
-        for p in range(pixels):
-            offsets[i * pixels + p + 1] = used + image_offsets[p + 1]
+            if count < 0:
+                times = _grown(times, used, 2 * times.size)
+        for p in range(pixels + 1):
+            offsets[row + p] += used
         used += count
     return times[:used].copy(), offsets
 
@@ -633,13 +677,14 @@ def paper_line(
     none,
     want_tr,
     want_frames,
+    want_stamps,
     ticks,
     firsts,
 ):  # type: ignore[no-untyped-def]
     """Detection to readout under `rules: paper`, for a sensor with nothing but afterpulsing, dead time and a TDC.
 
     The same per-image functions as the staged line, run one image at a time in buffers that stay in the cache.
-    `ticks` and `firsts` are empty arrays that give the types of the stamps.
+    `ticks` and `firsts` are empty arrays that give the types of the stamps. want_stamps: of the frames too (STR).
 
     Returns (ticks, offsets, counts (rows,) int32, span (rows,) s from the first to the last stamp,
     bits, firsts, first offsets, ones, waited): as `non_paralyzable` + `nearest_ticks` and `frame_readout` give them.
@@ -654,8 +699,15 @@ def paper_line(
     waited = np.empty(rows if want_frames else 0)
     bits = np.zeros((rows if want_frames else 0, (frames + 7) // 8), np.uint8)
 
-    image_offsets = np.empty(pixels + 1, np.int64)
+    everything = _room(_expected(rates.ravel(), exposure))
+    if want_tr:
+        ticks = np.empty(everything, ticks.dtype)
+    if want_stamps:
+        firsts = np.empty(everything, firsts.dtype)
+    tile_offsets = np.empty(pixels + 1, np.int64)
     buffer = np.empty(BATCH + 1)
+    places = np.empty(3, np.uint64)
+    distances = np.empty(2)
     times = np.empty(1)
     recorded = np.empty(1)
     frame = np.empty(1, np.uint32)
@@ -663,48 +715,94 @@ def paper_line(
     parents = np.empty(1, np.int64)
     delays = np.empty(1)
     used = 0
-    first_used = np.uint64(0)
-    everything = _room(_expected(rates.ravel(), exposure))
-    if want_tr:
-        ticks = np.empty(everything, ticks.dtype)
-    if want_frames:
-        firsts = np.empty(everything, firsts.dtype)
+    first_used = 0
     for i in range(n):
-        total = -1
-        room = _room(_expected(rates[i], exposure))
-        while total < 0:
-            if times.size < room:
-                times = np.empty(room)
-                recorded = np.empty(room)
-                frame = np.empty(room, np.uint32)
-                first = np.empty(room, firsts.dtype)
-                parents = np.empty(room, np.int64)
-                delays = np.empty(room)
-            total = _candidates(
-                rates[i], exposure, images[i], key, hazards, lifetime, dead_times, child_key, times, image_offsets, buffer, parents, delays
-            )
-            room *= 2
-        if want_tr:
-            ticks = _grown(ticks, used, used + total)
-            _image_tr(times, image_offsets, dead_times, tick, recorded, ticks, used, i * pixels, offsets, counts, span)
-            used = offsets[(i + 1) * pixels]
-        if want_frames:
-            firsts = _grown(firsts, np.int64(first_used), np.int64(first_used) + total + 1)
-            _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
-            first_used = _image_frames(
-                frame, first, image_offsets, i * pixels, frames, frame_time, tick, bits, firsts, first_used, first_offsets, ones, waited
-            )
-    return ticks[:used], offsets, counts, span, bits, firsts[: np.int64(first_used)], first_offsets, ones, waited
+        _begin_image(images[i], key, child_key, buffer, places, distances)
+        begin = 0
+        while begin < pixels:
+            # as many pixels at a time as the cache holds events for
+            expected = 0.0
+            end = begin
+            while end < pixels and (end == begin or expected < _TILE):
+                expected += rates[i, end] * exposure
+                end += 1
+            row = i * pixels + begin
+            room = _room(expected)
+            buffer_before = buffer.copy()
+            places_before = places.copy()
+            distances_before = distances.copy()
+            total = -1
+            while total < 0:
+                if times.size < room:
+                    times = np.empty(room)
+                    recorded = np.empty(room)
+                    frame = np.empty(room, np.uint32)
+                    first = np.empty(room, firsts.dtype)
+                    parents = np.empty(room, np.int64)
+                    delays = np.empty(room)
+                total = _candidates(
+                    rates[i, begin:end],
+                    exposure,
+                    images[i],
+                    key,
+                    hazards[begin:end],
+                    lifetime,
+                    dead_times[begin:end],
+                    child_key,
+                    times,
+                    tile_offsets,
+                    buffer,
+                    places,
+                    distances,
+                    parents,
+                    delays,
+                )
+                if total < 0:
+                    buffer[:] = buffer_before
+                    places[:] = places_before
+                    distances[:] = distances_before
+                    room = 2 * times.size
+            tile = tile_offsets[: end - begin + 1]
+            if want_tr:
+                ticks = _grown(ticks, used, used + total)
+                used = _tile_tr(
+                    times, tile, dead_times[begin:end], tick, recorded, ticks, used, row, offsets, counts, span
+                )
+            if want_frames:
+                if want_stamps:
+                    firsts = _grown(firsts, first_used, first_used + total + 1)
+                _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
+                # without STR the stamps go nowhere: back into the scratch that they came from
+                into = firsts if want_stamps else first
+                behind = _tile_frames(
+                    frame,
+                    first,
+                    tile,
+                    row,
+                    frames,
+                    frame_time,
+                    tick,
+                    bits,
+                    into,
+                    first_used if want_stamps else 0,
+                    first_offsets,
+                    ones,
+                    waited,
+                )
+                if want_stamps:
+                    first_used = behind
+            begin = end
+    return ticks[:used], offsets, counts, span, bits, firsts[:first_used], first_offsets, ones, waited
 
 
 @_jit
-def _image_tr(times, image_offsets, dead_times, tick, recorded, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
-    """The TR readout of one image: dead time, then the stamps, appended to `ticks` from `used` on."""
+def _tile_tr(times, tile_offsets, dead_times, tick, recorded, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
+    """The TR readout of some pixels: dead time, then the stamps, appended to `ticks` from `used` on."""
     k = np.uint64(0)
     for p in range(np.uint64(dead_times.size)):
         row = np.uint64(first_row) + p
         before = k
-        k = _record(times, image_offsets[p], image_offsets[p + np.uint64(1)], dead_times[p], recorded, k)
+        k = _record(times, tile_offsets[p], tile_offsets[p + np.uint64(1)], dead_times[p], recorded, k)
         counts[row] = k - before
         offsets[row + np.uint64(1)] = np.uint64(used) + k
     for j in range(k):
@@ -712,20 +810,22 @@ def _image_tr(times, image_offsets, dead_times, tick, recorded, ticks, used, fir
     for p in range(np.uint64(dead_times.size)):
         row = np.uint64(first_row) + p
         if counts[row] > 1:
-            span[row] = (ticks[offsets[row + np.uint64(1)] - 1] - ticks[offsets[row]]) * tick
+            last = ticks[np.uint64(offsets[row + np.uint64(1)] - 1)]
+            span[row] = (last - ticks[np.uint64(offsets[row])]) * tick
+    return used + np.int64(k)
 
 
 @_jit
-def _image_frames(
-    frame, first, image_offsets, first_row, frames, frame_time, tick, bits, firsts, used, first_offsets, ones, waited
+def _tile_frames(
+    frame, first, tile_offsets, first_row, frames, frame_time, tick, bits, firsts, used, first_offsets, ones, waited
 ):  # type: ignore[no-untyped-def]
-    """The frames of one image, its stamps appended to `firsts` from `used` on."""
+    """The frames of some pixels, their stamps appended to `firsts` from `used` on."""
     empty = frames * frame_time
     used = np.uint64(used)
-    start = image_offsets[0]
-    for p in range(np.uint64(image_offsets.size - 1)):
+    start = tile_offsets[0]
+    for p in range(np.uint64(tile_offsets.size - 1)):
         row = np.uint64(first_row) + p
-        stop = image_offsets[p + np.uint64(1)]
+        stop = tile_offsets[p + np.uint64(1)]
         if stop > start:
             before = used
             w, used = _row_frames(frame, first, start, stop, bits, row, firsts, used)
@@ -735,7 +835,7 @@ def _image_frames(
         else:
             waited[row] = empty
         first_offsets[row + np.uint64(1)] = used
-    return used
+    return np.int64(used)
 
 
 @_jit

@@ -66,6 +66,16 @@ class Frames:
         return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels)
 
 
+    @staticmethod
+    def join(parts: list[Frames]) -> Frames:
+        """Several batches, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        one = parts[0]
+        first = None if one.first is None else Events.join([f.first for f in parts if f.first is not None])
+        return Frames(np.concatenate([f.bits for f in parts]), first, one.frames, one.frame_time, one.pixels)
+
+
 @dataclass(frozen=True)
 class Recorded:
     """What the sensor made of some images: the streams, and per row what reconstructions need of them.
@@ -110,12 +120,7 @@ class Recorded:
         def joined(name: str) -> np.ndarray | None:
             return None if getattr(one, name) is None else np.concatenate([getattr(p, name) for p in parts])
 
-        frames = None
-        if one.frames is not None:
-            every = [p.frames for p in parts if p.frames is not None]
-            first = None if one.frames.first is None else Events.join([f.first for f in every if f.first is not None])
-            bits = np.concatenate([f.bits for f in every])
-            frames = Frames(bits, first, one.frames.frames, one.frames.frame_time, one.pixels)
+        frames = None if one.frames is None else Frames.join([p.frames for p in parts if p.frames is not None])
         tr = None if one.tr is None else Events.join([p.tr for p in parts if p.tr is not None])
         return Recorded(one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited"))
 

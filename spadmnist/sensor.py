@@ -145,7 +145,7 @@ class Sensor:
         """
         if not self._settled:
             return self.settled().expose(photons, conditions, streams, readouts, staged)
-        if self.is_paper_line and not staged:
+        if self.is_paper_line and not staged and (self.tick > 0 or set(readouts) == {"qis"}):
             return self._fused(photons, conditions, streams, readouts)
         step = self.block
         if step == 1:
@@ -166,7 +166,6 @@ class Sensor:
             self.rules == "paper"
             and set(kinds) <= {Afterpulsing, DeadTime, Tdc}
             and len(set(kinds)) == len(kinds)
-            and self.tick > 0
         )
 
     def _fused(
@@ -176,8 +175,8 @@ class Sensor:
         rate, _ = self.rates(photons, conditions)
         trap = self.effect("afterpulsing")
         tick = self.tick
-        none = no_detection(conditions.frame_time, tick)
-        stamped = unsigned_for(conditions.exposure / tick, "TR stamps")
+        none = no_detection(conditions.frame_time, tick) if tick > 0 else 1
+        stamped = unsigned_for(conditions.exposure / tick, "TR stamps") if tick > 0 else np.uint32
         framed = "str" in readouts or "qis" in readouts
         ticks, offsets, counts, span, bits, first, first_offsets, ones, waited = kernels.paper_line(
             np.ascontiguousarray(rate),
@@ -195,8 +194,9 @@ class Sensor:
             none,
             "tr" in readouts,
             framed,
+            "str" in readouts,
             np.empty(0, stamped),
-            np.empty(0, unsigned_for(none, "STR stamps")),
+            np.empty(0, unsigned_for(none, "STR stamps") if tick > 0 else np.float64),
         )
         recorded = Recorded(pixels)
         if "tr" in readouts:

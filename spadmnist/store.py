@@ -14,8 +14,8 @@ returned to the caller, who lists it. The bytes are a function of the content al
 
 **Zarr by hand.** An array is one file in Zarr's sharding layout: compressed chunks along axis 0, then a table
 of (offset, length) pairs with its CRC. zarr-python reads it, and so does every program that knows Zarr v3; it
-is written and read here without zarr-python, which takes twice the time to write and several times the time to
-read one image's part. The reader accepts exactly the layout that the writer makes and nothing else.
+is written and read here without zarr-python, which takes twice the time to write and several times the time
+to read one image's part. The reader accepts exactly the layout that the writer makes and nothing else.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _CRC = {"name": "crc32c"}
 _LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
 
 # HDF5's own attributes, and those that xarray takes for instructions.
-_RESERVED = {"units", "long_name", "CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS"}
+_RESERVED = {"units", "long_name", "dimension_names", "CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"}
 _RESERVED |= {"_FillValue", "missing_value", "scale_factor", "add_offset", "calendar", "coordinates", "dtype"}
 _TIME_WORDS = {"days", "hours", "minutes", "seconds", "milliseconds", "microseconds", "nanoseconds"}
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable."
@@ -428,7 +428,7 @@ def _check_tree(shapes: Mapping[str, tuple[tuple[str, ...], tuple[int, ...]]], p
                 f"{path}: {name!r} is an array, so {inner!r} cannot lie in it; rename one of them"
             )
     sizes: dict[tuple[str, str], tuple[int, str]] = {}
-    for name, (dims, shape) in shapes.items():
+    for name, (dims, shape) in sorted(shapes.items()):
         for dim, size in zip(dims, shape, strict=True):
             known, first = sizes.setdefault((_group_of(name), dim), (size, name))
             if known != size:
@@ -626,7 +626,8 @@ def _zstd_size(frame: bytes) -> int:
 
 
 # --- HDF5 -----------------------------------------------------------------------------------------
-_HDF5_FILTERS = [("shuffle", 2), ("deflate", 1), ("fletcher32", 3)]  # and HDF5's numbers for them
+_HDF5_FILTERS = [2, 1, 3]  # shuffle, deflate, fletcher32
+_SCALE_TYPE = np.dtype(">f4")  # of the data sets that only name a dimension; data are never big-endian here
 
 
 def _hdf5_image(columns: Mapping[str, Column], attributes: Mapping[str, Any]) -> bytes:
@@ -650,7 +651,7 @@ def _hdf5_image(columns: Mapping[str, Column], attributes: Mapping[str, Any]) ->
                 }
                 filters |= {"compression": "gzip", "compression_opts": 1}
             sets[name] = file.create_dataset(name, data=data, track_times=False, **filters)
-            _put_attributes(sets[name], column.attributes)
+            _put_attributes(sets[name], {**column.attributes, "dimension_names": list(column.dims)})
         # Dimension scales as netCDF-4 has them: a data set per dimension, empty where it is a name only.
         scales = {}
         for name in sorted(columns):
@@ -663,7 +664,7 @@ def _hdf5_image(columns: Mapping[str, Column], attributes: Mapping[str, Any]) ->
                     sets[full].make_scale(dim)
                     scales[full] = sets[full]
                 else:
-                    scales[full] = file.create_dataset(full, shape=(size,), dtype=">f4", track_times=False)
+                    scales[full] = file.create_dataset(full, (size,), _SCALE_TYPE, track_times=False)
                     scales[full].make_scale(f"{_ONLY_A_DIMENSION}{size:10d}")
         for name in sorted(columns):
             if name in scales:
@@ -1009,38 +1010,28 @@ def _walk_hdf5(group: Any, h5py: Any, depth: int = 0) -> Iterator[tuple[str, Any
             yield from _walk_hdf5(node, h5py, depth + 1)
         elif not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
             raise _Damaged(f"{where} takes its data from elsewhere, and only plain data is read")
-        elif not _scale_name(node, h5py).startswith(_ONLY_A_DIMENSION):
+        elif node.dtype != _SCALE_TYPE:
             yield where, node
-
-
-def _scale_name(dataset: Any, h5py: Any) -> str:
-    if not h5py.h5ds.is_scale(dataset.id):
-        return ""
-    return str(h5py.h5ds.get_scale_name(dataset.id).decode())
 
 
 def _hdf5_array(dataset: Any, file: str) -> _Array:
     """The description of one data set, which must be as `_hdf5_image` makes them."""
-    import h5py
-
     where, shape, dtype = dataset.name.lstrip("/"), dataset.shape, dataset.dtype
     if dtype.name not in _TYPES or dtype.byteorder == ">" or not shape:
         raise _Damaged(f"{where} is {dtype} with {len(shape or ())} axes, which spadmnist does not write")
     attributes = _get_attributes(dataset)
     if not all(type(attributes.get(key)) is str for key in ("units", "long_name")):
         raise _Damaged(f"{where} has no units or no long_name")
-    if _scale_name(dataset, h5py):
-        dims: tuple[str, ...] = (where.rpartition("/")[2],)
-    else:
-        dims = tuple(str(axis[0].name).rpartition("/")[2] for axis in dataset.dims if len(axis) == 1)
-    if len(dims) != len(shape):
+    # The names are text of our own beside the scales: HDF5's library for these crashes on some damaged files.
+    dims = tuple(attributes.pop("dimension_names", ()))
+    if len(dims) != len(shape) or not all(type(dim) is str for dim in dims):
         raise _Damaged(f"{where} has no names for its dimensions")
     rows = _rows(shape, dtype.itemsize, dataset.chunks[0] if dataset.chunks else None, where)
     places: list[tuple[int, int]] = []
     if math.prod(shape):
         plist = dataset.id.get_create_plist()
         filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
-        if filters != [number for _, number in _HDF5_FILTERS] or dataset.chunks != (rows, *shape[1:]):
+        if filters != _HDF5_FILTERS or dataset.chunks != (rows, *shape[1:]):
             raise _Damaged(
                 f"{where} is not stored as spadmnist stores it (chunks {dataset.chunks}, filters {filters})"
             )

@@ -94,33 +94,37 @@ def parse(value: object, unit: str) -> Quantity:
     if isinstance(value, Quantity) and value.unit == unit:
         return value
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+        raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
     if isinstance(value, (int, float)):
         if unit:
             raise ValueError(
-                f'{value!r} has no unit; a {name} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
+                f'{value!r} has no unit; {_a(name)} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
             )
         text = repr(value)
     else:
         text = value.strip()
     match = _QUANTITY.fullmatch(text)
     if match is None:
-        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+        raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
     number, written = match.groups()
     if written not in units:
         if not written:
             raise ValueError(
-                f'{value!r} has no unit; a {name} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
+                f'{value!r} has no unit; {_a(name)} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
             )
-        raise ValueError(f"{value!r} is not a {name}; write {_how(unit, sample)}")
+        raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
     try:
         # exact decimal arithmetic, so that 1000 mlux and 1 lux are the same double
         si = float(Decimal(number) * Decimal(units[written]))
     except (InvalidOperation, OverflowError):
         si = math.inf
     if not math.isfinite(si):
-        raise ValueError(f"{value!r} is too large for a {name}")
+        raise ValueError(f"{value!r} is too large for {_a(name)}")
     return Quantity(si, text, unit)
+
+
+def _a(name: str) -> str:
+    return f"an {name}" if name[0] in "aeiou" else f"a {name}"
 
 
 def _how(unit: str, sample: str) -> str:

@@ -180,7 +180,11 @@ def test_metadata_is_what_zarr_python_itself_would_write(tmp_path: Path) -> None
 
 def test_xarray_opens_it_without_a_warning(tmp_path: Path) -> None:
     columns = some_columns() | more_columns()
-    groups = {"": {"title": "a dataset"}, "5mlux": {"lux": 0.005}, "5mlux/train": {}}
+    groups: dict[str, dict[str, object]] = {
+        "": {"title": "a dataset"},
+        "5mlux": {"lux": 0.005},
+        "5mlux/train": {},
+    }
     files = write_groups(tmp_path, groups, "zarr")
     for i in range(2):
         files |= write_shard(tmp_path, f"5mlux/train/000{i}", columns, ATTRIBUTES, "zarr")
@@ -210,9 +214,14 @@ def test_hdf5_has_dimension_scales(tmp_path: Path) -> None:
                 continue
             for axis, dim in zip(file[name].dims, column.dims, strict=True):
                 assert axis[0].name.rpartition("/")[2] == dim
+
+
+def test_xarray_opens_hdf5_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("h5netcdf", reason="xarray reads HDF5 with h5netcdf, which is not installed")
+    columns = some_columns() | more_columns()
+    write_shard(tmp_path, "s", columns, ATTRIBUTES, "hdf5")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        pytest.importorskip("h5netcdf", reason="xarray reads HDF5 with h5netcdf, which is not installed")
         part = xr.open_dataset(tmp_path / "data/s.h5", engine="h5netcdf", group="tr")
         assert part.counts.dims == IMAGE and np.array_equal(part.ticks, columns["tr/ticks"].data)
 
@@ -261,7 +270,7 @@ def test_appending_is_writing_all_at_once(tmp_path: Path, format: str) -> None:
     append_columns(tmp_path / "twice", "s", more, format)  # again: the same is replaced by the same
     assert tree(tmp_path / "twice") == tree(tmp_path / "once")
     assert list(store.temporary(tmp_path / "twice").iterdir()) == []
-    with pytest.raises(ValueError, match="dimension 'image' has size 9 in .* and 7 in"):
+    with pytest.raises(ValueError, match=r"dimension 'image' has size 7 in .* and 9 in"):
         append_columns(tmp_path / "twice", "s", {"frames/other": more_columns(9)["frames/sum"]}, format)
 
 
@@ -464,11 +473,11 @@ def test_hostile_descriptions_are_refused(tmp_path: Path) -> None:
         ("extra", 1), ("storage_transformers", ["x"]), ("zarr_format", 2),
     ]:  # fmt: skip
         path.write_text(json.dumps(document | {key: value}))
-        with pytest.raises(InputError, match="zarr.json: "):
+        with pytest.raises(InputError, match=r"zarr\.json: "):
             ShardReader(tmp_path, "s", "zarr").read("a")
     for wrong in ("", "[]", "[" * 100_000, "{", "nonsense", "9" * 5000, " " * (2 << 20), '{"shape": NaN}'):
         path.write_text(wrong)
-        with pytest.raises(InputError, match="zarr.json: "):
+        with pytest.raises(InputError, match=r"zarr\.json: "):
             ShardReader(tmp_path, "s", "zarr").read("a")
     path.unlink()
     os.mkfifo(path)
@@ -505,13 +514,10 @@ def test_hostile_hdf5_is_refused(tmp_path: Path) -> None:
         file.create_group("g")["g"] = file["/"]
 
     def huge(file: h5py.File) -> None:
-        file.create_dataset(
-            "a", (1 << 40,), "u1", chunks=(1 << 20,), shuffle=True, compression=1, fletcher32=True
-        )
+        filters = {"chunks": (1 << 20,), "shuffle": True, "compression": 1, "fletcher32": True}
+        file.create_dataset("a", (1 << 40,), "u1", **filters)
+        file["a"].attrs["dimension_names"] = ["e"]
         file["a"].attrs.update({"units": "1", "long_name": "x"})
-        file["e"] = np.zeros(1)
-        file["e"].make_scale("e")
-        file["a"].dims[0].attach_scale(file["e"])
 
     def text(file: h5py.File) -> None:
         file["a"] = "text"

@@ -1,0 +1,650 @@
+"""A dataset: what it holds, where it lies, and how it is read.
+
+    out/manifest.json                      every file with its size and SHA-256, and its own digest
+    out/config.yaml                        the config with nothing left open
+    out/maps/                              maps of the sensor that came from files
+    out/data.zarr/images/<split>/<shard>   the original images and labels
+    out/data.zarr/<level>/<split>/<shard>  streams and reconstructions
+    out/data/...                           the same, one file a shard, with format hdf5
+
+`open` reads a finished dataset, or simulates one on demand from its config: bit for bit the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, overload
+
+import numpy as np
+
+from . import config, kernels, plugins, reconstruct, store
+from .config import Experiment, Level
+from .errors import InputError, SpadError
+from .events import Events
+from .images import Images
+from .readout import Frames, Recorded
+from .reconstruct import median_of_nonzero
+from .store import Column, Files, ShardReader
+
+FORMAT = "spadmnist-dataset/1"
+MANIFEST = "manifest.json"
+CONFIG = "config.yaml"
+STATE = ".spadmnist"
+
+_EVENTS_PER_SHARD = 8_000_000
+_BYTES_PER_SHARD = 72 * 2**20  # before compression
+_IMAGES_PER_SHARD = 4096
+_IMAGE_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Images `start` to `stop` of a split, at a light level or (level None) the originals themselves."""
+
+    level: str | None
+    folder: str
+    split: str
+    number: int
+    start: int
+    stop: int
+
+    @property
+    def path(self) -> str:
+        return f"{self.folder}/{self.split}/{self.number:05d}"
+
+
+def shards_of(experiment: Experiment, splits: Mapping[str, Images]) -> list[Shard]:
+    """Every shard, sized by the events that are expected in it: a function of config and images alone."""
+    shards = []
+    for split, images in splits.items():
+        n = experiment.wanted(images)
+        raw = images.pixels[0].nbytes
+        shards += _cut(None, "images", split, n, max(1, _BYTES_PER_SHARD // raw))
+    for level in experiment.levels:
+        for split, images in splits.items():
+            n = experiment.wanted(images)
+            events, size = expected_per_image(experiment, level, images)
+            most = min(_EVENTS_PER_SHARD / max(events, 1), _BYTES_PER_SHARD / size, _IMAGES_PER_SHARD)
+            shards += _cut(level.text, level.folder, split, n, max(1, int(most)))
+    return shards
+
+
+def _cut(level: str | None, folder: str, split: str, n: int, most: int) -> list[Shard]:
+    # whole blocks of 32 images, so that an effect that draws by blocks is not asked twice
+    step = most // 32 * 32 if most >= 32 else most
+    return [Shard(level, folder, split, k, a, min(a + step, n)) for k, a in enumerate(range(0, n, step))]
+
+
+def expected_per_image(experiment: Experiment, level: Level, images: Images) -> tuple[float, float]:
+    """(events, bytes before compression) expected of one mean image of a split."""
+    n = experiment.wanted(images)
+    shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else n]
+    grey = float(shown.mean(dtype=np.float64)) / images.white
+    pixels = images.pixels[0].size
+    photons = np.full((1, pixels), experiment.white(level) * grey)
+    photons = photons.reshape(-1, experiment.sensor.layout.pixels)
+    candidates, recorded = experiment.sensor.expected(photons, experiment.conditions)
+    frames = experiment.conditions.frames
+    stamped = np.minimum(candidates, frames)
+    size = 4.0 * pixels * len(experiment.methods)
+    if "tr" in experiment.readouts:
+        size += 4 * float(recorded.sum()) + 2 * pixels
+    if set(experiment.readouts) & {"str", "qis"}:
+        size += pixels * -(-frames // 8)
+    if "str" in experiment.readouts:
+        size += 4 * float(stamped.sum())
+    return float(candidates.sum()), size
+
+
+# --- what a shard holds -------------------------------------------------------------------------------------------
+
+
+def image_columns(images: Images, start: int, stop: int) -> dict[str, Column]:
+    """The originals."""
+    pixels = np.ascontiguousarray(images.pixels[start:stop])
+    dims = ("image", "channel", "y", "x")[: pixels.ndim] if pixels.ndim == 4 else ("image", "y", "x")
+    columns = {
+        "pixels": Column(
+            pixels, dims, "1", "original image", "counts", 64, {"white": float(images.white)}
+        )
+    }
+    if images.labels is not None:
+        columns["labels"] = Column(np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts")
+    return columns
+
+
+def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Column]:
+    """The raw streams; shape: of one image, (rows, columns) or (channels, rows, columns)."""
+    dims = ("image", "y", "x") if len(shape) == 2 else ("image", "channel", "y", "x")
+    per_image = int(np.prod(shape))
+    columns: dict[str, Column] = {}
+    if recorded.tr is not None:
+        columns |= _ragged(recorded.tr, "tr", "event", "since the start of the exposure", dims, shape, True)
+    if recorded.frames is not None:
+        f = recorded.frames
+        columns["frames/bits"] = Column(
+            f.bits.reshape(-1, *shape, f.bits.shape[1]),
+            (*dims, "frame_byte"),
+            "1",
+            "QIS: one bit per frame, is there a detection? Most significant bit first",
+            "bits",
+            max(1, (1 << 19) // max(1, per_image * f.bits.shape[1])),
+            {"frames": f.frames, "packed_axis": "frame_byte", "bitorder": "big"},
+        )
+        if f.first is not None:
+            columns |= _ragged(f.first, "frames", "first_event", "since the start of its frame", dims, shape, False)
+    return columns
+
+
+def _ragged(
+    events: Events, group: str, axis: str, since: str, dims: tuple[str, ...], shape: tuple[int, ...], counted: bool
+) -> dict[str, Column]:
+    """The stamps of a stream and where each image's begin.
+
+    TR stamps are stored as differences within a pixel, which compress better, with the count of each pixel. STR
+    stamps follow the bits of the frames, which say to which frame each belongs.
+    """
+    starts = events.offsets[:: events.pixels]
+    name = "ticks" if events.ticks is not None else "times"
+    values = events.ticks if events.ticks is not None else events.times
+    about = f"time {since}, pixel after pixel"
+    attributes: dict[str, Any] = {}
+    unit = "s"
+    if events.ticks is not None:
+        unit = f"{events.tick!r} s"
+        attributes = {"tick_s": events.tick}
+        if counted:
+            values = kernels.row_differences(values, events.offsets)
+            about += "; each pixel's first stamp, then differences"
+            attributes["differences"] = 1
+    columns = {
+        f"{group}/{name}": Column(values, (axis,), unit, about, "ticks", store.ROWS_OF_TICKS, attributes),
+        f"{group}/starts": Column(
+            starts.astype(np.uint64), (f"{axis}_start",), "1", "where each image's stamps begin, and the end", "counts"
+        ),
+    }
+    if counted:
+        counts = events.counts
+        kind = np.uint16 if not len(counts) or counts.max() < 2**16 else np.uint32
+        rows = max(1, (1 << 17) // max(1, events.pixels))
+        columns[f"{group}/counts"] = Column(
+            counts.astype(kind).reshape(-1, *shape), dims, "1", "recorded detections", "counts", rows
+        )
+    return columns
+
+
+def reconstruction_columns(
+    experiment: Experiment, recorded: Recorded, shape: tuple[int, ...], names: Sequence[str] | None = None
+) -> dict[str, Column]:
+    """Flux images by the config's methods (or `names`)."""
+    dims = ("image", "y", "x") if len(shape) == 2 else ("image", "channel", "y", "x")
+    columns = {}
+    for name in experiment.methods if names is None else names:
+        method = reconstruct.find(name)
+        values, saturated = method.image(recorded, experiment.settings)
+        rows = max(1, (1 << 18) // max(1, int(np.prod(shape))))
+        columns[f"reconstruction/{name}"] = Column(
+            values.reshape(-1, *shape),
+            dims,
+            method.unit,
+            method.summary().rstrip("."),
+            "floats",
+            rows,
+            {"saturated_pixels": int(saturated.sum())},
+        )
+    return columns
+
+
+def statistics(recorded: Recorded) -> dict[str, Any]:
+    """What the manifest adds up over shards: images, pixels, and per readout detections and empty pixels."""
+    out: dict[str, Any] = {}
+    for readout, column in (("tr", recorded.counts), ("frames", recorded.ones)):
+        if column is not None:
+            out[readout] = {
+                "detections": int(column.sum(dtype=np.int64)),
+                "empty_pixels": int(np.count_nonzero(column == 0)),
+            }
+    return out
+
+
+# --- the manifest -------------------------------------------------------------------------------------------------
+
+
+def canonical(value: Any) -> bytes:
+    """JSON with sorted keys: the same bytes for the same value."""
+    return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=True, allow_nan=False) + "\n").encode()
+
+
+def seal(manifest: dict[str, Any]) -> bytes:
+    """The manifest as bytes, with the digest of everything else in it under `sha256`."""
+    body = {key: value for key, value in manifest.items() if key != "sha256"}
+    return canonical({**body, "sha256": hashlib.sha256(canonical(body)).hexdigest()})
+
+
+def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
+    """(manifest, is every byte of it as it was sealed?). Raises InputError where there is none to read."""
+    path = root / MANIFEST
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        if (root / STATE).is_dir():
+            raise InputError(
+                f"{root} is not finished: type the command that makes it again, and it goes on where it stopped"
+            ) from None
+        if not root.exists():
+            raise InputError(f"{root}: there is no such dataset or config file") from None
+        raise InputError(f"{root} is not a dataset: it has no {MANIFEST}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        manifest = json.loads(raw)
+        intact = isinstance(manifest, dict) and seal(manifest) == raw
+    except (ValueError, RecursionError):
+        raise InputError(f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again") from None
+    if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
+        raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
+    if manifest["format"] != FORMAT:
+        raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
+    return manifest, intact
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+
+
+class _Backend(Protocol):
+    """Where a part's data come from; ranges are of images."""
+
+    def recorded(self, start: int, stop: int, what: str) -> Any: ...
+
+    def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray: ...
+
+    def normalisation(self, method: str) -> float | None: ...
+
+    def originals(self, start: int, stop: int) -> np.ndarray: ...
+
+    def labels(self) -> np.ndarray | None: ...
+
+
+class Field(Generic[T]):
+    """One kind of data of a part, by image: `[i]` or `[a:b]`."""
+
+    def __init__(self, length: int, get: Callable[[int, int], Any], one: Callable[[Any], Any]):
+        self._length = length
+        self._get = get
+        self._one = one
+
+    def __len__(self) -> int:
+        return self._length
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Any: ...
+
+    def __getitem__(self, index: int | slice) -> Any:
+        if isinstance(index, slice):
+            start, stop, step = index.indices(self._length)
+            if step != 1:
+                raise IndexError("slices go in steps of 1; take every n-th image one by one")
+            return self._get(start, max(start, stop))
+        i = int(index)
+        if i < 0:
+            i += self._length
+        if not 0 <= i < self._length:
+            raise IndexError(f"image {index} was asked for; there are {self._length}")
+        return self._one(self._get(i, i + 1))
+
+    def __iter__(self) -> Iterator[T]:
+        for i in range(self._length):
+            yield self[i]
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _first(value: Any) -> Any:
+    return value[0]
+
+
+class Reconstruction(Field[np.ndarray]):
+    """Images of one method: `[i]` raw, (rows, columns) float32; `.normalised[i]` divided by `.normalisation`."""
+
+    def __init__(self, length: int, backend: _Backend, method: str):
+        self._backend = backend
+        self.method = method
+        super().__init__(length, lambda a, b: backend.reconstruction(method, a, b), _first)
+
+    @cached_property
+    def normalisation(self) -> float | None:
+        """The median of the non-zero pixels of the training split; None where the method is not normalised."""
+        return self._backend.normalisation(self.method) if reconstruct.find(self.method).normalised else None
+
+    @property
+    def normalised(self) -> Field[np.ndarray]:
+        def get(start: int, stop: int) -> np.ndarray:
+            raw = self._backend.reconstruction(self.method, start, stop)
+            return raw if self.normalisation is None else raw / np.float32(self.normalisation)
+
+        return Field(self._length, get, _first)
+
+
+class Part:
+    """One split at one light level. Nothing of it needs the whole split in memory.
+
+    tr: `Events` of an image's pixels, row by row; qis: (frames, rows, columns) uint8; str: (frames, rows, columns)
+    float64, s, the frame time where there is no detection; reconstruction: by method; images: the originals;
+    labels: (n,) uint8, or None where the source has none. Colour adds a leading channel axis.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        backend: _Backend,
+        readouts: Sequence[str],
+        methods: Sequence[str],
+        shape: tuple[int, ...],
+    ):
+        self._length = length
+        self._backend = backend
+        self._readouts = tuple(readouts)
+        self.shape = shape
+        self.reconstruction: Mapping[str, Reconstruction] = {
+            name: Reconstruction(length, backend, name) for name in methods
+        }
+        self.images: Field[np.ndarray] = Field(length, backend.originals, _first)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __repr__(self) -> str:
+        return f"Part({self._length} images of {self.shape}, {', '.join(self._readouts)})"
+
+    @cached_property
+    def labels(self) -> np.ndarray | None:
+        return self._backend.labels()
+
+    @property
+    def tr(self) -> Field[Events]:
+        self._recorded("tr")
+        return Field(self._length, lambda a, b: self._backend.recorded(a, b, "tr"), _same)
+
+    @property
+    def qis(self) -> Field[np.ndarray]:
+        self._recorded("qis")
+        return Field(self._length, lambda a, b: self._frames(a, b, "qis", Frames.unpacked), _first)
+
+    @property
+    def str(self) -> Field[np.ndarray]:
+        self._recorded("str")
+        return Field(self._length, lambda a, b: self._frames(a, b, "str", Frames.stamps), _first)
+
+    def _frames(self, start: int, stop: int, what: Any, unpack: Callable[[Frames], np.ndarray]) -> np.ndarray:
+        dense = unpack(self._backend.recorded(start, stop, what))
+        n, frames, _ = dense.shape
+        dense = dense.reshape(n, frames, *self.shape)
+        # colour: the channel leads, then frames, rows, columns
+        return np.moveaxis(dense, 2, 1) if len(self.shape) == 3 else dense
+
+    def _recorded(self, readout: Any) -> None:
+        if readout not in self._readouts:
+            raise SpadError(f"{readout} was not recorded here; there are {', '.join(self._readouts)}")
+
+
+class Dataset:
+    """Light levels, each with its splits: `dataset["5 mlux", "train"]`; see `open`."""
+
+    def __init__(
+        self,
+        levels: Sequence[Level],
+        splits: Mapping[str, int],
+        part: Callable[[Level, Any], Part],
+        source: str,
+    ):
+        self._levels = tuple(levels)
+        self._splits = dict(splits)
+        self._part = part
+        self._source = source
+        self._parts: dict[tuple[str, str], Part] = {}
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """As written in the config."""
+        return tuple(level.text for level in self._levels)
+
+    @property
+    def lux(self) -> tuple[float, ...]:
+        """White of each level in lux. Raises SpadError where the levels are irradiances (see `irradiance`)."""
+        return self._values("lux")
+
+    @property
+    def irradiance(self) -> tuple[float, ...]:
+        """White of each level in W/m^2. Raises SpadError where the levels are lux."""
+        return self._values("irradiance")
+
+    def _values(self, kind: str) -> tuple[float, ...]:
+        if self._levels[0].kind != kind:
+            raise SpadError(f"the light levels here are given as {self._levels[0].kind}, not as {kind}")
+        return tuple(level.value for level in self._levels)
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return tuple(self._splits)
+
+    def __len__(self) -> int:
+        """Number of light levels."""
+        return len(self._levels)
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{n} {split}" for split, n in self._splits.items())
+        return f"Dataset({self._source}: {sizes}; {', '.join(self.levels)})"
+
+    def __getitem__(self, key: str | tuple[str, str]) -> Part:
+        level_text, split = key if isinstance(key, tuple) else (key, None)
+        level = next((x for x in self._levels if x.text == level_text), None)
+        if level is None:
+            raise KeyError(f"{level_text!r} is not a light level here; there are {', '.join(self.levels)}")
+        if split is None:
+            if len(self._splits) > 1:
+                names = " and ".join(self._splits)
+                raise KeyError(f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']")
+            split = next(iter(self._splits))
+        if split not in self._splits:
+            raise KeyError(f"{split!r} is not a split here; there are {', '.join(self._splits)}")
+        if (level.text, split) not in self._parts:
+            self._parts[level.text, split] = self._part(level, split)
+        return self._parts[level.text, split]
+
+
+class _Stored:
+    """A part of a finished dataset."""
+
+    def __init__(
+        self, root: Path, format: str, shards: Sequence[Shard], originals: Sequence[Shard], facts: dict[str, Any]
+    ):
+        self._shards = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in shards]
+        self._originals = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in originals]
+        self._facts = facts
+        self._starts: dict[tuple[int, str], np.ndarray] = {}
+
+    def _pieces(self, shards: Any, start: int, stop: int) -> Iterator[tuple[ShardReader, int, int]]:
+        if start == stop and shards:  # an empty range still has a type
+            yield shards[0][2], 0, 0
+        for first, last, reader in shards:
+            if first < stop and last > start and start < stop:
+                yield reader, max(start, first) - first, min(stop, last) - first
+
+    def recorded(self, start: int, stop: int, what: str) -> Any:
+        parts = [self._read(reader, a, b, what) for reader, a, b in self._pieces(self._shards, start, stop)]
+        if what == "tr":
+            return Events.join(parts)
+        return Frames.join(parts)
+
+    def _read(self, reader: ShardReader, start: int, stop: int, what: str) -> Any:
+        if what == "tr":
+            counts = reader.read("tr/counts", start, stop).reshape(-1)
+            return self._events(reader, "tr", start, stop, counts)
+        bits = reader.read("frames/bits", start, stop)
+        pixels = self._facts["pixels"]
+        first = None
+        if what == "str":
+            bytes_per_row = bits.reshape(-1, bits.shape[-1])
+            counts = np.bitwise_count(bytes_per_row).sum(axis=1, dtype=np.int64)
+            first = self._events(reader, "frames", start, stop, counts)
+        frames, frame_time = self._facts["frames"], self._facts["frame_time"]
+        return Frames(bits.reshape(-1, bits.shape[-1]), first, frames, frame_time, pixels)
+
+    def _events(self, reader: ShardReader, group: str, start: int, stop: int, counts: np.ndarray) -> Events:
+        key = (id(reader), group)
+        if key not in self._starts:
+            self._starts[key] = reader.read(f"{group}/starts").astype(np.int64)
+        first, last = self._starts[key][start], self._starts[key][stop]
+        offsets = np.zeros(len(counts) + 1, np.int64)
+        np.cumsum(counts, out=offsets[1:])
+        if offsets[-1] != last - first:
+            raise InputError(f"{reader.root / reader.path}: counts and stamps disagree; run spadmnist verify")
+        pixels = self._facts["pixels"]
+        if self._facts["tick"] > 0:
+            ticks = reader.read(f"{group}/ticks", int(first), int(last))
+            if group == "tr":
+                ticks = kernels.row_sums(ticks, offsets)
+            return Events(None, offsets, pixels, ticks, self._facts["tick"])
+        return Events(reader.read(f"{group}/times", int(first), int(last)), offsets, pixels)
+
+    def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
+        pieces = self._pieces(self._shards, start, stop)
+        return _joined([reader.read(f"reconstruction/{method}", a, b) for reader, a, b in pieces])
+
+    def normalisation(self, method: str) -> float | None:
+        return self._facts["normalisation"].get(method)
+
+    def originals(self, start: int, stop: int) -> np.ndarray:
+        return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
+
+    def labels(self) -> np.ndarray | None:
+        if "labels" not in self._originals[0][2].names:
+            return None
+        return np.concatenate([reader.read("labels") for _, _, reader in self._originals])
+
+
+def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+class _Simulated:
+    """A part that is made when it is asked for; the last range is kept."""
+
+    def __init__(self, experiment: Experiment, level: Level, split: str, splits: Mapping[str, Images]):
+        self._experiment = experiment
+        self._level = level
+        self._split = split
+        self._splits = splits
+        self._last: tuple[tuple[int, int], Recorded] | None = None
+
+    def _make(self, start: int, stop: int) -> Recorded:
+        if self._last is None or self._last[0] != (start, stop):
+            images = self._splits[self._split]
+            self._last = ((start, stop), self._experiment.simulate(self._level, self._split, images, start, stop))
+        return self._last[1]
+
+    def recorded(self, start: int, stop: int, what: str) -> Any:
+        made = self._make(start, stop)
+        if what == "tr":
+            return made.tr
+        return made.frames
+
+    def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
+        values, _ = reconstruct.find(method).image(self._make(start, stop), self._experiment.settings)
+        return values.reshape(-1, *self._splits[self._split].pixels.shape[1:])
+
+    def normalisation(self, method: str) -> float | None:
+        split = next(iter(self._splits))
+        images = self._splits[split]
+        one = reconstruct.find(method)
+
+        def chunks() -> Iterator[np.ndarray]:
+            for start in range(0, self._experiment.wanted(images), 256):
+                stop = min(start + 256, self._experiment.wanted(images))
+                made = self._experiment.simulate(self._level, split, images, start, stop)
+                yield one.image(made, self._experiment.settings)[0]
+
+        return median_of_nonzero(chunks)
+
+    def originals(self, start: int, stop: int) -> np.ndarray:
+        return self._splits[self._split].pixels[start:stop]
+
+    def labels(self) -> np.ndarray | None:
+        labels = self._splits[self._split].labels
+        return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
+
+
+def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()) -> Dataset:
+    """Open a dataset's folder, or a config file: then every image is simulated when it is asked for.
+
+    images_dir: where the images of a config are looked for; plugin: files with effects that a config names.
+    Raises InputError or ConfigError with a sentence.
+    """
+    for file in plugin:
+        plugins.load_file(file)
+    root = Path(path)
+    if root.is_file():
+        return simulated(config.read(root), Path(images_dir) if images_dir is not None else None)
+    return stored(root)
+
+
+def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset:
+    """The dataset of an experiment, made on demand."""
+    splits = experiment.load_images(images_dir)
+    any_split = next(iter(splits.values()))
+    shape = any_split.pixels.shape[1:]
+
+    def part(level: Level, split: str) -> Part:
+        backend = _Simulated(experiment, level, split, splits)
+        length = experiment.wanted(splits[split])
+        return Part(length, backend, experiment.readouts, experiment.methods, shape)
+
+    sizes = {split: experiment.wanted(images) for split, images in splits.items()}
+    return Dataset(experiment.levels, sizes, part, experiment.name)
+
+
+def stored(root: Path) -> Dataset:
+    """A finished dataset. Only its manifest is read here; checksums are compared as the data are read."""
+    manifest, intact = read_manifest(root)
+    if not intact:
+        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+    levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
+    shards = [Shard(**x) for x in manifest["shards"]]
+    shape = tuple(manifest["images"]["shape"])
+    facts = {
+        "pixels": int(np.prod(shape)),
+        "tick": manifest["settings"]["tick"],
+        "frames": manifest["settings"]["frames"],
+        "frame_time": manifest["settings"]["frame_time"],
+    }
+
+    def part(level: Level, split: str) -> Part:
+        mine = [s for s in shards if s.level == level.text and s.split == split]
+        originals = [s for s in shards if s.level is None and s.split == split]
+        own = {**facts, "normalisation": manifest["normalisation"][level.text]}
+        backend = _Stored(root, manifest["config"]["output"]["format"], mine, originals, own)
+        readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
+        return Part(manifest["images"]["splits"][split]["images"], backend, readouts, methods, shape)
+
+    sizes = {split: facts["images"] for split, facts in manifest["images"]["splits"].items()}
+    return Dataset(levels, sizes, part, str(root))
+
+
+def shards_in(manifest: Mapping[str, Any]) -> list[Shard]:
+    """The shards that a manifest lists."""
+    return [Shard(**x) for x in manifest["shards"]]
+
+
+__all__ = ["Dataset", "Files", "Part", "open"]

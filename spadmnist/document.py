@@ -1,0 +1,202 @@
+"""YAML as people mean it: version 1.2, duplicate keys refused, and the line of every entry kept for errors.
+
+No tag runs anything; aliases are refused (a few bytes of them can stand for gigabytes).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .errors import ConfigError, InputError
+
+_MOST_BYTES = 1 << 20
+_DEEPEST = 50
+
+Path_ = tuple[Any, ...]
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML reads version 1.1, where `1e9` is text, `010` is eight and `on` is true."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
+
+
+@dataclass
+class Document:
+    """What a YAML file says, and where.
+
+    value: nested dicts, lists, text, numbers, booleans and None; lines: line number of each path.
+    """
+
+    name: str
+    value: Any
+    lines: dict[Path_, int] = field(default_factory=dict)
+
+    def place(self, path: Iterable[Any]) -> str:
+        """`lab.yaml:7: sensor.layout.rows`, with the line of the nearest entry that is there."""
+        known = tuple(path)
+        while known and known not in self.lines:
+            known = known[:-1]
+        line = self.lines.get(known)
+        dotted = ""
+        for part in path:
+            dotted += f"[{part}]" if isinstance(part, int) else f"{'.' if dotted else ''}{part}"
+        where = f"{self.name}:{line}" if line else self.name
+        return f"{where}: {dotted}" if dotted else where
+
+
+def read(path: Path) -> Document:
+    """Read a YAML file. Raises InputError (cannot be read) or ConfigError (is not well formed), with the line."""
+    try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; name a YAML file")
+        with open(path, "rb") as file:
+            raw = file.read(_MOST_BYTES + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if len(raw) > _MOST_BYTES:
+        raise InputError(f"{path}: a config is text of at most 1 MiB; this file is larger")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError([f"{path}: is not UTF-8 text (byte {error.start})"]) from None
+    return parse(text, str(path))
+
+
+def parse(text: str, name: str) -> Document:
+    """Read YAML text; `name` stands for the file in errors."""
+    try:
+        node = yaml.compose(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f":{mark.line + 1}" if mark else ""
+        raise ConfigError([f"{name}{line}: is not well-formed YAML: {error.problem or error.context}"]) from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError([f"{name}: is not well-formed YAML: {' '.join(str(error).split())}"]) from None
+    except RecursionError:
+        raise ConfigError([f"{name}: is nested too deeply"]) from None
+    document = Document(name, None)
+    problems: list[str] = []
+    if node is not None:
+        document.value = _value(node, (), document, problems, set())
+    if problems:
+        raise ConfigError(problems)
+    return document
+
+
+def _value(node: Any, path: Path_, document: Document, problems: list[str], seen: set[int]) -> Any:
+    line = node.start_mark.line + 1
+    document.lines.setdefault(path, line)
+    if id(node) in seen:
+        problems.append(f"{document.name}:{line}: aliases (*name) are not allowed; write the value again")
+        return None
+    seen.add(id(node))
+    if len(path) > _DEEPEST:
+        problems.append(f"{document.name}:{line}: is nested more than {_DEEPEST} deep")
+        return None
+    if isinstance(node, yaml.MappingNode):
+        out: dict[Any, Any] = {}
+        first: dict[Any, int] = {}
+        for key_node, value_node in node.value:
+            key = _scalar(key_node, document, problems)
+            key_line = key_node.start_mark.line + 1
+            if key in first:
+                problems.append(
+                    f"{document.name}:{key_line}: {key} stands here a second time (first on line {first[key]}); "
+                    "keep one of them"
+                )
+                continue
+            first[key] = key_line
+            document.lines[(*path, key)] = key_line
+            out[key] = _value(value_node, (*path, key), document, problems, seen)
+        return out
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, (*path, i), document, problems, seen) for i, item in enumerate(node.value)]
+    return _scalar(node, document, problems)
+
+
+def _scalar(node: Any, document: Document, problems: list[str]) -> Any:
+    line = node.start_mark.line + 1
+    if not isinstance(node, yaml.ScalarNode):
+        problems.append(f"{document.name}:{line}: a key must be plain text")
+        return f"<line {line}>"
+    kind = node.tag.rpartition(":")[2]
+    text = node.value
+    try:
+        if kind == "null":
+            return None
+        if kind == "bool":
+            return text.lower() == "true"
+        if kind == "int":
+            return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+        if kind == "float":
+            return float(text.replace(".inf", "inf").replace(".nan", "nan").replace(".NaN", "nan"))
+        if kind == "str":
+            return text
+    except ValueError:
+        problems.append(f"{document.name}:{line}: {text[:40]!r} is not a number that can be held")
+        return None
+    problems.append(f"{document.name}:{line}: the tag {node.tag} is not allowed; write plain YAML")
+    return None
+
+
+def dump(value: Any) -> str:
+    """YAML text of nested dicts, lists and scalars: the same text for the same value, and read back as it was."""
+    lines: list[str] = []
+    _dump(value, 0, lines)
+    return "\n".join(lines) + "\n"
+
+
+def _dump(value: Any, depth: int, lines: list[str]) -> None:
+    indent = "  " * depth
+    for key, item in value.items():
+        if isinstance(item, dict) and item:
+            lines.append(f"{indent}{_text(key)}:")
+            _dump(item, depth + 1, lines)
+        else:
+            lines.append(f"{indent}{_text(key)}: {_flow(item)}")
+
+
+def _flow(item: Any) -> str:
+    if isinstance(item, list):
+        return "[" + ", ".join(map(_flow, item)) + "]"
+    if isinstance(item, dict):
+        return "{" + ", ".join(f"{_text(k)}: {_flow(v)}" for k, v in item.items()) + "}"
+    return _text(item)
+
+
+_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./^%+ -]*(?<! )")
+
+
+def _text(item: Any) -> str:
+    if item is None:
+        return "null"
+    if isinstance(item, bool):
+        return "true" if item else "false"
+    if isinstance(item, (int, float)):
+        return repr(item)
+    plain = _PLAIN.fullmatch(item) and item.lower() not in ("true", "false", "null")
+    if plain or re.fullmatch(r"[0-9.]+ [A-Za-z%][A-Za-z0-9^/%]*", item):
+        return str(item)
+    return '"' + item.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t") + '"'

@@ -1,0 +1,595 @@
+"""The factory: a dataset made shard by shard, by several workers, resumable at any moment.
+
+Each shard is simulated, encoded and committed by one task; what is committed is complete. The state of an
+unfinished run lies in `.spadmnist/` inside the dataset and is removed at the end: a finished dataset is a function
+of config, images and versions alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import functools
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import __version__, config, dataset, document, plugins, reconstruct, store
+from .config import Experiment
+from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Shard
+from .errors import InputError, SpadError
+from .images import Images
+from .plugins import Distribution, MapFile
+from .reconstruct import median_of_nonzero
+from .store import Files, ShardReader
+
+_ROUNDS = 3
+_VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker needs to know to simulate: enough to build the experiment anew."""
+
+    config: str
+    base: str
+    plugin_files: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One shard to be made. pixels: the images of whole blocks around it, the first of which is number `first`."""
+
+    job: Job
+    root: str
+    shard: Shard
+    pixels: np.ndarray
+    labels: np.ndarray | None
+    white: float
+    first: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is: called with the work done since the last time (in units of `total`)."""
+
+    start: Callable[[str, float, float], None] = lambda what, total, done: None
+    advance: Callable[[float, str], None] = lambda work, note: None
+    stop: Callable[[], None] = lambda: None
+
+
+# --- in a worker --------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=2)
+def _experiment(job: Job) -> Experiment:
+    for file in job.plugin_files:
+        plugins.load_file(file)
+    return config.build(document.parse(job.config, "config"), Path(job.base))
+
+
+def make_shard(task: Task) -> tuple[str, Files]:
+    """Simulate, encode and commit one shard, then note its files' digests in the state folder."""
+    experiment = _experiment(task.job)
+    columns, attributes = shard_content(experiment, task)
+    root = Path(task.root)
+    files = store.write_shard(root, task.shard.path, columns, attributes, experiment.format)
+    _note(root, task.shard, files)
+    return task.shard.path, files
+
+
+def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.Column], dict[str, Any]]:
+    """(columns, attributes) of a shard."""
+    shard = task.shard
+    attributes: dict[str, Any] = {"split": shard.split, "start": shard.start, "stop": shard.stop}
+    skip = shard.start - task.first
+    if shard.level is None:
+        images = Images(task.pixels, task.labels, task.white)
+        return dataset.image_columns(images, skip, skip + shard.stop - shard.start), attributes
+    level = experiment.level(shard.level)
+    recorded = experiment.simulate_block(level, shard.split, task.pixels, task.white, task.first)
+    if (skip, shard.stop - task.first) != (0, len(task.pixels)):
+        recorded = recorded.images(skip, shard.stop - task.first)
+    shape = task.pixels.shape[1:]
+    columns = dataset.stream_columns(recorded, shape)
+    columns |= dataset.reconstruction_columns(experiment, recorded, shape)
+    return columns, {**attributes, "level": shard.level, "statistics": json.dumps(dataset.statistics(recorded))}
+
+
+def _record_path(root: Path, shard: Shard) -> Path:
+    return root / STATE / "shards" / f"{shard.path}.json"
+
+
+def _note(root: Path, shard: Shard, files: Files) -> None:
+    store.commit_file(_record_path(root, shard), dataset.canonical(files), store.temporary(root))
+
+
+def _start_worker(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        os._exit(1)
+    keep_freed_memory()
+
+
+def keep_freed_memory() -> None:
+    """Ask the C library to keep what is freed for the next shard instead of returning it to the system.
+
+    Fresh pages cost more than the simulation that fills them. Only where the library is glibc.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
+        libc.mallopt(-1, 1 << 28)  # M_TRIM_THRESHOLD
+
+
+# --- running tasks ------------------------------------------------------------------------------------------------
+
+
+def run_tasks(
+    function: Callable[[Any], Any],
+    tasks: Callable[[Sequence[Any]], Iterator[Any]],
+    keys: Sequence[Any],
+    jobs: int,
+    done: Callable[[Any, Any], None],
+) -> None:
+    """Call `function` on the task of every key, `jobs` at a time, and `done(key, result)` for each.
+
+    A worker that dies takes its call down with it; what is missing is tried again, at last one by one, so that the
+    task that kills its worker is named. Errors that a task raises itself are passed on.
+    """
+    if jobs == 1 or len(keys) == 1:
+        keep_freed_memory()
+        for key, task in zip(keys, tasks(keys), strict=True):
+            done(key, function(task))
+        return
+    from joblib import Parallel, delayed
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    missing = list(keys)
+    for attempt in range(_ROUNDS):
+        remaining = set(missing)
+        workers = jobs if attempt < _ROUNDS - 1 else 1
+        try:
+            with Parallel(
+                n_jobs=min(workers, len(missing)) if workers > 1 else 2,
+                backend="loky",
+                return_as="generator_unordered",
+                pre_dispatch="n_jobs" if workers > 1 else 1,
+                batch_size=1,
+                max_nbytes=None,
+                initializer=_start_worker,
+                initargs=(os.getpid(),),
+            ) as parallel:
+                calls = (
+                    delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
+                )
+                for key, result in parallel(calls):
+                    remaining.discard(key)
+                    done(key, result)
+            return
+        except TerminatedWorkerError:
+            missing = [key for key in missing if key in remaining]
+        except BaseException:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+            raise
+    raise SpadError(
+        f"a worker died {_ROUNDS} times while making {missing[0]} (out of memory?); what is complete is kept: free "
+        "some memory or give fewer --jobs, and type the same command again"
+    )
+
+
+def _keyed(function: Callable[[Any], Any], key: Any, task: Any) -> tuple[Any, Any]:
+    return key, function(task)
+
+
+# --- the state of a run -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Hold the dataset for writing. The system frees the lock of a process that is killed."""
+    state = root / STATE
+    path = state / "lock"
+    with _writable(root):
+        state.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder with -o") from None
+        yield
+    finally:
+        os.close(handle)
+        # whatever went wrong before anything was written leaves no trace
+        with contextlib.suppress(OSError):
+            if set(os.listdir(state)) <= {"lock", "tmp"} and not (root / STATE / "plan.json").exists():
+                shutil.rmtree(state)
+                root.rmdir()
+
+
+@contextlib.contextmanager
+def _writable(place: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = {errno.ENOSPC: "the disk is full", errno.EROFS: "it is read-only"}.get(error.errno or 0, error.strerror)
+        raise SpadError(f"{place}: cannot be written ({reason}); choose another place with -o") from None
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the bytes of a dataset."""
+    return {"spadmnist": __version__} | {name: importlib.metadata.version(name) for name in _VERSIONS}
+
+
+def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, Any]:
+    """What a dataset is a function of, as a manifest holds it."""
+    any_split = next(iter(splits.values()))
+    return {
+        "format": FORMAT,
+        "config": portable(experiment)[0],
+        "images": {
+            "shape": list(any_split.pixels.shape[1:]),
+            "dtype": any_split.pixels.dtype.name,
+            "white": float(any_split.white),
+            "splits": {
+                split: {"images": experiment.wanted(images), "sha256": images.head(experiment.wanted(images)).sha256}
+                for split, images in splits.items()
+            },
+        },
+        "maps": {name: hashlib.sha256(data).hexdigest() for name, data in portable(experiment)[1].items()},
+        "plugins": {
+            path.name: {"sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
+            for path, text in sorted(plugins.loaded_files().items())
+            if any(plugins.source_file(type(e)) == str(path) for e in experiment.sensor.effects)
+            or any(plugins.source_file(type(reconstruct.find(m))) == str(path) for m in experiment.methods)
+        },
+        "versions": versions(),
+    }
+
+
+def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """(config, map files) that stand on their own: maps from files become files of the dataset."""
+    resolved = json.loads(json.dumps(experiment.resolved))
+    maps: dict[str, bytes] = {}
+    for name, values in resolved["sensor"]["effects"].items():
+        for key, raw in values.items():
+            if isinstance(raw, dict) and set(raw) == {"file"}:
+                effect = experiment.sensor.effect(name)
+                buffer = io.BytesIO()
+                np.save(buffer, np.asarray(getattr(effect, key)).reshape(experiment.sensor.layout.shape))
+                maps[f"maps/{name}.{key}.npy"] = buffer.getvalue()
+                values[key] = {"file": f"maps/{name}.{key}.npy"}
+    return resolved, maps
+
+
+def _difference(ours: Any, theirs: Any, path: str = "") -> list[str]:
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        out = []
+        for key in sorted(set(ours) | set(theirs)):
+            out += _difference(ours.get(key), theirs.get(key), f"{path}.{key}" if path else str(key))
+        return out
+    return [] if ours == theirs else [f"{path}: {_short(theirs)} there, {_short(ours)} asked for"]
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) <= 70 else text[:67] + "..."
+
+
+def _refuse_other(root: Path, wanted: dict[str, Any], there: Mapping[str, Any]) -> None:
+    known = {key: there.get(key) for key in wanted}
+    lines = _difference(wanted, known)
+    if lines:
+        more = f" (and {len(lines) - 4} more)" if len(lines) > 4 else ""
+        raise SpadError(
+            f"{root} holds another dataset: {'; '.join(lines[:4])}{more}; choose another folder with -o, or remove it"
+        )
+
+
+# --- generate -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run did."""
+
+    root: Path
+    made: int
+    kept: int
+    seconds: float
+    manifest: dict[str, Any]
+
+
+def generate(
+    experiment: Experiment,
+    splits: Mapping[str, Images],
+    root: Path,
+    jobs: int,
+    progress: Progress = Progress(),  # noqa: B008
+) -> Outcome:
+    """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done."""
+    started = time.monotonic()
+    check_volume(experiment, splits)
+    wanted = identity(experiment, splits)
+    _check_place(root, wanted)
+    if (root / MANIFEST).exists():
+        return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
+    with locked(root):
+        _begin(root, wanted)
+        _check_space(root, experiment, splits)
+        shards = dataset.shards_of(experiment, splits)
+        missing = [s for s in shards if not _is_made(root, s, experiment.format)]
+        _make(experiment, splits, root, shards, missing, jobs, progress)
+        manifest = _finish(experiment, root, wanted, shards, jobs, progress)
+    return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
+
+
+def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
+    """Raise InputError where one image would hold more than can be simulated or stored."""
+    images = next(iter(splits.values()))
+    shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else 1000]
+    channels = images.pixels[0].size // experiment.sensor.layout.pixels
+    experiment.check_volume(float(shown.mean(dtype=np.float64)) / images.white, channels)
+
+
+def _check_place(root: Path, wanted: dict[str, Any]) -> None:
+    """Refuse a folder that holds something else, before anything is written."""
+    with _writable(root):
+        if not root.exists():
+            return
+        if not root.is_dir():
+            raise SpadError(f"{root} is a file; choose another place with -o")
+        if (root / MANIFEST).exists():
+            _refuse_other(root, wanted, dataset.read_manifest(root)[0])
+            return
+        content = set(os.listdir(root))
+        plan = root / STATE / "plan.json"
+        if not plan.exists():
+            if content - {STATE}:
+                raise SpadError(
+                    f"{root} is not empty and holds no dataset (there is {sorted(content)[0]}); "
+                    "choose another folder with -o"
+                )
+            return
+    try:
+        there = json.loads(plan.read_bytes())
+    except ValueError:
+        raise SpadError(f"{plan}: is damaged; remove {root} and begin again") from None
+    _refuse_other(root, wanted, there)
+
+
+def _begin(root: Path, wanted: dict[str, Any]) -> None:
+    with _writable(root):
+        store.sweep(store.temporary(root))
+        store.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), store.temporary(root))
+
+
+def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images]) -> None:
+    """Refuse early where the disk cannot hold what is still to come (a rough, low estimate: half the raw size)."""
+    raw = 0.0
+    for images in splits.values():
+        for level in experiment.levels:
+            _, size = dataset.expected_per_image(experiment, level, images)
+            raw += size * experiment.wanted(images)
+    present = sum(f.stat().st_size for f in root.rglob("*") if f.is_file())
+    free = shutil.disk_usage(root).free
+    needed = raw / 4 - present
+    if free < needed:
+        raise SpadError(
+            f"{root}: about {needed / 1e9:.1f} GB are still to be written, but only {free / 1e9:.1f} GB are free; "
+            "free some space, or choose another place with -o"
+        )
+
+
+def _is_made(root: Path, shard: Shard, format: str) -> bool:
+    return _record_path(root, shard).exists() and store.exists(root, shard.path, format)
+
+
+def _make(
+    experiment: Experiment,
+    splits: Mapping[str, Images],
+    root: Path,
+    shards: Sequence[Shard],
+    missing: Sequence[Shard],
+    jobs: int,
+    progress: Progress,
+) -> None:
+    work = {s.path: _work(experiment, splits, s) for s in shards}
+    total = sum(work.values())
+    progress.start("simulating", total, total - sum(work[s.path] for s in missing))
+    by_path = {s.path: s for s in missing}
+
+    def done(path: str, _: Any) -> None:
+        shard = by_path[path]
+        progress.advance(work[path], f"{shard.level or 'images'} {shard.split}")
+
+    if missing:
+        job = job_of(experiment)
+
+        def tasks(paths: Sequence[str]) -> Iterator[Task]:
+            return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split]) for p in paths)
+
+        _warm(experiment)
+        run_tasks(make_shard, tasks, list(by_path), jobs, done)
+    progress.stop()
+
+
+def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
+    """Rough cost of a shard, in seconds of one core: what the progress bar's time left rests on."""
+    n = shard.stop - shard.start
+    if shard.level is None:
+        return 2e-6 * n
+    images = splits[shard.split]
+    events, size = dataset.expected_per_image(experiment, experiment.level(shard.level), images)
+    return n * (8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size)
+
+
+def job_of(experiment: Experiment) -> Job:
+    """The experiment, for workers."""
+    return Job(
+        document.dump(experiment.resolved),
+        str(experiment.base),
+        tuple(str(path) for path in plugins.loaded_files()),
+    )
+
+
+def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images) -> Task:
+    """The task that makes a shard: whole blocks of images where an effect needs them."""
+    block = experiment.sensor.block if shard.level is not None else 1
+    first = shard.start // block * block
+    last = min(-(-shard.stop // block) * block, len(images))
+    labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
+    return Task(job, str(root), shard, images.pixels[first:last], labels, images.white, first)
+
+
+def _warm(experiment: Experiment) -> None:
+    """Compile the kernels once, here, so that the workers find them in the cache."""
+    pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
+    if experiment.sensor.block == 1:
+        made = experiment.simulate_block(experiment.levels[0], "warm", pixels, 255, 0)
+        dataset.stream_columns(made, experiment.sensor.layout.shape)
+        dataset.reconstruction_columns(experiment, made, experiment.sensor.layout.shape)
+
+
+# --- finishing ----------------------------------------------------------------------------------------------------
+
+
+def _normalise(arguments: tuple[str, str, list[str], str]) -> float | None:
+    root, format, paths, method = arguments
+    readers = [ShardReader(root, path, format) for path in paths]
+    return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader in readers))
+
+
+def _finish(
+    experiment: Experiment,
+    root: Path,
+    wanted: dict[str, Any],
+    shards: Sequence[Shard],
+    jobs: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Normalisation, groups, config and manifest; then the state is removed."""
+    split = shards[0].split
+    training: dict[str, list[str]] = {level.text: [] for level in experiment.levels}
+    for shard in shards:
+        if shard.level is not None and shard.split == split:
+            training[shard.level].append(shard.path)
+    keys = [
+        (level.text, method)
+        for level in experiment.levels
+        for method in experiment.methods
+        if reconstruct.find(method).normalised
+    ]
+    normalisation: dict[str, dict[str, float | None]] = {level.text: {} for level in experiment.levels}
+    progress.start("normalising", len(keys), 0)
+
+    def tasks(which: Sequence[tuple[str, str]]) -> Iterator[Any]:
+        return ((str(root), experiment.format, training[level], method) for level, method in which)
+
+    def done(key: tuple[str, str], value: float | None) -> None:
+        normalisation[key[0]][key[1]] = value
+        progress.advance(1, key[0])
+
+    if keys:
+        run_tasks(_normalise, tasks, keys, jobs, done)
+    progress.stop()
+
+    resolved, maps = portable(experiment)
+    temporary = store.temporary(root)
+    files: Files = {}
+    for shard in shards:
+        files |= json.loads(_record_path(root, shard).read_bytes())
+    groups: dict[str, dict[str, Any]] = {"": {"format": FORMAT}}
+    for shard in shards:
+        groups.setdefault(shard.folder, _level_attributes(experiment, shard, normalisation))
+        groups.setdefault(f"{shard.folder}/{shard.split}", {"split": shard.split})
+    files |= store.write_groups(root, groups, experiment.format)
+    for name, data in maps.items():
+        files[name] = store.commit_file(root / name, data, temporary)
+    files[CONFIG] = store.commit_file(root / CONFIG, config_text(resolved).encode(), temporary)
+    settings = asdict(experiment.settings)
+    manifest = {
+        **wanted,
+        "seed": experiment.seed,
+        "levels": [{"text": x.text, "kind": x.kind, "value": x.value} for x in experiment.levels],
+        "settings": settings,
+        "shards": [asdict(shard) for shard in shards],
+        "normalisation": normalisation,
+        "statistics": _statistics(experiment, root, shards, wanted, files),
+        "files": files,
+    }
+    sealed = dataset.seal(manifest)
+    store.commit_file(root / MANIFEST, sealed, temporary)
+    shutil.rmtree(root / STATE)
+    return json.loads(sealed)
+
+
+def config_text(resolved: dict[str, Any]) -> str:
+    """The config file of a finished dataset."""
+    return "# The config of this dataset with nothing left open. spadmnist.open reads this file, too.\n" + document.dump(
+        resolved
+    )
+
+
+def _level_attributes(
+    experiment: Experiment, shard: Shard, normalisation: Mapping[str, Mapping[str, float | None]]
+) -> dict[str, Any]:
+    if shard.level is None:
+        return {"content": "original images and labels"}
+    level = experiment.level(shard.level)
+    unit = "lux" if level.kind == "lux" else "W/m^2"
+    medians = {f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None}
+    return {"level": level.text, "value": level.value, "unit": unit, **medians}
+
+
+def _statistics(
+    experiment: Experiment, root: Path, shards: Sequence[Shard], wanted: dict[str, Any], files: Files
+) -> dict[str, Any]:
+    """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data."""
+    pixels = int(np.prod(wanted["images"]["shape"]))
+    out: dict[str, Any] = {level.text: {} for level in experiment.levels}
+    for shard in shards:
+        if shard.level is None:
+            continue
+        total = out[shard.level].setdefault(
+            shard.split, {"images": 0, "pixels": 0, "saturated_pixels": {m: 0 for m in experiment.methods}, "bytes": {}}
+        )
+        total["images"] += shard.stop - shard.start
+        total["pixels"] += (shard.stop - shard.start) * pixels
+        reader = ShardReader(root, shard.path, experiment.format)
+        for readout, numbers in json.loads(reader.attributes["statistics"]).items():
+            sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
+            for key, value in numbers.items():
+                sums[key] += value
+        for method in experiment.methods:
+            found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
+            total["saturated_pixels"][method] += int(found)
+        place = store.location(shard.path, experiment.format)
+        for name, facts in files.items():
+            if name.startswith(place):
+                kind = name[len(place) :].strip("/").split("/")[0] if experiment.format == "zarr" else "all"
+                kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
+                total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
+    return out
+
+
+__all__ = ["Distribution", "InputError", "MapFile", "Outcome", "Progress", "generate"]
