@@ -88,7 +88,7 @@ def make_shard(task: Task) -> tuple[str, Files]:
     columns, attributes = shard_content(experiment, task)
     root = Path(task.root)
     files = store.write_shard(root, task.shard.path, columns, attributes, experiment.format)
-    _note(root, task.shard, files)
+    note(root, task.shard, files)
     return task.shard.path, files
 
 
@@ -114,7 +114,8 @@ def _record_path(root: Path, shard: Shard) -> Path:
     return root / STATE / "shards" / f"{shard.path}.json"
 
 
-def _note(root: Path, shard: Shard, files: Files) -> None:
+def note(root: Path, shard: Shard, files: Files) -> None:
+    """Remember the digests of a shard's files until the manifest lists them."""
     store.commit_file(_record_path(root, shard), dataset.canonical(files), store.temporary(root))
 
 
@@ -135,8 +136,8 @@ def keep_freed_memory() -> None:
     """
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
-        libc.mallopt(-1, 1 << 28)  # M_TRIM_THRESHOLD
+        libc.mallopt(-3, 1 << 25)  # M_MMAP_THRESHOLD, at its largest
+        libc.mallopt(-1, 1 << 29)  # M_TRIM_THRESHOLD
 
 
 # --- running tasks ------------------------------------------------------------------------------------------------
@@ -334,12 +335,12 @@ def generate(
     if (root / MANIFEST).exists():
         return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
     with locked(root):
-        _begin(root, wanted)
+        begin(root, wanted)
         _check_space(root, experiment, splits)
         shards = dataset.shards_of(experiment, splits)
         missing = [s for s in shards if not _is_made(root, s, experiment.format)]
         _make(experiment, splits, root, shards, missing, jobs, progress)
-        manifest = _finish(experiment, root, wanted, shards, jobs, progress)
+        manifest = finish(experiment, root, wanted, shards, jobs, progress)
     return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
 
 
@@ -377,7 +378,8 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> None:
     _refuse_other(root, wanted, there)
 
 
-def _begin(root: Path, wanted: dict[str, Any]) -> None:
+def begin(root: Path, wanted: dict[str, Any]) -> None:
+    """Note what is being made, so that the same command can go on with it and no other can."""
     with _writable(root):
         store.sweep(store.temporary(root))
         store.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), store.temporary(root))
@@ -470,6 +472,90 @@ def _warm(experiment: Experiment) -> None:
         dataset.reconstruction_columns(experiment, made, experiment.sensor.layout.shape)
 
 
+# --- reconstruct --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Addition:
+    """Methods to add to a shard."""
+
+    job: Job
+    root: str
+    shard: Shard
+    methods: tuple[str, ...]
+
+
+def add_methods(addition: Addition) -> tuple[str, Files]:
+    """Reconstruct the images of one shard from its raw streams and add them to it."""
+    experiment = _experiment(addition.job)
+    root, shard = Path(addition.root), addition.shard
+    reader = ShardReader(root, shard.path, experiment.format)
+    recorded, shape = dataset.read_shard(reader, experiment)
+    columns = dataset.reconstruction_columns(experiment, recorded, shape, addition.methods)
+    files = store.append_columns(root, shard.path, columns, experiment.format)
+    return shard.path, files
+
+
+def add_reconstructions(
+    root: Path,
+    names: Sequence[str],
+    jobs: int,
+    progress: Progress = Progress(),  # noqa: B008
+) -> tuple[list[str], dict[str, Any]]:
+    """Flux images from the raw streams of a finished dataset, as if its config had asked for them.
+
+    Returns (methods that were added, manifest). An interrupted run is taken up by the same call.
+    """
+    manifest, intact = dataset.read_manifest(root)
+    if not intact:
+        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+    before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
+    chosen = list(names) or [
+        m for m in reconstruct.Method.registry if set(reconstruct.find(m).readouts()) <= set(before.readouts)
+    ]
+    for name in chosen:
+        lacking = set(reconstruct.find(name).readouts()) - set(before.readouts)
+        if lacking:
+            raise InputError(f"{root}: {name} needs {', '.join(sorted(lacking))}, which was not recorded")
+    new = tuple(dict.fromkeys(m for m in chosen if m not in before.methods))
+    if not new:
+        return [], manifest
+    after = before.with_methods((*before.methods, *new))
+    kept = ("format", "images", "maps", "plugins", "versions")
+    wanted = {**{key: manifest[key] for key in kept}, "config": portable(after)[0]}
+    shards = dataset.shards_in(manifest)
+    with locked(root):
+        plan = root / STATE / "plan.json"
+        if plan.exists():
+            _refuse_other(root, wanted, json.loads(plan.read_bytes()))
+        begin(root, wanted)
+        by_path = {s.path: s for s in shards if not _record_path(root, s).exists()}
+        job = job_of(after)
+
+        def files_of(shard: Shard) -> Files:
+            place = store.location(shard.path, after.format)
+            return {n: f for n, f in manifest["files"].items() if n == place or n.startswith(place + "/")}
+
+        def done(path: str, result: tuple[str, Files]) -> None:
+            note(root, by_path[path], files_of(by_path[path]) | result[1])
+            progress.advance(1, path)
+
+        for path in [p for p, s in by_path.items() if s.level is None]:
+            note(root, by_path[path], files_of(by_path[path]))
+            del by_path[path]
+        progress.start("reconstructing", len(shards), len(shards) - len(by_path))
+        if by_path:
+            run_tasks(
+                add_methods,
+                lambda paths: (Addition(job, str(root), by_path[p], new) for p in paths),
+                list(by_path),
+                jobs,
+                done,
+            )
+        progress.stop()
+        return list(new), finish(after, root, wanted, shards, jobs, progress)
+
+
 # --- finishing ----------------------------------------------------------------------------------------------------
 
 
@@ -479,7 +565,7 @@ def _normalise(arguments: tuple[str, str, list[str], str]) -> float | None:
     return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader in readers))
 
 
-def _finish(
+def finish(
     experiment: Experiment,
     root: Path,
     wanted: dict[str, Any],
@@ -513,19 +599,15 @@ def _finish(
         run_tasks(_normalise, tasks, keys, jobs, done)
     progress.stop()
 
-    resolved, maps = portable(experiment)
     temporary = store.temporary(root)
     files: Files = {}
     for shard in shards:
         files |= json.loads(_record_path(root, shard).read_bytes())
-    groups: dict[str, dict[str, Any]] = {"": {"format": FORMAT}}
-    for shard in shards:
-        groups.setdefault(shard.folder, _level_attributes(experiment, shard, normalisation))
-        groups.setdefault(f"{shard.folder}/{shard.split}", {"split": shard.split})
+    small, groups = small_files(experiment, shards, normalisation)
     files |= store.write_groups(root, groups, experiment.format)
-    for name, data in maps.items():
-        files[name] = store.commit_file(root / name, data, temporary)
-    files[CONFIG] = store.commit_file(root / CONFIG, config_text(resolved).encode(), temporary)
+    for name, data in small.items():
+        if name not in files:
+            files[name] = store.commit_file(root / name, data, temporary)
     settings = asdict(experiment.settings)
     manifest = {
         **wanted,
@@ -541,6 +623,21 @@ def _finish(
     store.commit_file(root / MANIFEST, sealed, temporary)
     shutil.rmtree(root / STATE)
     return json.loads(sealed)
+
+
+def small_files(
+    experiment: Experiment,
+    shards: Sequence[Shard],
+    normalisation: Mapping[str, Mapping[str, float | None]],
+) -> tuple[dict[str, bytes], dict[str, dict[str, Any]]]:
+    """(every file besides shards and manifest, by name; the Zarr groups' attributes, by path)."""
+    resolved, files = portable(experiment)
+    files[CONFIG] = config_text(resolved).encode()
+    groups: dict[str, dict[str, Any]] = {"": {"format": FORMAT}}
+    for shard in shards:
+        groups.setdefault(shard.folder, _level_attributes(experiment, shard, normalisation))
+        groups.setdefault(f"{shard.folder}/{shard.split}", {"split": shard.split})
+    return files | store.group_files(groups, experiment.format), groups
 
 
 def config_text(resolved: dict[str, Any]) -> str:

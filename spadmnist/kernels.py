@@ -414,13 +414,14 @@ def uniforms(offsets, pixels, images, key):  # type: ignore[no-untyped-def]
 
 @_jit
 def row_totals(values, offsets):  # type: ignore[no-untyped-def]
-    """Sum of each row's entries, as float64; exact for integers up to 2^53."""
+    """Sum of each row's entries, as float64; that of integers is exact."""
     out = np.zeros(offsets.size - 1)
     for row in range(offsets.size - 1):
-        total = np.uint64(0)
-        for i in range(offsets[row], offsets[row + 1]):
-            total += np.uint64(values[i])
-        out[row] = total
+        if offsets[row + 1] > offsets[row]:
+            total = values[offsets[row]]
+            for i in range(offsets[row] + 1, offsets[row + 1]):
+                total += values[i]
+            out[row] = total
     return out
 
 
@@ -599,37 +600,29 @@ def _flush(word, number, bits, row):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def frame_readout(times, offsets, frames, frame_time, frame_period, tick, none, out):  # type: ignore[no-untyped-def]
-    """Bin events into frames: bits, and the first stamp of every frame that has an event.
+def frame_readout(times, offsets, frames, frame_time, frame_period, out):  # type: ignore[no-untyped-def]
+    """Bin events into frames: bits, and the first moment (s since its start) of every frame that has an event.
 
-    `tick` > 0: stamps are integers (the nearest tick, at most `none` - 1); `tick` = 0: seconds. `out` gives their
-    type and has room for one more than there are events.
-    Returns (bits (rows, ceil(frames / 8)) uint8, offsets of the stamps (rows + 1,), ones (rows,) int32,
-    waited (rows,) s: the sum over all frames of the first stamp, or of the frame time where there is none).
+    `out` has room for one more than there are events.
+    Returns (bits (rows, ceil(frames / 8)) uint8, offsets of the moments (rows + 1,)).
     """
     rows = offsets.size - 1
     bits = np.zeros((rows, (frames + 7) // 8), np.uint8)
     first_offsets = np.zeros(rows + 1, np.int64)
-    ones = np.zeros(rows, np.int32)
-    waited = np.empty(rows)
     longest = 1
     for row in range(rows):
         longest = max(longest, offsets[row + 1] - offsets[row])
     frame = np.empty(longest, np.uint32)
-    first = np.empty(longest, out.dtype)
+    first = np.empty(longest)
     used = np.uint64(0)
     for row in range(rows):
         start = offsets[row]
         count = offsets[row + 1] - start
-        waited[row] = frames * frame_time
         if count:
-            before = used
-            _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first)
-            w, used = _row_frames(frame, first, 0, count, bits, row, out, used)
-            ones[row] = used - before
-            waited[row] = _waited(w, ones[row], frames, frame_time, tick)
+            _stamps(times, start, count, frames, frame_time, frame_period, 0.0, 0, frame, first)
+            _, used = _row_frames(frame, first, 0, count, bits, row, out, used)
         first_offsets[row + 1] = used
-    return bits, first_offsets, ones, waited
+    return bits, first_offsets
 
 
 @_inline
@@ -859,13 +852,12 @@ def spans(times, offsets):  # type: ignore[no-untyped-def]
 def row_differences(values, offsets):  # type: ignore[no-untyped-def]
     """Each entry minus the one before it in its row; the first of a row as it is. The same type."""
     out = np.empty_like(values)
-    for row in range(offsets.size - 1):
-        start = offsets[row]
-        stop = offsets[row + 1]
-        if stop > start:
+    for i in range(np.uint64(1), np.uint64(values.size)):
+        out[i] = values[i] - values[i - np.uint64(1)]
+    for row in range(np.uint64(offsets.size - 1)):
+        start = np.uint64(offsets[row])
+        if start < np.uint64(offsets[row + np.uint64(1)]):
             out[start] = values[start]
-            for i in range(start + 1, stop):
-                out[i] = values[i] - values[i - 1]
     return out
 
 
@@ -880,4 +872,47 @@ def row_sums(differences, offsets):  # type: ignore[no-untyped-def]
             out[start] = differences[start]
             for i in range(start + 1, stop):
                 out[i] = out[i - 1] + differences[i]
+    return out
+
+
+@_jit
+def pack_rows(bits, width, rows):  # type: ignore[no-untyped-def]
+    """Put rows of `width` bits next to each other, without the padding to whole bytes at the end of each.
+
+    bits: (n * rows, ceil(width / 8)) uint8, most significant bit first, padding 0.
+    Returns (n, ceil(rows * width / 8)) uint8.
+    """
+    n = bits.shape[0] // rows
+    size = (rows * width + 7) // 8
+    out = np.zeros((n, size + 1), np.uint8)  # one more byte, which the last shift may touch
+    for i in range(n):
+        for r in range(rows):
+            for j in range(bits.shape[1]):
+                byte = bits[i * rows + r, j]
+                if byte:
+                    place = r * width + 8 * j
+                    shift = place & 7
+                    out[i, place >> 3] |= byte >> shift
+                    out[i, (place >> 3) + 1] |= (np.uint32(byte) << np.uint32(8 - shift)) & np.uint32(255)
+    return out[:, :size].copy()
+
+
+@_jit
+def unpack_rows(packed, width, rows):  # type: ignore[no-untyped-def]
+    """The inverse of `pack_rows`."""
+    n, size = packed.shape
+    bytes_per_row = (width + 7) // 8
+    out = np.zeros((n * rows, bytes_per_row), np.uint8)
+    last = np.uint32((255 << (8 * bytes_per_row - width)) & 255)
+    for i in range(n):
+        for r in range(rows):
+            for j in range(bytes_per_row):
+                place = r * width + 8 * j
+                shift = np.uint32(place & 7)
+                first = place >> 3
+                word = np.uint32(packed[i, first]) << np.uint32(8)
+                if first + 1 < size:
+                    word |= np.uint32(packed[i, first + 1])
+                out[i * rows + r, j] = (word >> (np.uint32(8) - shift)) & np.uint32(255)
+            out[i * rows + r, bytes_per_row - 1] &= last
     return out

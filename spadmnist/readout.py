@@ -125,9 +125,19 @@ class Recorded:
         return Recorded(one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited"))
 
 
-def spans(events: Events) -> tuple[np.ndarray, np.ndarray]:
-    """(detections, s from the first to the last stamp) of each row."""
-    if events.ticks is None:
-        return kernels.spans(events.times, events.offsets)
-    counts, span = kernels.spans(events.ticks, events.offsets)
-    return counts, span * events.tick
+def summarised(pixels: int, tr: Events | None, frames: Frames | None) -> Recorded:
+    """The streams with the sums that reconstructions need (`waited` only where STR was recorded)."""
+    recorded = Recorded(pixels)
+    if tr is not None:
+        counts, span = kernels.spans(tr.times if tr.ticks is None else tr.ticks, tr.offsets)
+        recorded = Recorded(pixels, tr, counts, span if tr.tick is None else span * tr.tick)
+    if frames is None:
+        return recorded
+    ones = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int32)
+    waited = None
+    if frames.first is not None:
+        first = frames.first
+        total = kernels.row_totals(first.times if first.ticks is None else first.ticks, first.offsets)
+        total = total if first.tick is None else total * first.tick
+        waited = total + (frames.frames - ones) * frames.frame_time
+    return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited)

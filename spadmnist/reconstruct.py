@@ -16,6 +16,8 @@ from . import kernels
 from .plugins import Plugin, Registry
 from .readout import Recorded
 
+_ROWS_AT_ONCE = 1 << 15  # pixels whose arithmetic stays in the processor's cache
+
 # what a method may ask for (columns of Recorded) -> the readout that it comes from
 COLUMNS = {"counts": "tr", "span": "tr", "ones": "qis", "waited": "str"}
 
@@ -71,12 +73,15 @@ class Method(Plugin, abstract=True):
             # a function of one small integer: worked out once for each value that occurs
             values = np.arange(int(columns[0].max(initial=0)) + 1)
             table, where = self._finite(settings, values)
-            return table.astype(np.float32)[columns[0]], where[columns[0]]
-        # no detection, no information: 0, and most pixels of a dim image need no arithmetic
-        seen = np.flatnonzero(columns[0])
+            values = table.astype(np.float32).take(columns[0])
+            return values, where.take(columns[0]) if where.any() else np.zeros(values.shape, bool)
         values = np.zeros(columns[0].shape, np.float32)
         where = np.zeros(columns[0].shape, bool)
-        values[seen], where[seen] = self._finite(settings, *(column[seen] for column in columns))
+        for start in range(0, len(values), _ROWS_AT_ONCE):
+            part = slice(start, start + _ROWS_AT_ONCE)
+            # no detection, no information: 0, and most pixels of a dim image need no arithmetic
+            seen = start + np.flatnonzero(columns[0][part])
+            values[seen], where[seen] = self._finite(settings, *(column[seen] for column in columns))
         return values, where
 
     def _finite(self, settings: Settings, *columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

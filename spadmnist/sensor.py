@@ -22,7 +22,7 @@ from .effects.tdc import Tdc
 from .errors import EffectError, InputError, SpadError
 from .events import Children, Events, Layout
 from .plugins import blame, settle, source_file
-from .readout import Frames, Recorded, no_detection, spans, unsigned_for
+from .readout import Frames, Recorded, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
 
 RULES = ("paper", "device")
@@ -236,18 +236,15 @@ class Sensor:
             latent = self._latent(events, conditions, streams, dead_times)
             detected = latent.fired(dead_times, conditions, frames=False) if "tr" in readouts else events
             candidates = latent.fired(dead_times, conditions, frames=True) if framed else events
-        recorded = Recorded(pixels)
+        tr, frames = None, None
         if "tr" in readouts:
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
                     detected = self._apply(effect, detected, streams)
-            detected = self._narrow(detected, conditions.exposure, "TR stamps")
-            counts, span = spans(detected)
-            recorded = Recorded(pixels, detected, counts, span)
+            tr = self._narrow(detected, conditions.exposure, "TR stamps")
         if framed:
-            frames, ones, waited = self._frames(candidates, conditions, streams, "str" in readouts)
-            recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited)
-        return recorded
+            frames = self._frames(candidates, conditions, streams, "str" in readouts)
+        return summarised(pixels, tr, frames)
 
     def _arrivals(self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams) -> Events:
         """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""
@@ -358,28 +355,23 @@ class Sensor:
             )
         return _Latent(np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels)
 
-    def _frames(
-        self, events: Events, conditions: Conditions, streams: Streams, stamped: bool
-    ) -> tuple[Frames, np.ndarray, np.ndarray]:
+    def _frames(self, events: Events, conditions: Conditions, streams: Streams, stamped: bool) -> Frames:
         pixels = events.pixels
         out = np.empty(len(events) + 1)
-        bits, offsets, ones, waited = kernels.frame_readout(
-            events.times, events.offsets, conditions.frames, conditions.frame_time, conditions.frame_period, 0.0, 0, out
+        bits, offsets = kernels.frame_readout(
+            events.times, events.offsets, conditions.frames, conditions.frame_time, conditions.frame_period, out
         )
-        first = Events(out[: offsets[-1]], offsets, pixels)
-        for effect in self.at("timing"):
-            first = self._apply(effect, first, streams)
-        if first.tick:
-            assert first.ticks is not None
-            none = no_detection(conditions.frame_time, first.tick)
-            # what rounds to the end of the frame would mean 'none'
-            first = Events(None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick)
-            first = self._narrow(first, conditions.frame_time, "STR stamps")
-            assert first.ticks is not None and first.tick is not None
-            sums = kernels.row_totals(first.ticks, offsets)
-            waited = sums * first.tick + (conditions.frames - ones) * conditions.frame_time
-        frames = Frames(bits, first if stamped else None, conditions.frames, conditions.frame_time, pixels)
-        return frames, ones, waited
+        first = None
+        if stamped:
+            first = Events(out[: offsets[-1]], offsets, pixels)
+            for effect in self.at("timing"):
+                first = self._apply(effect, first, streams)
+            if first.ticks is not None and first.tick is not None:
+                none = no_detection(conditions.frame_time, first.tick)
+                # what rounds to the end of the frame would mean 'none'
+                first = Events(None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick)
+                first = self._narrow(first, conditions.frame_time, "STR stamps")
+        return Frames(bits, first, conditions.frames, conditions.frame_time, pixels)
 
     def _narrow(self, events: Events, end: float, what: str) -> Events:
         if events.ticks is None or events.tick is None:

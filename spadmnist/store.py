@@ -53,6 +53,7 @@ ROWS_OF_TICKS = 1 << 16  # per chunk of a flat axis: 256 KiB of uint32, 0.1 ms t
 
 _LARGEST_CHUNK = 1 << 28  # bytes; what one chunk may take in memory, when written and when read
 _LARGEST_JSON = 1 << 20  # bytes
+_LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 _TYPES = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+ -]*(?<![. ])")
 
@@ -265,6 +266,9 @@ def _sync(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
+        if hasattr(os, "posix_fadvise") and os.fstat(handle).st_size >= _LARGE_FILE:
+            # what is safe on disk need not push others' data out of memory; its pages serve the next shard
+            os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
     finally:
         os.close(handle)
 
@@ -276,7 +280,7 @@ def _install(new: Path, final: Path, aside: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
-        os.rename(final, aside)  # a full folder cannot be replaced in one step: for a moment there is none
+        os.rename(final, aside)  # no full folder is replaced at once; for a moment none is there
         try:
             os.rename(new, final)
         except OSError:
@@ -361,15 +365,23 @@ def write_groups(root: str | os.PathLike[str], groups: Mapping[str, Mapping[str,
 
     HDF5 has files and folders there, and nothing is written.
     """
-    _check_format(format)
     records: Files = {}
-    for path, attributes in groups.items() if format == "zarr" else ():
-        relative = f"{location(path, format)}/zarr.json" if path else "data.zarr/zarr.json"
-        own = _check_attributes(attributes, path or "data.zarr")
-        with _writing(Path(root) / relative, 0):
+    for relative, data in group_files(groups, format).items():
+        with _writing(Path(root) / relative, len(data)):
             final = _inside(Path(root), relative)
-        records[relative] = commit_file(final, _group_json(own), temporary(root))
+        records[relative] = commit_file(final, data, temporary(root))
     return records
+
+
+def group_files(groups: Mapping[str, Mapping[str, Any]], format: str) -> dict[str, bytes]:
+    """What `write_groups` writes: path relative to the root -> content."""
+    _check_format(format)
+    return {
+        f"{location(path, format)}/zarr.json" if path else "data.zarr/zarr.json": _group_json(
+            _check_attributes(attributes, path or "data.zarr")
+        )
+        for path, attributes in (groups.items() if format == "zarr" else ())
+    }
 
 
 def _check_columns(columns: Mapping[str, Column], path: str) -> dict[str, Column]:
@@ -454,7 +466,7 @@ def _check_attributes(attributes: Mapping[str, Any], where: str) -> dict[str, An
     def plain(value: Any) -> bool:
         if type(value) is int:
             return -(2**63) <= value < 2**63
-        return type(value) is str or (type(value) is float and math.isfinite(value))
+        return (type(value) is str and "\0" not in value) or (type(value) is float and math.isfinite(value))
 
     for name, value in attributes.items():
         values = list(value) if isinstance(value, (list, tuple)) else [value]
@@ -676,12 +688,26 @@ def _hdf5_image(columns: Mapping[str, Column], attributes: Mapping[str, Any]) ->
 
 
 def _put_attributes(node: Any, attributes: Mapping[str, Any]) -> None:
+    """Text has a fixed length: what HDF5 keeps for text of any length makes it hang on some damaged files."""
+    import h5py
+
     for name, value in sorted(attributes.items()):
-        node.attrs[name] = np.array(value, "S") if value == "" else value
+        texts = [
+            text.encode() for text in (value if isinstance(value, list) else [value]) if isinstance(text, str)
+        ]
+        if texts:
+            dtype = h5py.string_dtype("utf-8", max(1, *map(len, texts)))
+            node.attrs.create(
+                name, np.array(texts if isinstance(value, list) else texts[0], dtype), dtype=dtype
+            )
+        else:
+            node.attrs[name] = value
 
 
 def _decode_hdf5(raw: bytes, into: np.ndarray, itemsize: int) -> None:
     """Undo fletcher32, deflate and shuffle, without ever making more than the chunk's size of them."""
+    if len(raw) < 8:
+        raise _Damaged("a chunk is too short")
     try:
         deflated = bytes(Fletcher32().decode(raw))
     except (RuntimeError, ValueError):
@@ -1059,6 +1085,11 @@ def _get_attributes(node: Any) -> dict[str, Any]:
     for name in sorted(node.attrs):
         if name in ("CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"):
             continue
-        value = node.attrs[name]
-        attributes[name] = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+        dtype = node.attrs.get_id(name).dtype
+        if dtype.kind not in "Sif":
+            raise _Damaged(
+                f"attribute {name} of {node.name} is {dtype}, not a number or text of fixed length"
+            )
+        value = np.asarray(node.attrs[name])
+        attributes[name] = (np.strings.decode(value, "utf-8") if dtype.kind == "S" else value).tolist()
     return attributes

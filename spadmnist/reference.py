@@ -1,0 +1,135 @@
+"""The reference of effects and reconstruction methods as text, made from their classes."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+from . import units
+from .effects import STAGES, Effect
+from .plugins import Parameter, Plugin, source_file
+from .readout import READOUTS
+from .reconstruct import Method
+
+_WIDTH = 100
+
+
+def effect_list() -> str:
+    """Every effect: name, stage, first line of its docstring; in the order of the stages."""
+    stages = list(STAGES)
+    known: list[type[Effect]] = [Effect.registry.find(name) for name in Effect.registry]
+    known.sort(key=lambda cls: (stages.index(cls.stage), cls.name))
+    return _listing(("effect", "stage", "what it is"), [(cls.name, cls.stage, cls.summary()) for cls in known])
+
+
+def effect_page(name: str) -> str:
+    """All about one effect, with the YAML to paste. Raises KeyError with a sentence where there is none."""
+    cls: type[Effect] = Effect.registry.find(name)
+    facts = [f"stage: {cls.stage}"]
+    if cls.after is not None:
+        facts.append(f"comes after {cls.after}")
+    values = ", ".join(f"{key}: {_yaml(declared)}" for key, declared in cls.parameters.items())
+    paste = ["In a config or a sensor file:", "", "  sensor:", "    effects:", f"      {cls.name}: {{{values}}}"]
+    return _page(cls, facts, paste)
+
+
+def method_list() -> str:
+    """Every reconstruction method: name, readouts it needs, unit, first line of its docstring; TR first."""
+    known: list[type[Method]] = [Method.registry.find(name) for name in Method.registry]
+    known.sort(key=lambda cls: ([READOUTS.index(r) for r in cls.readouts()], cls.name))
+    rows = [(cls.name, " ".join(cls.readouts()), cls.unit, cls.summary()) for cls in known]
+    return _listing(("method", "needs", "unit", "what it is"), rows)
+
+
+def method_page(name: str) -> str:
+    """All about one method, with the YAML to paste. Raises KeyError with a sentence where there is none."""
+    cls: type[Method] = Method.registry.find(name)
+    use = "divided by the training median" if cls.normalised else "used as it is, never normalised"
+    facts = [f"needs: {', '.join(cls.readouts())}", f"unit: {cls.unit}", use]
+    return _page(cls, facts, ["In a config:", "", f"  reconstruct: [{cls.name}]"])
+
+
+def _page(cls: type[Plugin], facts: Sequence[str], paste: Sequence[str]) -> str:
+    """Name and facts, the file if it is a user's, docstring, parameters, YAML."""
+    head = [cls.name, "; ".join(facts)]
+    if cls.__module__.partition(".")[0] != __package__:
+        head.append(f"file: {source_file(cls)}")
+    blocks = [head, _docstring(cls), _parameters(list(cls.parameters.values())), paste]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def _docstring(cls: type[Plugin]) -> list[str]:
+    """Its paragraphs, filled anew; a source begins a line of its own."""
+    out: list[str] = []
+    for number, paragraph in enumerate((inspect.getdoc(cls) or "").split("\n\n")):
+        out += [""] if number else []
+        for part in re.split(r"\s(?=Source:)", paragraph):
+            out += textwrap.wrap(" ".join(part.split()), _WIDTH)
+    return out
+
+
+def _parameters(declared: Sequence[Parameter]) -> list[str]:
+    """A table, and below each row what the parameter is."""
+    rows = [(p.name, p.symbol or "-", *_numbers(p), _varies(p)) for p in declared]
+    if not rows:
+        return []
+    header = ("parameter", "symbol", "unit", "default", "allowed", "off", "search", "varies by")
+    lines = _aligned([header, *rows])
+    out = lines[:1]
+    for line, parameter in zip(lines[1:], declared, strict=True):
+        out += [line, *textwrap.wrap(parameter.about, _WIDTH, initial_indent="    ", subsequent_indent="    ")]
+    return out
+
+
+def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
+    """(unit, default, allowed, off, search)."""
+    unit = declared.unit or "1"
+    if declared.unit == "bool":
+        return "-", _value(declared, declared.default), "true or false", _value(declared, declared.off), "-"
+    search = "-"
+    if declared.search is not None:
+        search = " to ".join(_value(declared, edge) for edge in declared.search)
+    default = "required" if declared.required else _value(declared, declared.default)
+    return unit, default, declared.allowed(), _value(declared, declared.off), search
+
+
+def _varies(declared: Parameter) -> str:
+    ways = {"pixel": declared.per_pixel, "wavelength": declared.by_wavelength}
+    return " or ".join(way for way, can in ways.items() if can) or "-"
+
+
+def _value(declared: Parameter, value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return units.show(value, declared.unit, 12)
+
+
+def _yaml(declared: Parameter) -> str:
+    """The default as a config writes it; where there is none, something of the right form."""
+    if declared.default is not None:
+        return _value(declared, declared.default)
+    if declared.per_pixel:
+        return f"{{file: {declared.name}.npy}}"
+    return "true" if declared.unit == "bool" else units.example(declared.unit).removesuffix(" %")
+
+
+def _listing(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose last column is wrapped."""
+    left = _aligned([row[:-1] for row in (header, *rows)], pad_last=True)
+    indent = len(left[0]) + 2
+    out = []
+    for start, row in zip(left, (header, *rows), strict=True):
+        about = textwrap.wrap(row[-1], _WIDTH - indent) or [""]
+        out += [f"{start}  {about[0]}".rstrip(), *(" " * indent + line for line in about[1:])]
+    return "\n".join(out)
+
+
+def _aligned(rows: Sequence[Sequence[str]], pad_last: bool = False) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    return lines if pad_last else [line.rstrip() for line in lines]

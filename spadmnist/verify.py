@@ -1,0 +1,250 @@
+"""Does a dataset still hold, byte for byte, what was made? And: make exactly the damaged files again."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import config, dataset, factory, store
+from .config import Experiment
+from .dataset import CONFIG, MANIFEST, STATE, Shard
+from .errors import InputError, SpadError
+from .factory import Progress
+from .images import Images
+from .store import ShardReader
+
+_PIECE = 1 << 22
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Files that are not as the manifest says, relative to the dataset's folder; files: how many were read."""
+
+    changed: tuple[str, ...]
+    missing: tuple[str, ...]
+    extra: tuple[str, ...]
+    files: int
+
+    def __bool__(self) -> bool:
+        return bool(self.changed or self.missing or self.extra)
+
+
+def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
+    """Read every byte of a dataset. Raises InputError where the folder never was a dataset."""
+    manifest = _manifest(root)
+    if manifest is None:
+        state = [MANIFEST] if (root / MANIFEST).exists() else []
+        return Damage(tuple(state), () if state else (MANIFEST,), (), 0)
+    listed: dict[str, dict[str, Any]] = manifest["files"]
+    found = set(_walk(root))
+    present = sorted(found & set(listed))
+    changed = []
+    progress.start("reading", sum(int(listed[name]["bytes"]) for name in present), 0)
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        for name, same in zip(present, pool.map(lambda n: _same(root / n, listed[n]), present), strict=True):
+            progress.advance(int(listed[name]["bytes"]), name)
+            if not same:
+                changed.append(name)
+    progress.stop()
+    if not dataset.read_manifest(root)[1]:
+        changed.append(MANIFEST)
+    return Damage(
+        tuple(sorted(changed)),
+        tuple(sorted(set(listed) - found)),
+        tuple(sorted(found - set(listed) - {MANIFEST})),
+        len(present) + 1,
+    )
+
+
+def _manifest(root: Path) -> dict[str, Any] | None:
+    """The manifest, None where a dataset has lost it. Raises InputError where there never was one."""
+    try:
+        return dataset.read_manifest(root)[0]
+    except InputError:
+        once = (root / CONFIG).is_file() and ((root / "data.zarr").is_dir() or (root / "data").is_dir())
+        if not once or (root / STATE / "plan.json").exists():
+            raise
+        return None
+
+
+def _walk(root: Path) -> Iterator[str]:
+    for folder, folders, files in os.walk(root):
+        for name in files + [f for f in folders if os.path.islink(os.path.join(folder, f))]:
+            yield os.path.relpath(os.path.join(folder, name), root).replace(os.sep, "/")
+
+
+def _same(path: Path, listed: Mapping[str, Any]) -> bool:
+    digest = hashlib.sha256()
+    try:
+        # a link is not the file, wherever it leads
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(handle, "rb") as file:
+            facts = os.fstat(file.fileno())
+            if not stat.S_ISREG(facts.st_mode) or facts.st_size != listed["bytes"]:
+                return False
+            while piece := file.read(_PIECE):
+                digest.update(piece)
+    except OSError:
+        return False
+    return digest.hexdigest() == listed["sha256"]
+
+
+# --- repair -------------------------------------------------------------------------------------------------------
+
+
+def repair(
+    root: Path,
+    damage: Damage,
+    jobs: int,
+    images_dir: Path | None = None,
+    progress: Progress = Progress(),  # noqa: B008
+) -> list[str]:
+    """Make exactly the damaged files again; what does not belong there is moved beside the dataset.
+
+    The images come from the dataset itself where they are intact, else from where the config says. Without a
+    manifest everything is simulated again and compared. Returns what was done, a line each.
+    """
+    manifest = None if {MANIFEST} & {*damage.changed, *damage.missing} else dataset.read_manifest(root)[0]
+    experiment = _experiment(root, manifest, damage)
+    if manifest is not None and manifest["versions"] != factory.versions():
+        wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions()[k] != v)
+        raise SpadError(f"{root}: was made with {wanted}; install these versions to make the same bytes again")
+    splits = _images(root, manifest, experiment, damage, images_dir)
+    identity = factory.identity(experiment, splits)
+    if manifest is not None:
+        lines = [key for key in identity if manifest.get(key) != identity[key]]
+        if lines:
+            raise SpadError(
+                f"{root}: cannot be made again from what is here: {', '.join(lines)} differ from the manifest's; "
+                "give the same images (--images-dir) and plug-ins (--plugin)"
+            )
+    did: list[str] = []
+    with factory.locked(root):
+        shards = dataset.shards_of(experiment, splits)
+        bad = set(damage.changed) | set(damage.missing)
+        if manifest is None:
+            factory.begin(root, identity)
+            again = list(shards)
+        else:
+            again = [s for s in shards if any(_belongs(name, s, experiment.format) for name in bad)]
+        did += _remake(experiment, splits, root, again, manifest, jobs, progress)
+        did += _set_aside(root, damage.extra)
+        if manifest is None:
+            factory.finish(experiment, root, identity, shards, jobs, progress)
+            did.append(f"made again: {MANIFEST}")
+        else:
+            small, _ = factory.small_files(experiment, shards, manifest["normalisation"])
+            for name, data in small.items():
+                if name in bad:
+                    store.commit_file(root / name, data, store.temporary(root))
+                    did.append(f"made again: {name}")
+            shutil.rmtree(root / STATE)
+    return did
+
+
+def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage) -> Experiment:
+    """From the manifest where it is intact, else from the config file."""
+    if manifest is None:
+        return config.read(root / CONFIG)
+    text = factory.config_text(manifest["config"])
+    lost = [name for name in manifest["maps"] if name in {*damage.changed, *damage.missing}]
+    if lost:
+        raise SpadError(f"{root / lost[0]}: the sensor's map is lost, and it cannot be made again; put it back")
+    return config.build(config.document.parse(text, str(root / CONFIG)), root)
+
+
+def _images(
+    root: Path,
+    manifest: dict[str, Any] | None,
+    experiment: Experiment,
+    damage: Damage,
+    images_dir: Path | None,
+) -> Mapping[str, Images]:
+    """The dataset's own copies where all of them are intact and whole blocks, else the config's source."""
+    bad = {*damage.changed, *damage.missing}
+    if manifest is not None and images_dir is None and experiment.sensor.block == 1:
+        own = [s for s in dataset.shards_in(manifest) if s.level is None]
+        if not any(_belongs(name, s, experiment.format) for s in own for name in bad):
+            splits: dict[str, Images] = {}
+            for split in dict.fromkeys(s.split for s in own):
+                readers = [ShardReader(root, s.path, experiment.format) for s in own if s.split == split]
+                pixels = np.concatenate([r.read("pixels") for r in readers])
+                labelled = "labels" in readers[0].names
+                labels = np.concatenate([r.read("labels") for r in readers]) if labelled else None
+                splits[split] = Images(pixels, labels, manifest["images"]["white"])
+            return splits
+    return experiment.load_images(images_dir)
+
+
+def _belongs(name: str, shard: Shard, format: str) -> bool:
+    place = store.location(shard.path, format)
+    return name == place or name.startswith(place + "/")
+
+
+def _remake(
+    experiment: Experiment,
+    splits: Mapping[str, Images],
+    root: Path,
+    shards: Sequence[Shard],
+    manifest: dict[str, Any] | None,
+    jobs: int,
+    progress: Progress,
+) -> list[str]:
+    """Simulate shards into a folder apart, and put in place the files that differ from what is there."""
+    apart = root / STATE / "again"
+    by_path = {s.path: s for s in shards}
+    job = factory.job_of(experiment)
+    did: list[str] = []
+
+    def tasks(paths: Sequence[str]) -> Iterator[Any]:
+        return (factory.task_of(experiment, job, apart, by_path[p], splits[by_path[p].split]) for p in paths)
+
+    def done(path: str, result: tuple[str, store.Files]) -> None:
+        progress.advance(1, path)
+        for name, facts in result[1].items():
+            if manifest is not None and manifest["files"].get(name) != facts:
+                raise SpadError(f"{root / name}: what is made now is not what the manifest lists; generate the dataset anew")
+            if not _same(root / name, facts):
+                (root / name).parent.mkdir(parents=True, exist_ok=True)
+                if (root / name).is_symlink():
+                    (root / name).unlink()
+                os.replace(apart / name, root / name)
+                did.append(f"made again: {name}")
+        if manifest is None:
+            factory.note(root, by_path[path], result[1])
+
+    progress.start("making again", len(shards), 0)
+    if shards:
+        factory.run_tasks(factory.make_shard, tasks, list(by_path), jobs, done)
+    progress.stop()
+    return did
+
+
+def _set_aside(root: Path, extra: Sequence[str]) -> list[str]:
+    """Move what does not belong to the dataset beside it: it may be somebody's only copy."""
+    aside = root.resolve().parent / f"{root.resolve().name}.extra"
+    did = []
+    for name in extra:
+        if name.startswith(f"{STATE}/"):
+            continue  # left by a run that was interrupted; goes with the state
+        target = aside / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(root / name, target)
+        did.append(f"moved to {target}: {name}")
+        folder = (root / name).parent
+        while folder != root and not any(folder.iterdir()):
+            folder.rmdir()
+            folder = folder.parent
+    return did
+
+
+__all__ = ["Damage", "repair", "verify"]
