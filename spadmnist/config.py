@@ -189,7 +189,9 @@ class Experiment:
                     return level
             except ValueError:
                 continue
-        raise KeyError(f"{text!r} is not a light level here; there are {', '.join(x.text for x in self.levels)}")
+        raise KeyError(
+            f"{text!r} is not a light level here; there are {', '.join(x.text for x in self.levels)}"
+        )
 
     # --- images --------------------------------------------------------------------------------------------------
 
@@ -223,7 +225,9 @@ class Experiment:
             start - first, stop - first
         )
 
-    def simulate_block(self, level: Level, split: str, pixels: np.ndarray, white: float, first: int) -> Recorded:
+    def simulate_block(
+        self, level: Level, split: str, pixels: np.ndarray, white: float, first: int
+    ) -> Recorded:
         """As `simulate`, for the images `pixels` whose first has the index `first` (a multiple of the block)."""
         numbers = np.arange(first, first + len(pixels), dtype=np.uint64)
         streams = self.streams(level, split, numbers)
@@ -309,7 +313,9 @@ def build(
 ) -> Experiment:
     """An Experiment from a parsed config; see `read`."""
     if not isinstance(source.value, Mapping):
-        raise ConfigError([f"{source.name}: is not a config; it begins with seed, scene, recording, ... (see configs/)"])
+        raise ConfigError(
+            [f"{source.name}: is not a config; it begins with seed, scene, recording, ... (see configs/)"]
+        )
     raw = dict(source.value)
     if seed is not None:
         raw["seed"] = seed
@@ -387,9 +393,8 @@ def _sentence(item: Any, model: type[_Model], source: Document, path: tuple[Any,
     value = item.get("input")
     if kind == "extra_forbidden":
         known = _fields_at(model, location[:-1])
-        return (
-            f"{place} is not an entry here.{did_you_mean(str(location[-1]), known)}"
-            + (f" Allowed are {', '.join(known)}" if known else "")
+        return f"{place} is not an entry here.{did_you_mean(str(location[-1]), known)}" + (
+            f" Allowed are {', '.join(known)}" if known else ""
         )
     if kind == "missing":
         return f"{source.place(full)} is missing"
@@ -439,7 +444,9 @@ def _sensor_file(
     if inner:
         for key in found.value:
             if key != "sensor":
-                problems.append(f"{found.place((key,))} is not an entry of a sensor file; it holds sensor: alone")
+                problems.append(
+                    f"{found.place((key,))} is not an entry of a sensor file; it holds sensor: alone"
+                )
     return found, file.resolve().parent, ("sensor",) if inner else ()
 
 
@@ -459,14 +466,22 @@ def read_sensor(
                 effects.append(effect)
         # its own reading was done above: pydantic need not complain a second time
         listed = {str(name): {} for name in listed}
-    model = _validated(_Sensor, {**raw, "effects": listed} if "effects" in raw else raw, source, path, problems)
+    model = _validated(
+        _Sensor, {**raw, "effects": listed} if "effects" in raw else raw, source, path, problems
+    )
     if model is None:
         return None, None
     layout = Layout(
-        model.layout.rows, model.layout.columns, float(model.layout.pixel_area), float(model.layout.fill_factor)
+        model.layout.rows,
+        model.layout.columns,
+        float(model.layout.pixel_area),
+        float(model.layout.fill_factor),
     )
     assert model.rules in RULES
-    return Sensor(layout, effects, model.rules, model.chip_seed, model.name), (model, raw.get("effects") or {})
+    return Sensor(layout, effects, model.rules, model.chip_seed, model.name), (
+        model,
+        raw.get("effects") or {},
+    )
 
 
 def _effect(
@@ -480,7 +495,9 @@ def _effect(
     if values is None:
         values = {}
     if not isinstance(values, Mapping):
-        problems.append(f"{source.place(path)}: {_brief(values)} is not a list of parameters such as {{rate: 100 Hz}}")
+        problems.append(
+            f"{source.place(path)}: {_brief(values)} is not a list of parameters such as {{rate: 100 Hz}}"
+        )
         return None
     settled: dict[str, Any] = {}
     before = len(problems)
@@ -598,7 +615,9 @@ def _check_clock(
     try:
         pdp = sensor.nominal_pdp(conditions.wavelength)
         if pdp <= 0:
-            problems.append(f"{place}.detection.pdp: is 0, so that no flux can be estimated; it must be more than 0")
+            problems.append(
+                f"{place}.detection.pdp: is 0, so that no flux can be estimated; it must be more than 0"
+            )
     except SpadError as error:
         problems.append(f"{sensor_source.place((*sensor_path, 'effects', 'detection', 'pdp'))}: {error}")
     try:
@@ -681,5 +700,3 @@ def _default_text(declared: plugins.Parameter) -> Any:
     if declared.unit in ("", "bool") or isinstance(value, bool):
         return value
     return units.show(value, declared.unit, 12)
-
-

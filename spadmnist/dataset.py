@@ -39,6 +39,7 @@ STATE = ".spadmnist"
 _EVENTS_PER_SHARD = 6_000_000
 _BYTES_PER_SHARD = 56 * 2**20  # before compression
 _IMAGES_PER_SHARD = 4096
+_BYTES_PER_CHUNK = 4 * 2**20
 _IMAGES_PER_CHUNK = 32  # one image is read in 0.1 ms, and twice as many would compress only 0.5 % better
 
 
@@ -110,11 +111,19 @@ def image_columns(images: Images, start: int, stop: int) -> dict[str, Column]:
     dims = ("image", "channel", "y", "x")[: pixels.ndim] if pixels.ndim == 4 else ("image", "y", "x")
     columns = {
         "pixels": Column(
-            pixels, dims, "1", "original image", "counts", _IMAGES_PER_CHUNK, {"white": float(images.white)}
+            pixels,
+            dims,
+            "1",
+            "original image",
+            "counts",
+            _per_chunk(pixels[:1].nbytes),
+            {"white": float(images.white)},
         )
     }
     if images.labels is not None:
-        columns["labels"] = Column(np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts")
+        columns["labels"] = Column(
+            np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts"
+        )
     return columns
 
 
@@ -127,22 +136,56 @@ def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Colu
         columns |= _ragged(recorded.tr, "tr", "event", "since the start of the exposure", dims, shape, True)
     if recorded.frames is not None:
         f = recorded.frames
+        # a line is a row of pixels: its bits lie next to each other, and a large sensor is cut between lines
+        lines = _packed(f.bits, f.frames, shape[-1])
         columns["frames/bits"] = Column(
-            kernels.pack_rows(f.bits, f.frames, per_image),
-            ("image", "frame_byte"),
+            lines,
+            ("line", "frame_byte"),
             "1",
-            "QIS: is there a detection? One bit per frame, pixel after pixel, most significant bit first",
+            "QIS: is there a detection? A line of pixels each; one bit per frame, pixel after pixel, high bit first",
             "bits",
-            _IMAGES_PER_CHUNK,
-            {"frames": f.frames, "unpacked_shape": [*shape, f.frames], "bitorder": "big"},
+            _lines_per_chunk(lines.shape[1], per_image // shape[-1]),
+            {
+                "frames": f.frames,
+                "columns": shape[-1],
+                "lines_per_image": per_image // shape[-1],
+                "bitorder": "big",
+            },
         )
         if f.first is not None:
-            columns |= _ragged(f.first, "frames", "first_event", "since the start of its frame", dims, shape, False)
+            columns |= _ragged(
+                f.first, "frames", "first_event", "since the start of its frame", dims, shape, False
+            )
     return columns
 
 
+def _packed(bits: np.ndarray, frames: int, columns: int) -> np.ndarray:
+    """(lines, ceil(columns * frames / 8)) uint8 from (rows, ceil(frames / 8))."""
+    if frames % 8 == 0:
+        return bits.reshape(-1, columns * frames // 8)
+    return kernels.pack_rows(bits, frames, columns)
+
+
+def _per_chunk(size: int) -> int:
+    """How many entries of so many bytes go into a chunk."""
+    return int(max(1, min(_IMAGES_PER_CHUNK, _BYTES_PER_CHUNK // max(1, size))))
+
+
+def _lines_per_chunk(size: int, per_image: int) -> int:
+    """Whole images where they are small, else as many lines of `size` bytes as fit."""
+    if size * per_image <= _BYTES_PER_CHUNK:
+        return _per_chunk(size * per_image) * per_image
+    return int(max(1, _BYTES_PER_CHUNK // size))
+
+
 def _ragged(
-    events: Events, group: str, axis: str, since: str, dims: tuple[str, ...], shape: tuple[int, ...], counted: bool
+    events: Events,
+    group: str,
+    axis: str,
+    since: str,
+    dims: tuple[str, ...],
+    shape: tuple[int, ...],
+    counted: bool,
 ) -> dict[str, Column]:
     """The stamps of a stream and where each image's begin.
 
@@ -165,14 +208,23 @@ def _ragged(
     columns = {
         f"{group}/{name}": Column(values, (axis,), unit, about, "ticks", store.ROWS_OF_TICKS, attributes),
         f"{group}/starts": Column(
-            starts.astype(np.uint64), (f"{axis}_start",), "1", "where each image's stamps begin, and the end", "counts"
+            starts.astype(np.uint64),
+            (f"{axis}_start",),
+            "1",
+            "where each image's stamps begin, and the end",
+            "counts",
         ),
     }
     if counted:
         counts = events.counts
         kind = np.uint16 if not len(counts) or counts.max() < 2**16 else np.uint32
         columns[f"{group}/counts"] = Column(
-            counts.astype(kind).reshape(-1, *shape), dims, "1", "recorded detections", "counts", _IMAGES_PER_CHUNK
+            counts.astype(kind).reshape(-1, *shape),
+            dims,
+            "1",
+            "recorded detections",
+            "counts",
+            _per_chunk(4 * events.pixels),
         )
     return columns
 
@@ -192,8 +244,8 @@ def reconstruction_columns(
             method.unit,
             method.summary().rstrip("."),
             "floats",
-            _IMAGES_PER_CHUNK,
-            {"saturated_pixels": int(saturated.sum())},
+            _per_chunk(4 * int(np.prod(shape))),
+            {"saturated_pixels": saturated},
         )
     return columns
 
@@ -205,8 +257,10 @@ def read_shard(reader: ShardReader, experiment: Experiment) -> tuple[Recorded, t
     if "tr" in experiment.readouts:
         n, *shape = reader.shape("tr/counts")
     else:
-        n = reader.shape("frames/bits")[0]
-        shape = list(reader.array_attributes("frames/bits")["unpacked_shape"])[:-1]
+        lines = reader.array_attributes("frames/bits")["lines_per_image"]
+        n = reader.shape("frames/bits")[0] // lines
+        shape = list(experiment.sensor.layout.shape)
+        shape = [lines // shape[0], *shape] if lines > shape[0] else shape
     pixels = int(np.prod(shape))
     if "tr" in experiment.readouts:
         tr = read_tr(reader, 0, n, pixels, experiment.sensor.tick)
@@ -223,10 +277,22 @@ def read_tr(reader: ShardReader, start: int, stop: int, pixels: int, tick: float
 
 
 def read_frames(
-    reader: ShardReader, start: int, stop: int, pixels: int, tick: float, frames: int, frame_time: float, stamped: bool
+    reader: ShardReader,
+    start: int,
+    stop: int,
+    pixels: int,
+    tick: float,
+    frames: int,
+    frame_time: float,
+    stamped: bool,
 ) -> Frames:
     """The frames of some images of a shard; stamped: with the first stamps (STR)."""
-    bits = kernels.unpack_rows(reader.read("frames/bits", start, stop), frames, pixels)
+    facts = reader.array_attributes("frames/bits")
+    lines = reader.read("frames/bits", start * facts["lines_per_image"], stop * facts["lines_per_image"])
+    if frames % 8 == 0:
+        bits = lines.reshape(-1, frames // 8)
+    else:
+        bits = kernels.unpack_rows(lines, frames, facts["columns"])
     first = None
     if stamped:
         counts = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
@@ -297,7 +363,9 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
         manifest = json.loads(raw)
         intact = isinstance(manifest, dict) and seal(manifest) == raw
     except (ValueError, RecursionError):
-        raise InputError(f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again") from None
+        raise InputError(
+            f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again"
+        ) from None
     if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
         raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
     if manifest["format"] != FORMAT:
@@ -507,7 +575,9 @@ class Dataset:
         if split is None:
             if len(self._splits) > 1:
                 names = " and ".join(self._splits)
-                raise KeyError(f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']")
+                raise KeyError(
+                    f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']"
+                )
             split = next(iter(self._splits))
         if split not in self._splits:
             raise KeyError(f"{split!r} is not a split here; there are {', '.join(self._splits)}")
@@ -520,7 +590,12 @@ class _Stored:
     """A part of a finished dataset."""
 
     def __init__(
-        self, root: Path, format: str, shards: Sequence[Shard], originals: Sequence[Shard], facts: dict[str, Any]
+        self,
+        root: Path,
+        format: str,
+        shards: Sequence[Shard],
+        originals: Sequence[Shard],
+        facts: dict[str, Any],
     ):
         self._shards = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in shards]
         self._originals = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in originals]
@@ -555,7 +630,9 @@ class _Stored:
         return self._facts["normalisation"].get(method)
 
     def originals(self, start: int, stop: int) -> np.ndarray:
-        return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
+        return _joined(
+            [reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)]
+        )
 
     def labels(self) -> np.ndarray | None:
         if "labels" not in self._originals[0][2].names:
@@ -580,7 +657,10 @@ class _Simulated:
     def _make(self, start: int, stop: int) -> Recorded:
         if self._last is None or self._last[0] != (start, stop):
             images = self._splits[self._split]
-            self._last = ((start, stop), self._experiment.simulate(self._level, self._split, images, start, stop))
+            self._last = (
+                (start, stop),
+                self._experiment.simulate(self._level, self._split, images, start, stop),
+            )
         return self._last[1]
 
     def recorded(self, start: int, stop: int, what: str) -> Any:
@@ -614,7 +694,9 @@ class _Simulated:
         return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
 
 
-def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()) -> Dataset:
+def open(
+    path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()
+) -> Dataset:
     """Open a dataset's folder, or a config file: then every image is simulated when it is asked for.
 
     images_dir: where the images of a config are looked for; plugin: files with effects that a config names.

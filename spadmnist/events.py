@@ -132,7 +132,9 @@ class Events:
             return "offsets decrease"
         times = self.times
         if times.dtype != np.float64 or times.ndim != 1 or len(times) != offsets[-1]:
-            return f"there are {times.shape} times of type {times.dtype}, but offsets for {offsets[-1]} float64"
+            return (
+                f"there are {times.shape} times of type {times.dtype}, but offsets for {offsets[-1]} float64"
+            )
         if not np.all(np.isfinite(times)):
             return "a time is not finite"
         later = np.diff(times) < 0

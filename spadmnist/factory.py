@@ -20,6 +20,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -70,6 +71,7 @@ class Progress:
     start: Callable[[str, float, float], None] = lambda what, total, done: None
     advance: Callable[[float, str], None] = lambda work, note: None
     stop: Callable[[], None] = lambda: None
+    notice: Callable[[str], None] = lambda text: None
 
 
 # --- in a worker --------------------------------------------------------------------------------------------------
@@ -107,7 +109,11 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     shape = task.pixels.shape[1:]
     columns = dataset.stream_columns(recorded, shape)
     columns |= dataset.reconstruction_columns(experiment, recorded, shape)
-    return columns, {**attributes, "level": shard.level, "statistics": json.dumps(dataset.statistics(recorded))}
+    return columns, {
+        **attributes,
+        "level": shard.level,
+        "statistics": json.dumps(dataset.statistics(recorded)),
+    }
 
 
 def _record_path(root: Path, shard: Shard) -> Path:
@@ -180,7 +186,8 @@ def run_tasks(
                 initargs=(os.getpid(),),
             ) as parallel:
                 calls = (
-                    delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
+                    delayed(_keyed)(function, key, task)
+                    for key, task in zip(missing, tasks(missing), strict=True)
                 )
                 for key, result in parallel(calls):
                     remaining.discard(key)
@@ -216,7 +223,9 @@ def locked(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder with -o") from None
+            raise SpadError(
+                f"{root}: another run is writing there; wait for it, or choose another folder with -o"
+            ) from None
         yield
     finally:
         os.close(handle)
@@ -232,7 +241,9 @@ def _writable(place: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = {errno.ENOSPC: "the disk is full", errno.EROFS: "it is read-only"}.get(error.errno or 0, error.strerror)
+        reason = {errno.ENOSPC: "the disk is full", errno.EROFS: "it is read-only"}.get(
+            error.errno or 0, error.strerror
+        )
         raise SpadError(f"{place}: cannot be written ({reason}); choose another place with -o") from None
 
 
@@ -252,7 +263,10 @@ def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, 
             "dtype": any_split.pixels.dtype.name,
             "white": float(any_split.white),
             "splits": {
-                split: {"images": experiment.wanted(images), "sha256": images.head(experiment.wanted(images)).sha256}
+                split: {
+                    "images": experiment.wanted(images),
+                    "sha256": images.head(experiment.wanted(images)).sha256,
+                }
                 for split, images in splits.items()
             },
         },
@@ -430,7 +444,7 @@ def _make(
         def tasks(paths: Sequence[str]) -> Iterator[Task]:
             return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split]) for p in paths)
 
-        _warm(experiment)
+        _warm(experiment, progress)
         run_tasks(make_shard, tasks, list(by_path), jobs, done)
     progress.stop()
 
@@ -463,13 +477,21 @@ def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: 
     return Task(job, str(root), shard, images.pixels[first:last], labels, images.white, first)
 
 
-def _warm(experiment: Experiment) -> None:
+def _warm(experiment: Experiment, progress: Progress) -> None:
     """Compile the kernels once, here, so that the workers find them in the cache."""
-    pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
-    if experiment.sensor.block == 1:
+    if experiment.sensor.block > 1:
+        return  # a user's effect is run for the images that are wanted, and for no others
+    hint = threading.Timer(
+        1.5, progress.notice, ["Compiling the simulation for this machine, once: about 20 s."]
+    )
+    hint.start()
+    try:
+        pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
         made = experiment.simulate_block(experiment.levels[0], "warm", pixels, 255, 0)
         dataset.stream_columns(made, experiment.sensor.layout.shape)
         dataset.reconstruction_columns(experiment, made, experiment.sensor.layout.shape)
+    finally:
+        hint.cancel()
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------
@@ -642,8 +664,9 @@ def small_files(
 
 def config_text(resolved: dict[str, Any]) -> str:
     """The config file of a finished dataset."""
-    return "# The config of this dataset with nothing left open. spadmnist.open reads this file, too.\n" + document.dump(
-        resolved
+    return (
+        "# The config of this dataset with nothing left open. spadmnist.open reads this file, too.\n"
+        + document.dump(resolved)
     )
 
 
@@ -654,7 +677,9 @@ def _level_attributes(
         return {"content": "original images and labels"}
     level = experiment.level(shard.level)
     unit = "lux" if level.kind == "lux" else "W/m^2"
-    medians = {f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None}
+    medians = {
+        f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None
+    }
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 
@@ -668,7 +693,8 @@ def _statistics(
         if shard.level is None:
             continue
         total = out[shard.level].setdefault(
-            shard.split, {"images": 0, "pixels": 0, "saturated_pixels": {m: 0 for m in experiment.methods}, "bytes": {}}
+            shard.split,
+            {"images": 0, "pixels": 0, "saturated_pixels": {m: 0 for m in experiment.methods}, "bytes": {}},
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels

@@ -62,7 +62,9 @@ _ONE_BITS = np.uint64(0x3FF0000000000000)
 _SQRT_HALF_SHIFT = np.uint64(0x3FF0000000000000 - 0x3FE6A09E00000000)
 _SQRT_HALF_BITS = np.uint64(0x3FE6A09E00000000)
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
-_MAGIC_BITS = np.uint64(0x4330000000000000)  # 2^52: adding it leaves an integer in the low bits of the mantissa
+_MAGIC_BITS = np.uint64(
+    0x4330000000000000
+)  # 2^52: adding it leaves an integer in the low bits of the mantissa
 _MAGIC = 4503599627370496.0
 
 
@@ -269,7 +271,17 @@ def _candidates(
                     if count > child_room or np.int64(k) + count > room:
                         return -1
                     left, child_block, found = _row_parents(
-                        count, hazard, left, child_block, image, child_key[0], child_key[1], child_key[2], parents, delays, 0
+                        count,
+                        hazard,
+                        left,
+                        child_block,
+                        image,
+                        child_key[0],
+                        child_key[1],
+                        child_key[2],
+                        parents,
+                        delays,
+                        0,
                     )
                     # the children stand apart until all are known, for their parents' places must stay
                     for child in range(found):
@@ -463,13 +475,16 @@ def merge(times, offsets, extra, extra_rows):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _record(times, start, stop, dead_time, out, used):  # type: ignore[no-untyped-def]
-    """Copy the events of a row that are more than the dead time after the last one copied (paper, lines 24-29)."""
+def _record(times, stamps, start, stop, dead_time, out, used):  # type: ignore[no-untyped-def]
+    """Append the stamps of a row's events that are more than the dead time after the last one appended.
+
+    Non-paralyzable (paper, lines 24-29): what is not recorded hides nothing.
+    """
     last = -np.inf
     for i in range(np.uint64(start), np.uint64(stop)):
         time = times[i]
         if time - last > dead_time:
-            out[used] = time
+            out[used] = stamps[i]
             used += np.uint64(1)
             last = time
     return used
@@ -479,17 +494,12 @@ def _record(times, start, stop, dead_time, out, used):  # type: ignore[no-untype
 def non_paralyzable(times, offsets, dead_times):  # type: ignore[no-untyped-def]
     """Remove what a non-paralyzable dead time hides. dead_times: (pixels,) s. Returns the kept indices (int64)."""
     pixels = dead_times.size
+    indices = np.arange(times.size)
     kept = np.empty(times.size, np.int64)
-    k = 0
+    k = np.uint64(0)
     for row in range(offsets.size - 1):
-        dead_time = dead_times[row % pixels]
-        last = -np.inf
-        for i in range(offsets[row], offsets[row + 1]):
-            if times[i] - last > dead_time:
-                kept[k] = i
-                k += 1
-                last = times[i]
-    return kept[:k].copy()
+        k = _record(times, indices, offsets[row], offsets[row + 1], dead_times[row % pixels], kept, k)
+    return kept[: np.int64(k)].copy()
 
 
 @_jit
@@ -702,7 +712,7 @@ def paper_line(
     places = np.empty(3, np.uint64)
     distances = np.empty(2)
     times = np.empty(1)
-    recorded = np.empty(1)
+    stamps = np.empty(1, ticks.dtype)
     frame = np.empty(1, np.uint32)
     first = np.empty(1, firsts.dtype)
     parents = np.empty(1, np.int64)
@@ -728,7 +738,7 @@ def paper_line(
             while total < 0:
                 if times.size < room:
                     times = np.empty(room)
-                    recorded = np.empty(room)
+                    stamps = np.empty(room, ticks.dtype)
                     frame = np.empty(room, np.uint32)
                     first = np.empty(room, firsts.dtype)
                     parents = np.empty(room, np.int64)
@@ -759,7 +769,7 @@ def paper_line(
             if want_tr:
                 ticks = _grown(ticks, used, used + total)
                 used = _tile_tr(
-                    times, tile, dead_times[begin:end], tick, recorded, ticks, used, row, offsets, counts, span
+                    times, tile, dead_times[begin:end], tick, stamps, ticks, used, row, offsets, counts, span
                 )
             if want_frames:
                 if want_stamps:
@@ -789,28 +799,40 @@ def paper_line(
 
 
 @_jit
-def _tile_tr(times, tile_offsets, dead_times, tick, recorded, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
-    """The TR readout of some pixels: dead time, then the stamps, appended to `ticks` from `used` on."""
-    k = np.uint64(0)
+def _tile_tr(times, tile_offsets, dead_times, tick, stamps, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
+    """The TR readout of some pixels: stamps, then the dead time; appended to `ticks` from `used` on."""
+    for i in range(np.uint64(tile_offsets[tile_offsets.size - 1])):
+        stamps[i] = _nearest(times[i] / tick)
+    k = np.uint64(used)
+    start = tile_offsets[0]
     for p in range(np.uint64(dead_times.size)):
         row = np.uint64(first_row) + p
-        before = k
-        k = _record(times, tile_offsets[p], tile_offsets[p + np.uint64(1)], dead_times[p], recorded, k)
-        counts[row] = k - before
-        offsets[row + np.uint64(1)] = np.uint64(used) + k
-    for j in range(k):
-        ticks[np.uint64(used) + j] = _nearest(recorded[j] / tick)
-    for p in range(np.uint64(dead_times.size)):
-        row = np.uint64(first_row) + p
-        if counts[row] > 1:
-            last = ticks[np.uint64(offsets[row + np.uint64(1)] - 1)]
-            span[row] = (last - ticks[np.uint64(offsets[row])]) * tick
-    return used + np.int64(k)
+        stop = tile_offsets[p + np.uint64(1)]
+        if stop > start:
+            before = k
+            k = _record(times, stamps, start, stop, dead_times[p], ticks, k)
+            counts[row] = k - before
+            span[row] = (ticks[k - np.uint64(1)] - ticks[before]) * tick
+            start = stop
+        offsets[row + np.uint64(1)] = k
+    return np.int64(k)
 
 
 @_jit
 def _tile_frames(
-    frame, first, tile_offsets, first_row, frames, frame_time, tick, bits, firsts, used, first_offsets, ones, waited
+    frame,
+    first,
+    tile_offsets,
+    first_row,
+    frames,
+    frame_time,
+    tick,
+    bits,
+    firsts,
+    used,
+    first_offsets,
+    ones,
+    waited,
 ):  # type: ignore[no-untyped-def]
     """The frames of some pixels, their stamps appended to `firsts` from `used` on."""
     empty = frames * frame_time

@@ -66,23 +66,22 @@ class Method(Plugin, abstract=True):
         """What a dataset stores where `estimate` is infinite."""
         return np.inf
 
-    def image(self, recorded: Recorded, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-        """What a dataset stores: ((rows,) float32, (rows,) bool: where it was saturated)."""
+    def image(self, recorded: Recorded, settings: Settings) -> tuple[np.ndarray, int]:
+        """What a dataset stores: ((rows,) float32, how many of them were saturated)."""
         columns = [getattr(recorded, name) for name in self.columns]
         if len(columns) == 1 and columns[0].dtype.kind in "iu":
             # a function of one small integer: worked out once for each value that occurs
-            values = np.arange(int(columns[0].max(initial=0)) + 1)
-            table, where = self._finite(settings, values)
-            values = table.astype(np.float32).take(columns[0])
-            return values, where.take(columns[0]) if where.any() else np.zeros(values.shape, bool)
+            table, where = self._finite(settings, np.arange(int(columns[0].max(initial=0)) + 1))
+            values = table.astype(np.float32).take(columns[0], mode="clip")
+            return values, int(np.count_nonzero(where.take(columns[0]))) if where.any() else 0
         values = np.zeros(columns[0].shape, np.float32)
-        where = np.zeros(columns[0].shape, bool)
+        saturated = 0
         for start in range(0, len(values), _ROWS_AT_ONCE):
-            part = slice(start, start + _ROWS_AT_ONCE)
             # no detection, no information: 0, and most pixels of a dim image need no arithmetic
-            seen = start + np.flatnonzero(columns[0][part])
-            values[seen], where[seen] = self._finite(settings, *(column[seen] for column in columns))
-        return values, where
+            seen = np.flatnonzero(columns[0][start : start + _ROWS_AT_ONCE]) + start
+            values[seen], where = self._finite(settings, *(column[seen] for column in columns))
+            saturated += int(np.count_nonzero(where))
+        return values, saturated
 
     def _finite(self, settings: Settings, *columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = self.estimate(settings, *columns)

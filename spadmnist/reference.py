@@ -22,7 +22,8 @@ def effect_list() -> str:
     stages = list(STAGES)
     known: list[type[Effect]] = [Effect.registry.find(name) for name in Effect.registry]
     known.sort(key=lambda cls: (stages.index(cls.stage), cls.name))
-    return _listing(("effect", "stage", "what it is"), [(cls.name, cls.stage, cls.summary()) for cls in known])
+    rows = [(cls.name, cls.stage, cls.summary()) for cls in known]
+    return _listing(("effect", "stage", "what it is"), rows)
 
 
 def effect_page(name: str) -> str:
@@ -32,8 +33,8 @@ def effect_page(name: str) -> str:
     if cls.after is not None:
         facts.append(f"comes after {cls.after}")
     values = ", ".join(f"{key}: {_yaml(declared)}" for key, declared in cls.parameters.items())
-    paste = ["In a config or a sensor file:", "", "  sensor:", "    effects:", f"      {cls.name}: {{{values}}}"]
-    return _page(cls, facts, paste)
+    yaml = ["  sensor:", "    effects:", f"      {cls.name}: {{{values}}}"]
+    return _page(cls, facts, ["In a config or a sensor file:", "", *yaml])
 
 
 def method_list() -> str:
@@ -80,7 +81,7 @@ def _parameters(declared: Sequence[Parameter]) -> list[str]:
     lines = _aligned([header, *rows])
     out = lines[:1]
     for line, parameter in zip(lines[1:], declared, strict=True):
-        out += [line, *textwrap.wrap(parameter.about, _WIDTH, initial_indent="    ", subsequent_indent="    ")]
+        out += [line, *(f"    {part}" for part in textwrap.wrap(parameter.about, _WIDTH - 4))]
     return out
 
 

@@ -5,12 +5,14 @@ The only module that imports matplotlib, and only where a picture is drawn.
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,31 +20,35 @@ from . import dataset as datasets
 from . import reconstruct, units
 from .dataset import Dataset, Part
 from .errors import SpadError
+from .events import Events
 from .readout import Frames
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _WIDTH = 100  # characters of a table
 
-# --- the table ----------------------------------------------------------------------------------------------------
+# --- the table ----------------------------------------------------------------------------------------------
 
 
 def level_rows(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One row per light level and split, in the config's order; a number that was not recorded is None.
 
-    detections, mean_per_pixel, empty_share: of TR (empty_share of the frames where there is no TR); ones, density:
-    frames with a detection, and their share of all frames; saturated_pixels: by method, saturated_total: their sum;
-    bytes, bytes_by_kind: on disk, without the original images; bits_per_detection: of TR, None where the format does
-    not tell the bytes of TR apart.
+    detections, mean_per_pixel, empty_share: of TR (empty_share of the frames where there is no TR).
+    ones, density: frames of a pixel with a detection, and their share.
+    saturated_pixels, saturated_total: by method, and their sum.
+    bytes, bytes_by_kind: on disk, without the original images.
+    bits_per_detection: of TR, None where the format does not tell the bytes of TR apart.
     """
     frames = manifest["settings"]["frames"]
     rows = []
     for level in manifest["levels"]:
-        for split, facts in manifest["statistics"][level["text"]].items():
+        for split in _splits(manifest):
             row = {"level": level["text"], "kind": level["kind"], "value": level["value"], "split": split}
-            rows.append(row | _numbers(facts, frames))
+            rows.append(row | _numbers(manifest["statistics"][level["text"]][split], frames))
     return rows
+
+
+def _splits(manifest: Mapping[str, Any]) -> list[str]:
+    """In the config's order, which the manifest's shards keep and its sorted names do not."""
+    return list(dict.fromkeys(shard.split for shard in datasets.shards_in(manifest)))
 
 
 def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
@@ -85,80 +91,86 @@ def level_table(manifest: Mapping[str, Any], by_split: bool = False) -> str:
 
 
 def _about(manifest: Mapping[str, Any]) -> str:
-    config, splits = manifest["config"], manifest["images"]["splits"]
+    config, images = manifest["config"], manifest["images"]
     sensor, recording = config["sensor"], config["recording"]
-    size = " x ".join(str(n) for n in manifest["images"]["shape"])
-    each = " and ".join(f"{facts['images']:,} {split}" for split, facts in splits.items())
-    levels = len(manifest["levels"])
+    each = " and ".join(f"{images['splits'][split]['images']:,} {split}" for split in _splits(manifest))
+    size = " x ".join(str(n) for n in images["shape"])
+    levels = f"{len(manifest['levels'])} light level{'s' if len(manifest['levels']) > 1 else ''}"
     stored = sum(facts["bytes"] for facts in manifest["files"].values()) + len(datasets.seal(dict(manifest)))
-    frames = ""
+    framed = ""
     if set(recording["readouts"]) & {"str", "qis"}:
-        frames = f", {recording['frames']:,} frames of {recording['frame_time']}"
+        framed = f", {recording['frames']:,} frames of {recording['frame_time']}"
     facts = {
-        "images": f"{each}, {size}, at {levels} light level{'s' if levels > 1 else ''}",
-        "sensor": f"{sensor['name'] or 'without a name'}, rules: {sensor['rules']}",
-        "recording": f"{recording['exposure']}{frames}; {', '.join(recording['readouts'])}",
+        "images": f"{each}, {size} pixels, at {levels}",
+        "sensor": f"{sensor['name'] or 'unnamed'}, rules: {sensor['rules']}",
+        "recording": f"{recording['exposure']}{framed}; {', '.join(recording['readouts'])}",
         "seed": str(manifest["seed"]),
         "stored": f"{_bytes(stored)} in {len(manifest['files']) + 1:,} files, {config['output']['format']}",
     }
     return "\n".join(f"{name:<9}  {text}" for name, text in facts.items())
 
 
+_HEADER = ("level", "images", "detections", "mean", "empty", "ones", "density", "saturated", "size", "bits")
+_LEGEND = """\
+mean: detections per pixel of an image. empty: pixels without any. ones: frames of a pixel with a
+detection. density: their share. size: without the originals. bits: stored per detection of TR."""
+
+
 def _levels(manifest: Mapping[str, Any], by_split: bool) -> str:
     frames = manifest["settings"]["frames"]
-    header = ["level", "images", "detections", "per pixel", "empty", "ones", "density", "saturated", "size", "bits/det."]
-    rows = []
+    rows: list[Sequence[str]] = []
     for level in manifest["levels"]:
         splits = manifest["statistics"][level["text"]]
-        groups = splits if by_split else {"": _summed(list(splits.values()))}
-        for split, facts in groups.items():
-            n = _numbers(facts, frames)
-            rows.append(
-                [
-                    f"{level['text']} {split}".strip(),
-                    f"{n['images']:,}",
-                    _integer(n["detections"]),
-                    _number(n["mean_per_pixel"]),
-                    _percent(n["empty_share"]),
-                    _integer(n["ones"]),
-                    _percent(n["density"]),
-                    f"{n['saturated_total']:,}",
-                    _bytes(n["bytes"]),
-                    "-" if n["bits_per_detection"] is None else f"{n['bits_per_detection']:.1f}",
-                ]
-            )
-    return _aligned(header, rows)
+        if by_split:
+            rows.append((level["text"], *[""] * (len(_HEADER) - 1)))
+            rows += [(f"  {split}", *_cells(_numbers(splits[split], frames))) for split in _splits(manifest)]
+        else:
+            rows.append((level["text"], *_cells(_numbers(_summed(list(splits.values())), frames))))
+    return f"{_aligned(_HEADER, rows)}\n\n{_LEGEND}"
+
+
+def _cells(numbers: Mapping[str, Any]) -> list[str]:
+    bits = numbers["bits_per_detection"]
+    return [
+        _integer(numbers["images"]),
+        _integer(numbers["detections"]),
+        _number(numbers["mean_per_pixel"]),
+        _percent(numbers["empty_share"]),
+        _integer(numbers["ones"]),
+        _percent(numbers["density"]),
+        _integer(numbers["saturated_total"]),
+        _bytes(numbers["bytes"]),
+        "-" if bits is None else f"{bits:.1f}",
+    ]
 
 
 def _summed(parts: Sequence[Any]) -> Any:
-    """Numbers of the same names added up, at every depth."""
-    if isinstance(parts[0], Mapping):
-        return {key: _summed([part[key] for part in parts if key in part]) for key in dict.fromkeys(k for p in parts for k in p)}
-    return sum(parts)
+    """Numbers under the same names added up, at every depth."""
+    if not isinstance(parts[0], Mapping):
+        return sum(parts)
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: _summed([part[name] for part in parts if name in part]) for name in names}
 
 
 def _saturated(manifest: Mapping[str, Any]) -> str:
-    totals: dict[str, int] = {}
-    for row in level_rows(manifest):
-        for method, pixels in row["saturated_pixels"].items():
-            totals[method] = totals.get(method, 0) + pixels
-    named = ", ".join(f"{method} ({pixels:,})" for method, pixels in totals.items() if pixels)
+    totals = _summed([row["saturated_pixels"] for row in level_rows(manifest)])
+    named = [f"{method} {pixels:,}" for method, pixels in totals.items() if pixels]
+    if not named:
+        return ""
     return _wrapped(
-        f"Saturated are pixels for which a method's formula has no finite answer, so that its rule stands in: {named}. "
-        "spadmnist methods NAME says which."
-    ) if named else ""
+        "saturated: pixels for which the formula of a method has no finite answer, so that a rule of the "
+        f"method stands in ({', '.join(named)}; spadmnist methods NAME tells the rule)."
+    )
 
 
 def _normalisation(manifest: Mapping[str, Any]) -> str:
     medians = manifest["normalisation"]
-    methods = list(dict.fromkeys(method for by_method in medians.values() for method in by_method))
+    methods = [m for m in manifest["config"]["reconstruct"] if any(m in known for known in medians.values())]
     if not methods:
         return ""
-    rows = [
-        [level["text"], *(_integer(medians[level["text"]].get(method)) for method in methods)]
-        for level in manifest["levels"]
-    ]
-    title = _wrapped("Normalisation: the median of the non-zero pixels of the training images, photons/s")
+    levels = [level["text"] for level in manifest["levels"]]
+    rows = [[level, *(_number(medians[level].get(method)) for method in methods)] for level in levels]
+    title = f"normalisation: the median of all non-zero pixels of the {_splits(manifest)[0]} split, photons/s"
     return f"{title}\n{_aligned(['level', *methods], rows)}"
 
 
@@ -173,15 +185,14 @@ def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     tables = []
     for group in groups:
         lines = [
-            row[0].ljust(widths[0]) + "".join("  " + row[i].rjust(widths[i]) for i in group) for row in (header, *rows)
+            row[0].ljust(widths[0]) + "".join("  " + row[i].rjust(widths[i]) for i in group)
+            for row in (header, *rows)
         ]
-        tables.append("\n".join(lines))
+        tables.append("\n".join(line.rstrip() for line in lines))
     return "\n\n".join(tables)
 
 
 def _wrapped(text: str) -> str:
-    import textwrap
-
     return "\n".join(textwrap.wrap(text, _WIDTH))
 
 
@@ -207,10 +218,371 @@ def _percent(share: float | None) -> str:
 
 def _bytes(size: float) -> str:
     """`1.2 MB`, in powers of 1000."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if size < 999.5:
-            break
+    units_left = ["TB", "GB", "MB", "kB", "B"]
+    while size >= 999.5 and len(units_left) > 1:
         size /= 1000
-    else:
-        unit = "TB"
+        units_left.pop()
+    unit = units_left[-1]
     return f"{size:.0f} {unit}" if unit == "B" or size >= 99.95 else f"{size:.1f} {unit}"
+
+
+# --- the sheet ----------------------------------------------------------------------------------------------
+
+_CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstructions
+_SMALL, _LARGE = 168, 256  # points of the picture: images are magnified up to one, and reduced to the other
+_LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
+_PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
+_TOP, _BOTTOM, _GAP, _CAPTION = 92, 100, 16, 34  # above and below the cells, between them, under each
+_DPI = 100
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """The chosen images at one light level, or one image without the leading axis; None: was not recorded.
+
+    fluxes: by method, divided by the median where the method is normalised.
+    counts: detections of TR; first: s, time of the first one, infinite without one.
+    bits: first frame of QIS; ones: sum of its frames.
+    waited: s until the first detection of STR, or to the frame's end, mean over frames of `frame_time` s.
+    """
+
+    originals: np.ndarray
+    fluxes: dict[str, np.ndarray]
+    counts: np.ndarray | None = None
+    first: np.ndarray | None = None
+    bits: np.ndarray | None = None
+    ones: np.ndarray | None = None
+    waited: np.ndarray | None = None
+    frame_time: float = 0.0
+
+    @staticmethod
+    def stacked(singles: Sequence[_Shown]) -> _Shown:
+        def together(name: str) -> Any:
+            values = [getattr(single, name) for single in singles]
+            return None if values[0] is None else np.stack(values)
+
+        names = ("originals", "counts", "first", "bits", "ones", "waited")
+        stacks = {name: together(name) for name in names}
+        fluxes = {method: np.stack([one.fluxes[method] for one in singles]) for method in singles[0].fluxes}
+        return _Shown(fluxes=fluxes, frame_time=singles[0].frame_time, **stacks)
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """A cell of the sheet. pixels: (images, rows, columns, 3) uint8; caption: its scale in words."""
+
+    title: str
+    subtitle: str
+    pixels: np.ndarray
+    caption: str
+
+
+def sheet(
+    dataset: Dataset, path: str | Path, levels: Sequence[str] | None = None, count: int | None = None
+) -> None:
+    """Draw some training images in all readouts and reconstructions, a row for each light level, as a PNG.
+
+    levels: as written in the config, all by default. count: images in a cell, with different labels as far as
+    there are; by default four, or one where they are large. Raises KeyError with a sentence where there is no
+    such level, SpadError where the picture cannot be written.
+    """
+    brightness = dict(zip(dataset.levels, _brightness(dataset), strict=True))
+    split = "train" if "train" in dataset.splits else dataset.splits[0]
+    parts = {level: dataset[level, split] for level in levels or dataset.levels}
+    parts = dict(sorted(parts.items(), key=lambda item: brightness[item[0]]))
+    one = next(iter(parts.values()))
+    indices = _different(one, count)
+    shown = {level: _show(part, indices) for level, part in parts.items()}
+    times = _time_scale([s.first for s in shown.values() if s.first is not None])
+    rows = {level: _cells_of(s, times) for level, s in shown.items()}
+    which = f"{split} image{'s' if len(indices) > 1 else ''} {', '.join(map(str, indices))}"
+    if one.labels is not None:
+        which += f" (label{'s' if len(indices) > 1 else ''} {', '.join(str(one.labels[i]) for i in indices)})"
+    _save(_draw(rows, which, _basis(one, split), times), Path(path))
+
+
+def _brightness(dataset: Dataset) -> tuple[float, ...]:
+    try:
+        return dataset.lux
+    except SpadError:
+        return dataset.irradiance
+
+
+def _different(part: Part, count: int | None) -> list[int]:
+    """Which images to show: the first of each label; where there are too few, the first of the others."""
+    if count is None:
+        count = 1 if max(part.shape[-2:]) > _LARGE_IMAGE else 4
+    firsts = [] if part.labels is None else sorted(np.unique(part.labels, return_index=True)[1].tolist())
+    others = (i for i in range(len(part)) if i not in firsts)
+    return sorted(itertools.islice(itertools.chain(firsts, others), max(1, count)))
+
+
+def _show(part: Part, indices: Sequence[int]) -> _Shown:
+    """One image after the other, so that never more than one is in memory as a stream."""
+    medians = {method: _median(part, method) for method in part.reconstruction}
+    return _Shown.stacked([_show_one(part, i, medians) for i in indices])
+
+
+def _show_one(part: Part, index: int, medians: Mapping[str, float | None]) -> _Shown:
+    readouts: dict[str, Any] = {}
+    if _recorded(part, "tr"):
+        events = part.tr[index]
+        readouts["counts"] = events.counts.reshape(part.shape)
+        readouts["first"] = _first_times(events).reshape(part.shape)
+    if _recorded(part, "qis") or _recorded(part, "str"):
+        frames = _packed(part, index)
+        readouts["frame_time"] = frames.frame_time
+        if _recorded(part, "qis"):
+            readouts["bits"] = (frames.bits[:, 0] >> 7).reshape(part.shape)
+            readouts["ones"] = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int64).reshape(part.shape)
+        if _recorded(part, "str"):
+            readouts["waited"] = _mean_wait(frames).reshape(part.shape)
+    fluxes = {}
+    for method, median in medians.items():
+        fluxes[method] = part.reconstruction[method][index] / np.float32(median or 1)
+    return _Shown(part.images[index], fluxes, **readouts)
+
+
+def _recorded(part: Part, readout: str) -> bool:
+    try:
+        getattr(part, readout)
+    except SpadError:
+        return False
+    return True
+
+
+def _packed(part: Part, index: int) -> Frames:
+    """The frames of an image as bits: unpacked, those of a large sensor would fill the memory."""
+    frames: Frames = part._backend.recorded(index, index + 1, "str" if _recorded(part, "str") else "qis")
+    return frames
+
+
+def _first_times(events: Events) -> np.ndarray:
+    """(rows,) s, infinite where there is no detection; no other stamp becomes a time."""
+    out = np.full(len(events.offsets) - 1, np.inf)
+    some = events.counts > 0
+    starts = events.offsets[:-1][some]
+    out[some] = events.times[starts] if events.ticks is None else events.ticks[starts] * events.tick
+    return out
+
+
+def _mean_wait(frames: Frames) -> np.ndarray:
+    """(pixels,) s, from the start of a frame to its first detection, or to its end where there is none."""
+    assert frames.first is not None
+    until = np.concatenate([[0.0], np.cumsum(frames.first.times)])[frames.first.offsets]
+    empty = frames.frames - frames.first.counts
+    return (np.diff(until) + empty * frames.frame_time) / frames.frames
+
+
+def _at_hand(part: Part) -> int:
+    """How many training images a median rests on: all, unless all would have to be simulated for it."""
+    if not isinstance(part._backend, datasets._Simulated):
+        return len(part)
+    return min(len(part), max(1, _PIXELS_AT_HAND // math.prod(part.shape)))
+
+
+def _median(part: Part, method: str) -> float | None:
+    if not reconstruct.find(method).normalised:
+        return None
+    if _at_hand(part) == len(part):
+        return part.reconstruction[method].normalisation
+    some = part.reconstruction[method][: _at_hand(part)]
+    return reconstruct.median_of_nonzero(lambda: [some])
+
+
+def _basis(part: Part, split: str) -> str | None:
+    """What the medians rest on, for the foot of the sheet; None where nothing is normalised."""
+    if not any(reconstruct.find(method).normalised for method in part.reconstruction):
+        return None
+    n = _at_hand(part)
+    if n == len(part):
+        return f"all {n:,} {split} images"
+    return f"the first {n:,} of {len(part):,} {split} images (the dataset's own rest on all)"
+
+
+# --- from numbers to colours
+
+
+def _time_scale(first: Sequence[np.ndarray]) -> tuple[float, float] | None:
+    """(shortest, longest) time of the colour scale, s, round numbers; None without any detection."""
+    times = np.concatenate([np.ravel(f) for f in first]) if first else np.zeros(0)
+    times = times[np.isfinite(times) & (times > 0)]
+    if not len(times):
+        return None
+    high = _round(float(times.max()), up=True)
+    return min(_round(float(np.quantile(times, 0.01)), up=False), high / 10), high
+
+
+def _round(value: float, up: bool) -> float:
+    """The next 1, 2 or 5 times a power of ten."""
+    decade = 10.0 ** math.floor(math.log10(value))
+    steps = [step * decade for step in (1, 2, 5, 10)]
+    tolerance = 1e-9 * decade
+    if up:
+        return next(step for step in steps if step >= value - tolerance)
+    return next(step for step in reversed(steps) if step <= value + tolerance)
+
+
+def _cells_of(shown: _Shown, times: tuple[float, float] | None) -> list[_Cell]:
+    """The cells of one row."""
+    cells = [_Cell("original", "grey level", *_grey(shown.originals))]
+    if shown.first is not None and shown.counts is not None:
+        caption = f"{_number(float(shown.counts.mean()))} detections/pixel"
+        cells.append(_Cell("TR", "time of the first detection", _in_colours(shown.first, times), caption))
+    if shown.bits is not None and shown.ones is not None:
+        caption = f"{_percent(float(shown.bits.mean()))} ones"
+        cells.append(_Cell("QIS, first frame", "white is 1", _grey(shown.bits, white=1)[0], caption))
+        if "qis_counts" not in shown.fluxes:  # which is the same
+            cells.append(_Cell("QIS, sum", "frames with a detection", *_grey(shown.ones)))
+    if shown.waited is not None:
+        none, shortest = shown.frame_time, float(shown.waited.min())
+        caption = f"white: {units.show(shortest, 's')}" if shortest < none else "no detection"
+        subtitle = f"mean wait, black: {units.show(none, 's')}"
+        cells.append(_Cell("STR, first arrival", subtitle, _grey(none - shown.waited)[0], caption))
+    for name, flux in shown.fluxes.items():
+        method = reconstruct.find(name)
+        needs = " ".join(method.readouts()).upper()
+        if method.normalised:
+            cells.append(_Cell(name, f"{needs}: flux / median", *_grey(flux, clip=_CLIP)))
+        else:
+            cells.append(_Cell(name, f"{needs}: not normalised", *_grey(flux)))
+    return cells
+
+
+def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf) -> tuple[np.ndarray, str]:
+    """(RGB, caption) from 0, black, to `white`, by default the largest value up to `clip`.
+
+    Three channels are red, green and blue; of another number of them the mean is shown.
+    """
+    largest = float(values.max())
+    white = min(largest, clip) if white is None else white
+    scaled = np.clip(values / white, 0, 1) if white > 0 else np.zeros(values.shape)
+    if values.ndim == 4 and values.shape[1] == 3:
+        rgb = np.moveaxis(scaled, 1, -1)
+    else:
+        grey = scaled.mean(axis=1) if values.ndim == 4 else scaled
+        rgb = np.repeat(grey[..., None], 3, axis=-1)
+    caption = f"white: {white:.4g}" if white > 0 else "all 0"
+    if largest > clip:
+        caption += f" (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
+    return _bytes_of(rgb), caption
+
+
+def _in_colours(first: np.ndarray, times: tuple[float, float] | None) -> np.ndarray:
+    """RGB of first detections, over the channels where there are any: early is bright, none is black."""
+    earliest = first.min(axis=1) if first.ndim == 4 else first
+    if times is None:
+        return np.zeros((*earliest.shape, 3), np.uint8)
+    low, high = times
+    late = np.log(np.clip(earliest, low, high) / low) / math.log(high / low)
+    return np.where(np.isfinite(earliest)[..., None], _colours(late), np.uint8(0))
+
+
+def _colours(late: np.ndarray) -> np.ndarray:
+    """RGB of the time scale, from 0 (early, bright) to 1; the darkest part of the map is left to 'none'."""
+    from matplotlib import colormaps
+
+    return _bytes_of(colormaps["plasma"](1 - 0.9 * late)[..., :3])
+
+
+def _bytes_of(scaled: np.ndarray) -> np.ndarray:
+    return (scaled * 255 + 0.5).astype(np.uint8)
+
+
+# --- from colours to a page
+
+
+def _mosaic(images: np.ndarray) -> np.ndarray:
+    """(height, width, 3): the images side by side, in whole points per pixel or whole pixels per point."""
+    n, rows, columns, _ = images.shape
+    across = min(range(1, n + 1), key=lambda k: (max(k * columns, -(-n // k) * rows), k))
+    side = max(across * columns, -(-n // across) * rows)
+    images = _reduced(images, -(-side // _LARGE)) if side > _LARGE else images
+    zoom = max(1, _SMALL // side)
+    images = images.repeat(zoom, axis=1).repeat(zoom, axis=2)
+    _, height, width, _ = images.shape
+    page = np.full((-(-n // across) * (height + 2) - 2, across * (width + 2) - 2, 3), 255, np.uint8)
+    for i, image in enumerate(images):
+        y, x = i // across * (height + 2), i % across * (width + 2)
+        page[y : y + height, x : x + width] = image
+    return page
+
+
+def _reduced(images: np.ndarray, factor: int) -> np.ndarray:
+    """Means over squares of factor x factor pixels; smaller at the edges."""
+    sums = images.astype(np.float64)
+    for axis in (1, 2):
+        starts = np.arange(0, sums.shape[axis], factor)
+        sizes = np.diff([*starts, sums.shape[axis]])
+        sums = np.add.reduceat(sums, starts, axis=axis) / np.expand_dims(sizes, [0, *{1, 2, 3} - {axis}])
+    return (sums + 0.5).astype(np.uint8)
+
+
+def _draw(
+    rows: Mapping[str, Sequence[_Cell]], which: str, basis: str | None, times: tuple[float, float] | None
+) -> bytes:
+    """The sheet as a PNG: the same bytes for the same cells, whatever the user's settings of matplotlib."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    pages = {level: [_mosaic(cell.pixels) for cell in cells] for level, cells in rows.items()}
+    columns = next(iter(rows.values()))
+    height, width = next(iter(pages.values()))[0].shape[:2]
+    # a bold letter is about 8 points wide, one of the small print 6
+    wide = max(width, 160, *(8 * len(cell.title) for cell in columns))
+    left = 32 + 8 * max(map(len, rows))
+    full = left + len(columns) * (wide + _GAP)
+    tall = _TOP + len(rows) * (height + _CAPTION) + _BOTTOM
+    if max(full, tall) >= 1 << 16:
+        raise SpadError(f"a sheet of {len(rows)} light levels is too large for a picture; name fewer levels")
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor="white")
+
+        def text(x: int, y: int, words: str, size: int = 8, color: str = "0.3", **style: Any) -> None:
+            figure.text(x / full, 1 - y / tall, words, fontsize=size, color=color, va="top", **style)
+
+        def picture(x: int, y: int, pixels: np.ndarray) -> None:
+            figure.figimage(pixels, x, tall - y - len(pixels))
+
+        text(16, 16, f"Each row is one light level; each cell shows {which}.", 10, "black")
+        for k, cell in enumerate(columns):
+            text(left + k * (wide + _GAP), _TOP - 40, cell.title, 9, "black", weight="bold")
+            text(left + k * (wide + _GAP), _TOP - 22, cell.subtitle)
+        for r, (level, cells) in enumerate(rows.items()):
+            y = _TOP + r * (height + _CAPTION)
+            text(16, y + height // 2 - 7, level, 9, "black", weight="bold")
+            for k, cell in enumerate(cells):
+                picture(left + k * (wide + _GAP), y, pages[level][k])
+                text(left + k * (wide + _GAP), y + height + 4, cell.caption)
+
+        y = tall - _BOTTOM + 16
+        foot = [
+            "Grey runs from 0, black, to the value below the cell, white, unless the head says otherwise."
+        ]
+        if basis is not None:
+            foot.append(
+                f"Fluxes are divided by the median of the non-zero pixels of {basis}; "
+                f"what is above {_CLIP:g} is drawn as {_CLIP:g}."
+            )
+        for line, words in enumerate(foot):
+            text(left, y + 18 * line, words)
+        if times is not None:
+            y += 18 * len(foot) + 4
+            text(left, y, "TR, first detection:")
+            bar = np.broadcast_to(_colours(np.linspace(0, 1, 240)), (12, 240, 3))
+            text(left + 125, y, units.show(times[0], "s"))
+            picture(left + 175, y, bar)
+            text(left + 423, y, f"{units.show(times[1], 's')} (logarithmic); none: black")
+        buffer = io.BytesIO()
+        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})
+    return buffer.getvalue()
+
+
+def _save(png: bytes, path: Path) -> None:
+    try:
+        path.write_bytes(png)
+    except OSError as error:
+        raise SpadError(f"{path}: the picture cannot be written there ({error.strerror})") from None

@@ -110,7 +110,9 @@ class Sensor:
             rate = self._call(effect, "apply", rate, conditions)
         if rate.size and not 0 <= rate.min() <= rate.max() < np.inf:
             culprit = (self.at("dark") or self.at("detection") or self.at("light"))[-1]
-            raise EffectError(f"{source_file(type(culprit))}: a rate is negative or not finite after {culprit.name}")
+            raise EffectError(
+                f"{source_file(type(culprit))}: a rate is negative or not finite after {culprit.name}"
+            )
         return rate, light
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +154,9 @@ class Sensor:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1]
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + photons.shape[1]))))
         parts = [
-            self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts)
+            self._staged(
+                photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts
+            )
             for i in range(0, len(photons), step)
         ]
         return Recorded.join(parts)
@@ -246,13 +250,17 @@ class Sensor:
             frames = self._frames(candidates, conditions, streams, "str" in readouts)
         return summarised(pixels, tr, frames)
 
-    def _arrivals(self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams) -> Events:
+    def _arrivals(
+        self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams
+    ) -> Events:
         """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""
         pixels = rate.shape[1]
         varying = self.at("arrival")
         if not varying:
             key = streams.key("photons and dark counts")
-            times, offsets = kernels.arrivals(np.ascontiguousarray(rate), conditions.exposure, streams.images, key)
+            times, offsets = kernels.arrivals(
+                np.ascontiguousarray(rate), conditions.exposure, streams.images, key
+            )
             return Events(times, offsets, pixels)
         parts = {"light": light, "dark": rate - light}
         most = dict(parts)
@@ -260,7 +268,9 @@ class Sensor:
             most[effect.acts_on] = most[effect.acts_on] * self._call(effect, "maximum", conditions)
         drawn = most["light"] + most["dark"]
         key = streams.key("photons and dark counts")
-        times, offsets = kernels.arrivals(np.ascontiguousarray(drawn), conditions.exposure, streams.images, key)
+        times, offsets = kernels.arrivals(
+            np.ascontiguousarray(drawn), conditions.exposure, streams.images, key
+        )
         events = Events(times, offsets, pixels)
         rows = events.rows
         now = {kind: part.ravel()[rows] for kind, part in parts.items()}
@@ -269,7 +279,9 @@ class Sensor:
         share = (now["light"] + now["dark"]) / drawn.ravel()[rows]
         if np.any(share < 0) or np.any(share > 1 + 1e-9):
             names = ", ".join(e.name for e in varying)
-            raise EffectError(f"the factor of {names} leaves the range from 0 to its maximum; mend `maximum` or `factor`")
+            raise EffectError(
+                f"the factor of {names} leaves the range from 0 to its maximum; mend `maximum` or `factor`"
+            )
         chance = kernels.uniforms(offsets, pixels, streams.images, streams.key("thinning"))
         return events.keep(chance < share)
 
@@ -277,7 +289,9 @@ class Sensor:
         for effect in self.at("gate"):
             mask = np.asarray(self._call(effect, "open", events.times, conditions))
             if mask.dtype != bool or mask.shape != events.times.shape:
-                raise EffectError(f"{source_file(type(effect))}: {effect.name}.open must return one bool per time")
+                raise EffectError(
+                    f"{source_file(type(effect))}: {effect.name}.open must return one bool per time"
+                )
             events = events.keep(mask)
         return events
 
@@ -290,8 +304,10 @@ class Sensor:
             raise EffectError(f"{source_file(type(effect))}: {effect.name}.spawn must return Children")
         parent = np.asarray(children.parent)
         delay = np.asarray(children.delay, np.float64)
-        if parent.dtype.kind not in "iu" or parent.shape != delay.shape or (
-            len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0))
+        if (
+            parent.dtype.kind not in "iu"
+            or parent.shape != delay.shape
+            or (len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0)))
         ):
             raise EffectError(
                 f"{source_file(type(effect))}: the children of {effect.name} need a parent among the {len(events)} "
@@ -319,7 +335,9 @@ class Sensor:
         merged, offsets, _ = kernels.merge(events.times, events.offsets, extra[order], extra_rows[order])
         return self._gate(Events(merged, offsets, events.pixels), conditions)
 
-    def _latent(self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray) -> _Latent:
+    def _latent(
+        self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray
+    ) -> _Latent:
         """Rules of a device: everything that may happen, generation after generation."""
         rows = len(events.offsets) - 1
         times, row_of, parents = [events.times], [events.rows], [np.full(len(events), -1, np.int64)]
@@ -327,7 +345,9 @@ class Sensor:
         known = len(events)
         for generation in range(_GENERATIONS):
             found = [
-                self._spawn(effect, current, streams, dead_times, f"/generation {generation}" if generation else "")
+                self._spawn(
+                    effect, current, streams, dead_times, f"/generation {generation}" if generation else ""
+                )
                 for effect in self.at("correlated")
             ]
             if not found:
@@ -353,13 +373,20 @@ class Sensor:
                 f"the cascade of avalanches does not end ({_GENERATIONS} generations); "
                 "lower the probabilities of the correlated effects"
             )
-        return _Latent(np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels)
+        return _Latent(
+            np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels
+        )
 
     def _frames(self, events: Events, conditions: Conditions, streams: Streams, stamped: bool) -> Frames:
         pixels = events.pixels
         out = np.empty(len(events) + 1)
         bits, offsets = kernels.frame_readout(
-            events.times, events.offsets, conditions.frames, conditions.frame_time, conditions.frame_period, out
+            events.times,
+            events.offsets,
+            conditions.frames,
+            conditions.frame_time,
+            conditions.frame_period,
+            out,
         )
         first = None
         if stamped:
@@ -369,7 +396,9 @@ class Sensor:
             if first.ticks is not None and first.tick is not None:
                 none = no_detection(conditions.frame_time, first.tick)
                 # what rounds to the end of the frame would mean 'none'
-                first = Events(None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick)
+                first = Events(
+                    None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick
+                )
                 first = self._narrow(first, conditions.frame_time, "STR stamps")
         return Frames(bits, first, conditions.frames, conditions.frame_time, pixels)
 
@@ -378,7 +407,9 @@ class Sensor:
             return events
         kind = unsigned_for(end / events.tick, what)
         if len(events.ticks) and int(events.ticks.max()) > np.iinfo(kind).max:
-            raise SpadError(f"{what}: a stamp of {int(events.ticks.max())} ticks does not fit {np.dtype(kind)}")
+            raise SpadError(
+                f"{what}: a stamp of {int(events.ticks.max())} ticks does not fit {np.dtype(kind)}"
+            )
         return Events(None, events.offsets, events.pixels, events.ticks.astype(kind, copy=False), events.tick)
 
     # --- calling effects ------------------------------------------------------------------------------------------
@@ -400,9 +431,15 @@ class Sensor:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""
         after = self._call(effect, "apply", events, self._rng(effect, streams))
         if not effect.counted:
-            wrong = after.problem() if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
+            wrong = (
+                after.problem()
+                if isinstance(after, Events)
+                else f"it is a {type(after).__name__}, not Events"
+            )
             if wrong:
-                raise EffectError(f"{source_file(type(effect))}: what {effect.name}.apply returns is wrong: {wrong}")
+                raise EffectError(
+                    f"{source_file(type(effect))}: what {effect.name}.apply returns is wrong: {wrong}"
+                )
         return after
 
 

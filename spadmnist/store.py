@@ -319,6 +319,14 @@ def write_shard(
     return {relative + name.removeprefix("shard"): record for name, record in records.items()}
 
 
+def encoded_size(columns: Mapping[str, Column], format: str) -> int:
+    """How many bytes the arrays take on disk."""
+    checked = _check_columns(columns, "estimate")
+    if format == "zarr":
+        return sum(len(piece) for pieces in _zarr_files(checked).values() for piece in pieces)
+    return len(_hdf5_image(checked, {}))
+
+
 def append_columns(
     root: str | os.PathLike[str], path: str, columns: Mapping[str, Column], format: str
 ) -> Files:

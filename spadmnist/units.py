@@ -139,7 +139,9 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     >>> show(5e-8, "s")
     '50 ns'
     """
-    units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"}
+    units = {
+        u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"
+    }
     if unit == "W/m^2":
         units = {u: f for u, f in units.items() if u.endswith("/cm^2")}
     if value == 0 or not math.isfinite(value) or len(units) == 1:

@@ -80,7 +80,9 @@ class Effect(Plugin, abstract=True):
             raise TypeError(f"{cls.__name__}: {chosen!r} is not a stage; the stages are {', '.join(STAGES)}")
         missing = [hook for hook in STAGES[chosen] if not callable(getattr(cls, hook, None))]
         if missing:
-            raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {' and '.join(missing)}")
+            raise TypeError(
+                f"{cls.__name__}: an effect at stage {chosen} must define {' and '.join(missing)}"
+            )
         super().__init_subclass__(**keywords)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:

@@ -1,0 +1,44 @@
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin
+DEMO := demo
+# MNIST, where it is at hand: tests and benchmarks that need the real digits look there
+IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
+
+.PHONY: help demo test verify bench lint clean
+
+help:  ## say what there is
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/installed: pyproject.toml
+	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
+	$(RUN)/python -m pip install --quiet --upgrade pip
+	$(RUN)/python -m pip install --quiet -e '.[dev]'
+	@touch $@
+
+demo: $(VENV)/installed  ## set up, and run the main job in seconds: digits, four light levels, three readouts
+	@echo "spadmnist generate configs/quick.yaml -o $(DEMO)/quick"
+	@$(RUN)/spadmnist generate configs/quick.yaml -o $(DEMO)/quick
+	@$(RUN)/spadmnist verify $(DEMO)/quick
+	@$(RUN)/spadmnist inspect $(DEMO)/quick --plot $(DEMO)/quick.png > /dev/null
+	@echo
+	@echo "Look at $(DEMO)/quick.png: the same digits from 5 to 2560 mlux, in every readout and reconstruction."
+	@echo "Then read $(DEMO)/quick/config.yaml, change configs/quick.yaml, or open the data:"
+	@echo "  $(RUN)/python -c \"import spadmnist; print(spadmnist.open('$(DEMO)/quick')['2560 mlux', 'train'].tr[0])\""
+
+test: $(VENV)/installed lint  ## set up, and run the tests (a few minutes)
+	$(RUN)/python -m pytest -m "not slow" -q
+
+verify: $(VENV)/installed  ## the slow statistical and fault tests
+	$(RUN)/python -m pytest -m slow -q
+
+lint: $(VENV)/installed
+	$(RUN)/ruff check .
+	$(RUN)/ruff format --check .
+	$(RUN)/mypy
+
+bench: $(VENV)/installed  ## measure the README's table on this machine (about 4 minutes; never fails on time)
+	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
+
+clean:  ## remove what was made here
+	rm -rf $(VENV) $(DEMO) benchmarks.md .pytest_cache .mypy_cache .ruff_cache .hypothesis

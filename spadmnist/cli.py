@@ -1,0 +1,499 @@
+"""The command line: each verb a few lines over the library. The only module that prints or exits.
+
+What a program reads goes to standard output, everything else to standard error. Exit status: 0 done; 1 the answer is
+'no'; 2 it could not be done; 130 interrupted. Imports stand inside the verbs, so that `--help` needs neither numpy
+nor numba.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from .factory import Progress
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _Verbs(click.Group):
+    """Verbs in the order of a day's work, not of the alphabet."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        return list(self.commands)
+
+
+@click.group(
+    cls=_Verbs,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Begin with:  spadmnist generate configs/quick.yaml -o out  and then  spadmnist inspect out --plot out.png",
+)
+@click.version_option(package_name="spadmnist", message="%(package)s %(version)s")
+def cli() -> None:
+    """What a single-photon (SPAD) camera would have recorded.
+
+    A config (YAML) names images, light levels, a sensor and its effects; `generate` makes the dataset: time stamps
+    (TR), first time stamps of frames (STR), 1-bit frames (QIS), and flux images made from them.
+    """
+
+
+def _plugin(command: F) -> F:
+    return click.option(
+        "--plugin",
+        "plugin_files",
+        multiple=True,
+        type=click.Path(path_type=Path),
+        metavar="FILE.py",
+        help="Load a file with effects or methods of your own (it is run as a program; repeatable).",
+    )(command)
+
+
+def _jobs(command: F) -> F:
+    return click.option(
+        "--jobs",
+        "-j",
+        type=click.IntRange(1, 4096),
+        default=None,
+        metavar="N",
+        help="Workers at a time. The result does not depend on it.  [default: one per processor]",
+    )(command)
+
+
+def _json(command: F) -> F:
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
+
+
+@cli.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Folder of the dataset.  [default: the config's name]",
+)
+@click.option(
+    "--lux",
+    "levels",
+    multiple=True,
+    metavar="LEVEL",
+    help='Only this light level, as the config writes it: --lux "5 mlux" (repeatable).',
+)
+@click.option(
+    "--limit",
+    type=click.IntRange(1),
+    default=None,
+    metavar="N",
+    help="Only the first N images of each split.",
+)
+@click.option(
+    "--images-dir",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Where the images lie (MNIST: else $SPADMNIST_DATA, the cache, a download).",
+)
+@_jobs
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    default=None,
+    metavar="N",
+    help="Another seed than the config's.",
+)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["zarr", "hdf5"]),
+    default=None,
+    help="Another format than the config's.",
+)
+@click.option("--dry-run", is_flag=True, help="Say photons, bytes, memory and time, and make nothing.")
+@_plugin
+@_json
+def generate(
+    config: Path,
+    output: Path | None,
+    levels: tuple[str, ...],
+    limit: int | None,
+    images_dir: Path | None,
+    jobs: int | None,
+    seed: int | None,
+    format_: str | None,
+    dry_run: bool,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Make the dataset that CONFIG describes.
+
+    The same command again goes on where an interrupted run stopped. --lux, --limit and --jobs change no drawn value
+    of what is made.
+
+    \b
+    spadmnist generate configs/quick.yaml -o out
+    spadmnist generate configs/spad_mnist.yaml -o full --images-dir ~/mnist
+    spadmnist generate configs/spad_mnist.yaml -o dim --lux "5 mlux" --limit 1000
+    """
+    from . import config as configs
+    from . import factory
+
+    _load(plugin_files)
+    experiment = configs.read(config, seed, format_, levels, limit)
+    for note in experiment.notes:
+        _say(f"Note: {note}")
+    images = experiment.load_images(images_dir)
+    root = output if output is not None else Path(config.stem)
+    workers = jobs or _processors()
+    if dry_run:
+        from . import plan
+
+        estimate = plan.estimate(experiment, images, workers)
+        click.echo(json.dumps(estimate) if as_json else plan.text(estimate, root))
+        return
+    with _terminal() as progress:
+        outcome = factory.generate(experiment, images, root, workers, progress)
+    if as_json:
+        click.echo(
+            json.dumps(
+                {"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds}
+            )
+        )
+        return
+    from . import report
+
+    click.echo(report.level_table(outcome.manifest))
+    if outcome.made == 0 and outcome.kept == 0:
+        _say(
+            f"\n{root} was complete already; nothing was done. spadmnist verify {root} reads every byte of it."
+        )
+    else:
+        kept = f", {outcome.kept} were there already" if outcome.kept else ""
+        _say(f"\nMade {outcome.made} shards in {_duration(outcome.seconds)}{kept}: {root}")
+        _say(f"Look at it:  spadmnist inspect {root} --plot {root.name}.png")
+
+
+@cli.command("reconstruct")
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    metavar="METHOD",
+    help="A method (repeatable).  [default: all that the readouts allow]",
+)
+@_jobs
+@_plugin
+@_json
+def reconstruct_(
+    dataset: Path, methods: tuple[str, ...], jobs: int | None, plugin_files: tuple[Path, ...], as_json: bool
+) -> None:
+    """Make flux images from the raw streams of DATASET, and add them to it.
+
+    The dataset is then, byte for byte, what `generate` makes of a config that lists these methods.
+
+    \b
+    spadmnist reconstruct out --method inter_photon
+    """
+    from . import factory, report
+    from . import reconstruct as library
+    from .errors import SpadError
+
+    _load(plugin_files)
+    for name in methods:
+        try:
+            library.find(name)
+        except KeyError as error:
+            raise SpadError(f"--method: {error.args[0]}") from None
+    with _terminal() as progress:
+        added, manifest = factory.add_reconstructions(dataset, methods, jobs or _processors(), progress)
+    if as_json:
+        click.echo(
+            json.dumps({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
+        )
+        return
+    if added:
+        _say(f"Added to {dataset}: {', '.join(added)}\n")
+    else:
+        _say(f"{dataset} holds these reconstructions already; nothing was done.\n")
+    click.echo(report.level_table(manifest))
+
+
+@cli.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw a sheet of images in all readouts and methods.",
+)
+@_json
+def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
+    """Say what DATASET holds: per light level detections, empty and saturated pixels, bytes, bits per detection.
+
+    \b
+    spadmnist inspect out
+    spadmnist inspect out --plot sheet.png
+    """
+    from . import dataset as library
+    from . import report
+
+    manifest, intact = library.read_manifest(dataset)
+    if as_json:
+        click.echo(
+            json.dumps(
+                {
+                    "levels": report.level_rows(manifest),
+                    "normalisation": manifest["normalisation"],
+                    "config": manifest["config"],
+                }
+            )
+        )
+    else:
+        click.echo(report.level_table(manifest))
+    if not intact:
+        _say(
+            f"Note: {dataset / library.MANIFEST} was changed since it was written; spadmnist verify {dataset} says more."
+        )
+    if plot is not None:
+        with _writing(plot):
+            report.sheet(library.open(dataset), plot)
+        _say(f"Drawn: {plot}")
+
+
+@cli.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--repair", is_flag=True, help="Make exactly the damaged files again.")
+@click.option(
+    "--images-dir",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="For --repair: where the images lie, if the dataset's own copy is damaged.",
+)
+@_jobs
+@_plugin
+@_json
+def verify(
+    dataset: Path,
+    repair: bool,
+    images_dir: Path | None,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Compare every byte of DATASET with its manifest; name each file that is changed, missing or extra.
+
+    Exit status 0: as it was made; 1: damage was found (and not repaired).
+    """
+    from . import verify as library
+
+    _load(plugin_files)
+    with _terminal() as progress:
+        damage = library.verify(dataset, progress)
+        did: list[str] = []
+        if damage and repair:
+            did = library.repair(dataset, damage, jobs or _processors(), images_dir, progress)
+            left = library.verify(dataset, progress)
+        else:
+            left = damage
+    if as_json:
+        found = {
+            "changed": damage.changed,
+            "missing": damage.missing,
+            "extra": damage.extra,
+            "files": damage.files,
+        }
+        click.echo(json.dumps({"dataset": str(dataset), **found, "repaired": did, "intact": not left}))
+    else:
+        for kind in ("changed", "missing", "extra"):
+            for name in getattr(damage, kind):
+                click.echo(f"{kind}: {name}")
+        for line in did:
+            click.echo(line)
+        if not damage:
+            click.echo(f"{dataset}: all {damage.files} files are as they were made")
+        elif not left:
+            click.echo(f"{dataset}: repaired; all {left.files} files are as they were made")
+        elif not repair:
+            click.echo(
+                f"{dataset}: {_count(damage)} not as made; spadmnist verify {dataset} --repair makes them again"
+            )
+    if left:
+        sys.exit(1)
+
+
+def _count(damage: Any) -> str:
+    n = len(damage.changed) + len(damage.missing) + len(damage.extra)
+    return f"{n} file is" if n == 1 else f"{n} files are"
+
+
+def _reference(kind: str) -> click.Command:
+    """`effects` and `methods`: the reference, made from the classes."""
+
+    @click.argument("name", required=False)
+    @_plugin
+    @_json
+    def command(name: str | None, plugin_files: tuple[Path, ...], as_json: bool) -> None:
+        from . import reference
+        from .errors import SpadError
+
+        _load(plugin_files)
+        try:
+            if as_json:
+                click.echo(json.dumps(reference.as_data(kind, name)))
+            else:
+                click.echo(reference.page(kind, name) if name else reference.listing(kind))
+        except KeyError as error:
+            raise SpadError(str(error.args[0])) from None
+
+    command.__doc__ = {
+        "effect": "List the physical effects, or describe one with its parameters and the YAML to paste.",
+        "method": "List the flux reconstructions, or describe one with its formula and rules.",
+    }[kind]
+    return cli.command(f"{kind}s")(command)
+
+
+_reference("effect")
+_reference("method")
+
+
+# --- talking to people --------------------------------------------------------------------------------------------
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min"
+
+
+def _processors() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def _load(plugin_files: tuple[Path, ...]) -> None:
+    from . import plugins
+
+    for file in plugin_files:
+        plugins.load_file(file)
+
+
+class _writing:
+    """Turn a failure to write a file into a sentence."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        from .errors import SpadError
+
+        if isinstance(error, OSError):
+            raise SpadError(
+                f"{self.path}: cannot be written ({error.strerror or error}); name another file"
+            ) from None
+
+
+class _terminal:
+    """A progress bar on standard error, where that is a terminal."""
+
+    def __enter__(self) -> Progress:
+        from tqdm import tqdm
+
+        from .factory import Progress
+
+        bar: list[Any] = []
+
+        def start(what: str, total: float, done: float) -> None:
+            bar.append(
+                tqdm(
+                    total=total,
+                    initial=done,
+                    desc=what,
+                    disable=None,
+                    leave=False,
+                    bar_format="{desc} {percentage:3.0f}%|{bar}| {postfix}{elapsed}, {remaining} left",
+                )
+            )
+
+        def advance(work: float, note: str) -> None:
+            bar[-1].set_postfix_str(f"{note}  ", refresh=False)
+            bar[-1].update(work)
+
+        def stop() -> None:
+            while bar:
+                bar.pop().close()
+
+        self._stop = stop
+        return Progress(start, advance, stop, _say)
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+
+# --- the way out --------------------------------------------------------------------------------------------------
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit: one clear sentence and no traceback for whatever a user can cause."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    sys.exit(_run(arguments))
+
+
+def _run(arguments: list[str] | None) -> int:
+    from .errors import ConfigError, SpadError
+
+    try:
+        result = cli.main(arguments, prog_name="spadmnist", standalone_mode=False)
+        sys.stdout.flush()
+        return result if isinstance(result, int) else 0
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        _say("\nInterrupted. What is complete is kept: the same command goes on from there.")
+        return 130
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except ConfigError as error:
+        for problem in error.problems:
+            _say(f"Error: {problem}")
+        return 2
+    except SpadError as error:
+        _say(f"Error: {error}")
+        return 2
+    except BrokenPipeError:
+        # the reader has gone; there is nobody left to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except MemoryError:
+        _say("Error: there is not enough memory; give fewer --jobs or smaller images")
+        return 2
+    except OSError as error:
+        _say(f"Error: {error.filename or 'the system'}: {error.strerror or error}")
+        return 2
+    except Exception as error:
+        if os.environ.get("SPADMNIST_DEBUG"):
+            raise
+        _say(
+            f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}"
+        )
+        _say("SPADMNIST_DEBUG=1 shows where; please report it.")
+        return 2
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""What a run will cost, before it runs: photons, bytes, memory and time, from the flux and a small probe."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import dataset, factory, store
+from .config import Experiment
+from .images import Images
+
+_PROBE = 64  # images a level
+_BESIDES_ENCODING = (
+    1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
+)
+
+
+def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) -> dict[str, Any]:
+    """Per level and in total: images, photons, detections, bytes, seconds with `jobs` workers, and memory in bytes.
+
+    Photons and detections are expectations over the very images. Bytes and time are scaled up from some images
+    that are simulated and encoded here.
+    """
+    factory.check_volume(experiment, splits)
+    # compile first, so that the probe times the work alone
+    _probe(experiment, experiment.levels[0], next(iter(splits.values())), 1)
+    levels = []
+    for level in experiment.levels:
+        row: dict[str, Any] = {"level": level.text, "images": 0, "photons": 0.0, "detections": 0.0}
+        size = seconds = 0.0
+        for images in splits.values():
+            n = experiment.wanted(images)
+            photons, detections = _expected(experiment, level, images, n)
+            probed, took, bytes_ = _probe(experiment, level, images, _PROBE)
+            row["images"] += n
+            row["photons"] += photons
+            row["detections"] += detections
+            size += bytes_ / probed * n
+            seconds += took / probed * n
+        row["bytes"] = int(size)
+        row["seconds"] = seconds * _BESIDES_ENCODING / jobs
+        levels.append(row)
+    total = {
+        key: sum(row[key] for row in levels)
+        for key in ("images", "photons", "detections", "bytes", "seconds")
+    }
+    largest = max(
+        (s.stop - s.start)
+        * dataset.expected_per_image(experiment, experiment.level(s.level), splits[s.split])[1]
+        for s in dataset.shards_of(experiment, splits)
+        if s.level is not None
+    )
+    return {
+        "levels": levels,
+        "total": total,
+        "jobs": jobs,
+        "shards": len(dataset.shards_of(experiment, splits)),
+        # streams, scratch and what the interpreter and its libraries take
+        "memory_per_worker": int(3 * largest + _resident()),
+    }
+
+
+def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tuple[float, float]:
+    """(photons, recorded detections) expected of the first `n` images."""
+    pixels = images.pixels[:n]
+    if pixels.dtype == np.uint8 and _uniform(experiment):
+        # every pixel obeys the same law: the histogram of grey levels says it all
+        counted = (
+            np.bincount(pixels[0].ravel(), minlength=256) * n
+            if pixels.strides[0] == 0
+            else np.bincount(pixels.ravel(), minlength=256)
+        )
+        photons = experiment.photons(level, np.arange(256, dtype=np.uint8)[:, None, None], images.white)
+        row = np.tile(photons, (1, experiment.sensor.layout.pixels))[:, : experiment.sensor.layout.pixels]
+        _, recorded = experiment.sensor.expected(row, experiment.conditions)
+        total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
+        return total, float(counted @ recorded[:, 0])
+    step = max(1, n // 256)
+    some = np.ascontiguousarray(pixels[::step])
+    photons = experiment.photons(level, some, images.white)
+    _, recorded = experiment.sensor.expected(
+        photons.reshape(-1, experiment.sensor.layout.pixels), experiment.conditions
+    )
+    share = n / len(some)
+    return float(photons.sum()) * experiment.conditions.exposure * share, float(recorded.sum()) * share
+
+
+def _uniform(experiment: Experiment) -> bool:
+    return all(
+        np.ndim(getattr(effect, name)) == 0
+        for effect in experiment.sensor.effects
+        for name in effect.parameters
+    )
+
+
+def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tuple[int, float, int]:
+    """(images, seconds to simulate and encode them, bytes)."""
+    block = experiment.sensor.block
+    count = min(max(count, block), len(images))
+    pixels = np.ascontiguousarray(images.pixels[:count])
+    started = time.perf_counter()
+    made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
+    columns = dataset.stream_columns(made, pixels.shape[1:])
+    columns |= dataset.reconstruction_columns(experiment, made, pixels.shape[1:])
+    size = store.encoded_size(columns, experiment.format)
+    return count, time.perf_counter() - started, size
+
+
+def _resident() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def text(estimated: Mapping[str, Any], root: Path) -> str:
+    """The estimate for people."""
+    lines = [
+        f"{'light level':>14}  {'images':>9}  {'photons':>9}  {'detections':>10}  {'size':>8}  {'time':>8}"
+    ]
+    for row in [*estimated["levels"], {"level": "all", **estimated["total"]}]:
+        lines.append(
+            f"{row['level']:>14}  {row['images']:>9,}  {row['photons']:>9.3g}  {row['detections']:>10.4g}  "
+            f"{_bytes(row['bytes']):>8}  {_seconds(row['seconds']):>8}"
+        )
+    jobs = estimated["jobs"]
+    lines += [
+        "",
+        f"{estimated['shards']} shards with {jobs} worker{'s' if jobs > 1 else ''}, "
+        f"about {_bytes(estimated['memory_per_worker'])} of memory each. Nothing was made in {root}.",
+        "Photons and detections are expectations; size and time are scaled up from some images simulated just now.",
+    ]
+    return "\n".join(lines)
+
+
+def _bytes(n: float) -> str:
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if n >= factor:
+            return f"{n / factor:.3g} {unit}"
+    return f"{n:.0f} B"
+
+
+def _seconds(s: float) -> str:
+    return f"{s / 60:.1f} min" if s >= 100 else f"{s:.1f} s"
