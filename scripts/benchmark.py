@@ -96,9 +96,7 @@ def simulation(images_dir: Path | None, rounds: int) -> list[Row]:
     def staged() -> None:
         numbers = np.arange(n, dtype=np.uint64)
         streams = experiment.streams(level, "train", numbers)
-        made = experiment.sensor.expose(
-            photons, experiment.conditions, streams, experiment.readouts, staged=True
-        )
+        made = experiment.sensor.expose(photons, experiment.conditions, streams, experiment.readouts, staged=True)
         for method in methods:
             method.image(made, experiment.settings)
 
@@ -116,9 +114,7 @@ def simulation(images_dir: Path | None, rounds: int) -> list[Row]:
     one = statistics.median(seconds(ours) for _ in range(rounds)) / n
     # the same image on both sides would be one in 400 of ours: compare per candidate event
     events = rates.sum() * experiment.conditions.exposure
-    slow = statistics.median(seconds(literal) for _ in range(3)) / (
-        rates[0].sum() * experiment.conditions.exposure
-    )
+    slow = statistics.median(seconds(literal) for _ in range(3)) / (rates[0].sum() * experiment.conditions.exposure)
     name = f"TR, STR, QIS and six reconstructions, 2560 mlux, one core ({kind})"
     return [
         (
@@ -152,7 +148,7 @@ def reading(images_dir: Path | None, folder: Path) -> list[Row]:
         picks = [int(i) for i in rng.integers(0, len(part), 300)]
         for i in picks[:100]:
             part.tr[i]
-        took = sorted(seconds(lambda i=i: part.tr[i].ticks) for i in picks[100:])
+        took = sorted(seconds(lambda i=i, part=part: part.tr[i].ticks) for i in picks[100:])
         rows.append((what, wanted, f"{took[100] * 1e3:.2f} ms"))
     return rows
 
@@ -164,9 +160,7 @@ def run(arguments: list[str]) -> tuple[float, int]:
         "r=subprocess.run(sys.argv[1:],stdout=subprocess.DEVNULL,stderr=subprocess.DEVNULL).returncode;"
         "print(time.perf_counter()-t,resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss,r)"
     )
-    out = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
-    ).stdout
+    out = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True).stdout
     took, peak, status = out.split()
     if status != "0":
         raise SystemExit(f"{' '.join(arguments)} failed with exit status {status}")
@@ -258,17 +252,11 @@ def whole_runs(images_dir: Path | None, folder: Path, quick: bool) -> list[Row]:
         rows.append((what, wanted, f"{size[kind] / floor[kind]:.3f}x"))
     rows.append(("peak memory of a process, 12,000 images", "<= 0.5 GB", f"{peak_small / 1e9:.2f} GB"))
     if not quick:
-        rows.append(
-            ("peak memory of a process, 70,000 images", "<= 0.5 GB, the same", f"{peak / 1e9:.2f} GB")
-        )
+        rows.append(("peak memory of a process, 70,000 images", "<= 0.5 GB, the same", f"{peak / 1e9:.2f} GB"))
         shutil.rmtree(root)
         took, _ = run([*command, "-o", str(folder / "all")])
-        size_all = sum(
-            f["bytes"] for f in json.loads((folder / "all" / "manifest.json").read_text())["files"].values()
-        )
-        rows.append(
-            (f"all ten levels, 700,000 images ({size_all / 1e9:.1f} GB)", "<= 150 s", f"{took:.0f} s")
-        )
+        size_all = sum(f["bytes"] for f in json.loads((folder / "all" / "manifest.json").read_text())["files"].values())
+        rows.append((f"all ten levels, 700,000 images ({size_all / 1e9:.1f} GB)", "<= 150 s", f"{took:.0f} s"))
     return rows
 
 
@@ -282,22 +270,16 @@ def writing_share(experiment, splits, folder: Path) -> float:  # type: ignore[no
     for shard in shards:
         task = factory.task_of(experiment, job, root, shard, splits[shard.split])
         started = time.perf_counter()
-        made = experiment.simulate_block(
-            experiment.levels[0], shard.split, task.pixels, task.white, task.first
-        )
+        made = experiment.simulate_block(experiment.levels[0], shard.split, task.pixels, task.white, task.first)
         images = dataset.reconstruction_columns(experiment, made, (28, 28))
         middle = time.perf_counter()
-        store.write_shard(
-            root, shard.path, dataset.stream_columns(made, (28, 28)) | images, {}, experiment.format
-        )
+        store.write_shard(root, shard.path, dataset.stream_columns(made, (28, 28)) | images, {}, experiment.format)
         ratios.append((time.perf_counter() - middle) / (middle - started))
     return statistics.median(ratios[4:])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--images-dir", type=Path, help="where MNIST lies (else $SPADMNIST_DATA, the cache, a download)"
     )

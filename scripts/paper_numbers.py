@@ -41,16 +41,12 @@ def spad512(mean_count: float, wavelength: float, pdp: float, frame_time: float)
 
 def main() -> None:
     white = photons_from_lux(2.56, 25e-12, 555e-9)
-    print(
-        f"white at 2560 mlux, 25 um^2, 555 nm: {white:.1f} photons/s, {white * 1e-3 * 0.5:.1f} detected in 1 ms"
-    )
+    print(f"white at 2560 mlux, 25 um^2, 555 nm: {white:.1f} photons/s, {white * 1e-3 * 0.5:.1f} detected in 1 ms")
     dark = 0.957 * 40 * np.exp(0.5**2 / 2) + 0.043 * 3000 * np.exp(0.3**2 / 2)
     print(f"SPAD23, mean DCR of the config's mixture: {dark:.0f} Hz")
     for mean, wavelength, pde, given in ((17.0e3, 500e-9, 0.422, 3), (2.27e3, 700e-9, 0.162, 0.8)):
         solved = spad23(mean, wavelength, pde, dark) / NANOWATT
-        print(
-            f"SPAD23, {wavelength * 1e9:.0f} nm, {mean / 1e3:g} kcps: {solved:.3f} nW/cm^2 (paper: about {given})"
-        )
+        print(f"SPAD23, {wavelength * 1e9:.0f} nm, {mean / 1e3:g} kcps: {solved:.3f} nW/cm^2 (paper: about {given})")
     for mean, wavelength, pdp, frame_time, given in (
         (457, 500e-9, 0.444, 1e-6, "120"),
         (60, 700e-9, 0.207, 1e-6, "20"),

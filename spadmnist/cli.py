@@ -160,18 +160,14 @@ def generate(
         outcome = factory.generate(experiment, images, root, workers, progress)
     if as_json:
         click.echo(
-            json.dumps(
-                {"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds}
-            )
+            json.dumps({"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds})
         )
         return
     from . import report
 
     click.echo(report.level_table(outcome.manifest))
     if outcome.made == 0 and outcome.kept == 0:
-        _say(
-            f"\n{root} was complete already; nothing was done. spadmnist verify {root} reads every byte of it."
-        )
+        _say(f"\n{root} was complete already; nothing was done. spadmnist verify {root} reads every byte of it.")
     else:
         kept = f", {outcome.kept} were there already" if outcome.kept else ""
         _say(f"\nMade {outcome.made} shards in {_duration(outcome.seconds)}{kept}: {root}")
@@ -213,9 +209,7 @@ def reconstruct_(
     with _terminal() as progress:
         added, manifest = factory.add_reconstructions(dataset, methods, jobs or _processors(), progress)
     if as_json:
-        click.echo(
-            json.dumps({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
-        )
+        click.echo(json.dumps({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]}))
         return
     if added:
         _say(f"Added to {dataset}: {', '.join(added)}\n")
@@ -257,9 +251,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
     else:
         click.echo(report.level_table(manifest))
     if not intact:
-        _say(
-            f"Note: {dataset / library.MANIFEST} was changed since it was written; spadmnist verify {dataset} says more."
-        )
+        _say(f"Note: {dataset / library.MANIFEST} was changed; spadmnist verify {dataset} says more.")
     if plot is not None:
         with _writing(plot):
             report.sheet(library.open(dataset), plot)
@@ -320,9 +312,7 @@ def verify(
         elif not left:
             click.echo(f"{dataset}: repaired; all {left.files} files are as they were made")
         elif not repair:
-            click.echo(
-                f"{dataset}: {_count(damage)} not as made; spadmnist verify {dataset} --repair makes them again"
-            )
+            click.echo(f"{dataset}: {_count(damage)} not as made; spadmnist verify {dataset} --repair makes them again")
     if left:
         sys.exit(1)
 
@@ -346,8 +336,10 @@ def _reference(kind: str) -> click.Command:
         try:
             if as_json:
                 click.echo(json.dumps(reference.as_data(kind, name)))
+            elif kind == "effect":
+                click.echo(reference.effect_page(name) if name else reference.effect_list())
             else:
-                click.echo(reference.page(kind, name) if name else reference.listing(kind))
+                click.echo(reference.method_page(name) if name else reference.method_list())
         except KeyError as error:
             raise SpadError(str(error.args[0])) from None
 
@@ -402,9 +394,7 @@ class _writing:
         from .errors import SpadError
 
         if isinstance(error, OSError):
-            raise SpadError(
-                f"{self.path}: cannot be written ({error.strerror or error}); name another file"
-            ) from None
+            raise SpadError(f"{self.path}: cannot be written ({error.strerror or error}); name another file") from None
 
 
 class _terminal:
@@ -488,9 +478,7 @@ def _run(arguments: list[str] | None) -> int:
     except Exception as error:
         if os.environ.get("SPADMNIST_DEBUG"):
             raise
-        _say(
-            f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}"
-        )
+        _say(f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}")
         _say("SPADMNIST_DEBUG=1 shows where; please report it.")
         return 2
 

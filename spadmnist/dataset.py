@@ -121,9 +121,7 @@ def image_columns(images: Images, start: int, stop: int) -> dict[str, Column]:
         )
     }
     if images.labels is not None:
-        columns["labels"] = Column(
-            np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts"
-        )
+        columns["labels"] = Column(np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts")
     return columns
 
 
@@ -153,9 +151,7 @@ def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Colu
             },
         )
         if f.first is not None:
-            columns |= _ragged(
-                f.first, "frames", "first_event", "since the start of its frame", dims, shape, False
-            )
+            columns |= _ragged(f.first, "frames", "first_event", "since the start of its frame", dims, shape, False)
     return columns
 
 
@@ -289,10 +285,8 @@ def read_frames(
     """The frames of some images of a shard; stamped: with the first stamps (STR)."""
     facts = reader.array_attributes("frames/bits")
     lines = reader.read("frames/bits", start * facts["lines_per_image"], stop * facts["lines_per_image"])
-    if frames % 8 == 0:
-        bits = lines.reshape(-1, frames // 8)
-    else:
-        bits = kernels.unpack_rows(lines, frames, facts["columns"])
+    whole_bytes = frames % 8 == 0
+    bits = lines.reshape(-1, frames // 8) if whole_bytes else kernels.unpack_rows(lines, frames, facts["columns"])
     first = None
     if stamped:
         counts = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
@@ -363,9 +357,7 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
         manifest = json.loads(raw)
         intact = isinstance(manifest, dict) and seal(manifest) == raw
     except (ValueError, RecursionError):
-        raise InputError(
-            f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again"
-        ) from None
+        raise InputError(f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again") from None
     if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
         raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
     if manifest["format"] != FORMAT:
@@ -575,9 +567,7 @@ class Dataset:
         if split is None:
             if len(self._splits) > 1:
                 names = " and ".join(self._splits)
-                raise KeyError(
-                    f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']"
-                )
+                raise KeyError(f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']")
             split = next(iter(self._splits))
         if split not in self._splits:
             raise KeyError(f"{split!r} is not a split here; there are {', '.join(self._splits)}")
@@ -618,9 +608,7 @@ class _Stored:
         f = self._facts
         if what == "tr":
             return read_tr(reader, start, stop, f["pixels"], f["tick"])
-        return read_frames(
-            reader, start, stop, f["pixels"], f["tick"], f["frames"], f["frame_time"], what == "str"
-        )
+        return read_frames(reader, start, stop, f["pixels"], f["tick"], f["frames"], f["frame_time"], what == "str")
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
         pieces = self._pieces(self._shards, start, stop)
@@ -630,9 +618,7 @@ class _Stored:
         return self._facts["normalisation"].get(method)
 
     def originals(self, start: int, stop: int) -> np.ndarray:
-        return _joined(
-            [reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)]
-        )
+        return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
 
     def labels(self) -> np.ndarray | None:
         if "labels" not in self._originals[0][2].names:
@@ -694,9 +680,7 @@ class _Simulated:
         return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
 
 
-def open(
-    path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()
-) -> Dataset:
+def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()) -> Dataset:
     """Open a dataset's folder, or a config file: then every image is simulated when it is asked for.
 
     images_dir: where the images of a config are looked for; plugin: files with effects that a config names.

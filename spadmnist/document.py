@@ -91,9 +91,7 @@ def parse(text: str, name: str) -> Document:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f":{mark.line + 1}" if mark else ""
-        raise ConfigError(
-            [f"{name}{line}: is not well-formed YAML: {error.problem or error.context}"]
-        ) from None
+        raise ConfigError([f"{name}{line}: is not well-formed YAML: {error.problem or error.context}"]) from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError([f"{name}: is not well-formed YAML: {' '.join(str(error).split())}"]) from None
     except RecursionError:
@@ -201,6 +199,4 @@ def _text(item: Any) -> str:
     plain = _PLAIN.fullmatch(item) and item.lower() not in ("true", "false", "null")
     if plain or re.fullmatch(r"[0-9.]+ [A-Za-z%][A-Za-z0-9^/%]*", item):
         return str(item)
-    return (
-        '"' + item.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t") + '"'
-    )
+    return '"' + item.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t") + '"'

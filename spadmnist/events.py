@@ -119,7 +119,7 @@ class Events:
         offsets = np.concatenate([[0], *(p.offsets[1:] + s for p, s in zip(parts, starts, strict=False))])
         first = parts[0]
         if first.ticks is not None:
-            ticks = np.concatenate([p.ticks for p in parts])  # type: ignore[arg-type]
+            ticks = np.concatenate([p.ticks for p in parts])
             return Events(None, offsets, first.pixels, ticks, first.tick)
         return Events(np.concatenate([p.times for p in parts]), offsets, first.pixels)
 
@@ -132,9 +132,7 @@ class Events:
             return "offsets decrease"
         times = self.times
         if times.dtype != np.float64 or times.ndim != 1 or len(times) != offsets[-1]:
-            return (
-                f"there are {times.shape} times of type {times.dtype}, but offsets for {offsets[-1]} float64"
-            )
+            return f"there are {times.shape} times of type {times.dtype}, but offsets for {offsets[-1]} float64"
         if not np.all(np.isfinite(times)):
             return "a time is not finite"
         later = np.diff(times) < 0

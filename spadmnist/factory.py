@@ -186,8 +186,7 @@ def run_tasks(
                 initargs=(os.getpid(),),
             ) as parallel:
                 calls = (
-                    delayed(_keyed)(function, key, task)
-                    for key, task in zip(missing, tasks(missing), strict=True)
+                    delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
                 )
                 for key, result in parallel(calls):
                     remaining.discard(key)
@@ -339,7 +338,7 @@ def generate(
     splits: Mapping[str, Images],
     root: Path,
     jobs: int,
-    progress: Progress = Progress(),  # noqa: B008
+    progress: Progress = Progress(),
 ) -> Outcome:
     """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done."""
     started = time.monotonic()
@@ -481,9 +480,7 @@ def _warm(experiment: Experiment, progress: Progress) -> None:
     """Compile the kernels once, here, so that the workers find them in the cache."""
     if experiment.sensor.block > 1:
         return  # a user's effect is run for the images that are wanted, and for no others
-    hint = threading.Timer(
-        1.5, progress.notice, ["Compiling the simulation for this machine, once: about 20 s."]
-    )
+    hint = threading.Timer(1.5, progress.notice, ["Compiling the simulation for this machine, once: about 20 s."])
     hint.start()
     try:
         pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
@@ -522,7 +519,7 @@ def add_reconstructions(
     root: Path,
     names: Sequence[str],
     jobs: int,
-    progress: Progress = Progress(),  # noqa: B008
+    progress: Progress = Progress(),
 ) -> tuple[list[str], dict[str, Any]]:
     """Flux images from the raw streams of a finished dataset, as if its config had asked for them.
 
@@ -677,9 +674,7 @@ def _level_attributes(
         return {"content": "original images and labels"}
     level = experiment.level(shard.level)
     unit = "lux" if level.kind == "lux" else "W/m^2"
-    medians = {
-        f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None
-    }
+    medians = {f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None}
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 
@@ -694,7 +689,7 @@ def _statistics(
             continue
         total = out[shard.level].setdefault(
             shard.split,
-            {"images": 0, "pixels": 0, "saturated_pixels": {m: 0 for m in experiment.methods}, "bytes": {}},
+            {"images": 0, "pixels": 0, "saturated_pixels": dict.fromkeys(experiment.methods, 0), "bytes": {}},
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels

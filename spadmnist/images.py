@@ -78,9 +78,7 @@ class Images:
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (3, 4) or self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
             raise ValueError(f"pixels must not be {self.pixels.dtype} of shape {self.pixels.shape}")
-        if self.labels is not None and (
-            self.labels.dtype != np.uint8 or self.labels.shape != self.pixels.shape[:1]
-        ):
+        if self.labels is not None and (self.labels.dtype != np.uint8 or self.labels.shape != self.pixels.shape[:1]):
             raise ValueError(f"labels must not be {self.labels.dtype} of shape {self.labels.shape}")
         for name in ("pixels", "labels"):
             array = getattr(self, name)
@@ -158,9 +156,7 @@ def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) ->
 class _Source(BaseModel):
     """What every source shares. `load` is for callers; each source writes `_read` and `describe`."""
 
-    model_config = ConfigDict(
-        strict=True, extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
     def load(
         self,
@@ -187,8 +183,7 @@ class _Source(BaseModel):
         except OSError as error:
             place = error.filename or self.describe()
             raise InputError(
-                f"{place}: cannot be opened ({error.strerror or _reason(error)}); "
-                "check the path and its permissions"
+                f"{place}: cannot be opened ({error.strerror or _reason(error)}); check the path and its permissions"
             ) from error
         except MemoryError as error:
             raise InputError(
@@ -259,9 +254,7 @@ def read_idx(path: Path, ndim: int) -> np.ndarray:
             most = file_bytes * _MAX_DEFLATE if packed else file_bytes
             return _read_idx(cast(IO[bytes], stream), ndim, path, most)
     except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-        raise InputError(
-            f"{path}: its gzip data are damaged ({_reason(error)}); download or copy it again"
-        ) from error
+        raise InputError(f"{path}: its gzip data are damaged ({_reason(error)}); download or copy it again") from error
 
 
 def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int) -> np.ndarray:
@@ -328,9 +321,7 @@ def _idx_sha256(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _labelled(
-    images: np.ndarray, labels: np.ndarray | None, white: float, files: tuple[object, object]
-) -> Images:
+def _labelled(images: np.ndarray, labels: np.ndarray | None, white: float, files: tuple[object, object]) -> Images:
     """Images and labels of the two `files` together, if their numbers agree."""
     if labels is not None and len(labels) != len(images):
         raise InputError(
@@ -349,12 +340,8 @@ class Idx(_Source):
     source: Literal["idx"] = "idx"
     train_images: str = Field(min_length=1, description="IDX file of images (n, rows, columns), bytes")
     train_labels: str | None = Field(default=None, min_length=1, description="IDX file of labels (n,), bytes")
-    test_images: str | None = Field(
-        default=None, min_length=1, description="as train_images, for the test split"
-    )
-    test_labels: str | None = Field(
-        default=None, min_length=1, description="as train_labels, for the test split"
-    )
+    test_images: str | None = Field(default=None, min_length=1, description="as train_images, for the test split")
+    test_labels: str | None = Field(default=None, min_length=1, description="as train_labels, for the test split")
     transpose: bool = Field(default=False, description="swap rows and columns, as EMNIST's files need")
 
     def describe(self) -> str:
@@ -364,9 +351,7 @@ class Idx(_Source):
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
         if self.test_labels and not self.test_images:
-            raise InputError(
-                f"scene.images.test_labels: {self.test_labels} labels nothing; give test_images too"
-            )
+            raise InputError(f"scene.images.test_labels: {self.test_labels} labels nothing; give test_images too")
         folders = [images_dir] if images_dir is not None else [_data_dir(), base]
         splits = {}
         for split, images_name, labels_name in (
@@ -514,9 +499,7 @@ class Folder(_Source):
 
     source: Literal["folder"] = "folder"
     path: str = Field(min_length=1, description="the folder")
-    white: float | None = Field(
-        default=None, gt=0, description="the grey level of white; 255, or 65535 for 16 bits"
-    )
+    white: float | None = Field(default=None, gt=0, description="the grey level of white; 255, or 65535 for 16 bits")
 
     def describe(self) -> str:
         return f"folder {self.path}"
@@ -546,9 +529,7 @@ class Folder(_Source):
         for split, part in files.items():
             if not part:
                 allowed = ", ".join(_SUFFIXES)
-                raise InputError(
-                    f"{root / prefixes[split]}: there is no image in it; put some there ({allowed})"
-                )
+                raise InputError(f"{root / prefixes[split]}: there is no image in it; put some there ({allowed})")
             of_part = classes[split]
             pixels = _read_folder(root, part[:limit], self.white)
             splits[split] = Images(
@@ -611,9 +592,7 @@ def _classes(root: Path, prefix: str, names: list[str]) -> list[str] | None:
         return None
     for name, parts in zip(names, inner, strict=True):
         if len(parts) == 1:
-            raise InputError(
-                f"{root / name}: it lies beside class folders, in none of them; move it into one"
-            )
+            raise InputError(f"{root / name}: it lies beside class folders, in none of them; move it into one")
     return [parts[0] for parts in inner]
 
 
@@ -663,9 +642,7 @@ def _decode(path: Path) -> np.ndarray:
         except InputError:
             raise
         except UnidentifiedImageError as error:
-            raise InputError(
-                f"{path}: its content is none of {', '.join(_FORMATS)}; replace or remove it"
-            ) from error
+            raise InputError(f"{path}: its content is none of {', '.join(_FORMATS)}; replace or remove it") from error
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
             raise InputError(
                 f"{path}: it declares more than the {Image.MAX_IMAGE_PIXELS} pixels allowed; "
@@ -745,17 +722,13 @@ class Array(_Source):
             if head[:2] == b"PK":
                 return self._read_npz(file, path, limit)
         seems = _looks_like(head) if head else "an empty file"
-        raise InputError(
-            f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez"
-        )
+        raise InputError(f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez")
 
     def _read_npz(self, file: IO[bytes], path: Path, limit: int | None) -> dict[str, Images]:
         try:
             archive = zipfile.ZipFile(file)
         except Exception as error:  # damaged directories make zipfile raise nearly anything
-            raise InputError(
-                f"{path}: the archive is damaged ({_reason(error)}); copy or store it again"
-            ) from error
+            raise InputError(f"{path}: the archive is damaged ({_reason(error)}); copy or store it again") from error
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         names = next((pairs for pairs in _NPZ_NAMES if pairs[0][0] in members), None)
         if names is None:
@@ -764,9 +737,7 @@ class Array(_Source):
             raise InputError(f"{path}: it holds {held}, but no {allowed}; rename the arrays")
         wanted = [members[name] for pair in names for name in pair if name in members]
         if sum(info.file_size for info in wanted) > MAX_BYTES:
-            raise InputError(
-                f"{path}: its arrays declare more than the {MAX_BYTES} bytes allowed; store fewer images"
-            )
+            raise InputError(f"{path}: its arrays declare more than the {MAX_BYTES} bytes allowed; store fewer images")
         splits, file_bytes = {}, path.stat().st_size
         for split, (images_name, labels_name) in zip(("train", "test"), names, strict=False):
             if images_name not in members:
@@ -798,9 +769,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: in
             f"{place} is encrypted or packed in an unusual way; store it by np.savez or np.savez_compressed"
         )
     if info.file_size > file_bytes * _MAX_DEFLATE:
-        raise InputError(
-            f"{place} declares {info.file_size} bytes, more than the file can hold; store it again"
-        )
+        raise InputError(f"{place} declares {info.file_size} bytes, more than the file can hold; store it again")
     try:
         with archive.open(info) as stream:
             return _read_npy(stream, info.file_size, place)
@@ -820,35 +789,26 @@ def _read_npy(stream: IO[bytes], size: int, place: str) -> np.ndarray:
         shape, _, dtype = read_header(stream)
     # the header is a Python literal, and NumPy's reader of it raises nearly anything when it is damaged
     except Exception as error:
-        raise InputError(
-            f"{place}: its header is damaged ({_reason(error)}); store it again by np.save"
-        ) from error
+        raise InputError(f"{place}: its header is damaged ({_reason(error)}); store it again by np.save") from error
     if dtype.kind not in "biuf":
         raise InputError(f"{place}: it holds {dtype}, not plain numbers; store uint8, uint16 or float32")
     declared, held = math.prod(shape) * dtype.itemsize, size - stream.tell()
     if declared > MAX_BYTES:
-        raise InputError(
-            f"{place}: it declares {declared} bytes, {MAX_BYTES} are allowed; store fewer images"
-        )
+        raise InputError(f"{place}: it declares {declared} bytes, {MAX_BYTES} are allowed; store fewer images")
     if declared != held or min(shape, default=0) < 0:
-        raise InputError(
-            f"{place}: it declares {shape} {dtype}, {declared} bytes, but {held} follow; store it again"
-        )
+        raise InputError(f"{place}: it declares {shape} {dtype}, {declared} bytes, but {held} follow; store it again")
     stream.seek(0)
     try:
         return npy.read_array(stream, allow_pickle=False)
     except ValueError as error:
-        raise InputError(
-            f"{place}: it ends too early ({_reason(error)}); store it again by np.save"
-        ) from error
+        raise InputError(f"{place}: it ends too early ({_reason(error)}); store it again by np.save") from error
 
 
 def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.ndarray, float]:
     """The array as uint8, uint16 or float32 images, every value checked, and the grey level of white."""
     if array.ndim not in (3, 4):
         raise InputError(
-            f"{place}: its shape is {array.shape}; "
-            "store images as (n, rows, columns) or (n, channels, rows, columns)"
+            f"{place}: its shape is {array.shape}; store images as (n, rows, columns) or (n, channels, rows, columns)"
         )
     if array.size == 0:
         raise InputError(f"{place}: its shape is {array.shape}, that is nothing; give at least one image")
@@ -861,9 +821,7 @@ def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.n
         dtype = np.dtype(np.uint8 if array.itemsize == 1 else np.uint16)
     elif white is None:
         # 0 to 255 as often as not, so guessing white would make such images nearly black
-        raise InputError(
-            f"{place}: it holds {array.dtype}, which leaves white open; set white (255 or 65535)"
-        )
+        raise InputError(f"{place}: it holds {array.dtype}, which leaves white open; set white (255 or 65535)")
     else:
         dtype = np.dtype(np.uint8 if white <= 255 else np.uint16)
     top = _white(white, dtype)
@@ -885,9 +843,7 @@ def _to_labels(array: np.ndarray, place: str) -> np.ndarray:
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
     if array.ndim != 1 or array.dtype.kind not in "biu":
-        raise InputError(
-            f"{place}: it is {array.dtype} {array.shape}; labels are one integer per image, (n,)"
-        )
+        raise InputError(f"{place}: it is {array.dtype} {array.shape}; labels are one integer per image, (n,)")
     if array.size and not (array.min() >= 0 and array.max() <= 255):
         wrong = array[(array < 0) | (array > 255)][0]
         raise InputError(f"{place}: it has the label {wrong}; labels are 0 to 255: number the classes from 0")
@@ -1017,9 +973,7 @@ class Uniform(_Source):
 
     source: Literal["uniform"] = "uniform"
     repetitions: int = Field(default=10, ge=1, le=2**31 - 1, description="number of images")
-    grey: int = Field(
-        default=255, ge=0, le=255, description="grey level; 255, white, is the scene's full light"
-    )
+    grey: int = Field(default=255, ge=0, le=255, description="grey level; 255, white, is the scene's full light")
 
     def describe(self) -> str:
         return f"{self.repetitions} uniform images of grey {self.grey}"

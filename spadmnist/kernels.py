@@ -11,6 +11,9 @@ images, `paper_line` calls them image by image so that everything stays in the p
 give the same events, bit for bit.
 """
 
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the types from the calls; the docstrings give them.
+
 from __future__ import annotations
 
 from typing import Any
@@ -62,14 +65,12 @@ _ONE_BITS = np.uint64(0x3FF0000000000000)
 _SQRT_HALF_SHIFT = np.uint64(0x3FF0000000000000 - 0x3FE6A09E00000000)
 _SQRT_HALF_BITS = np.uint64(0x3FE6A09E00000000)
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
-_MAGIC_BITS = np.uint64(
-    0x4330000000000000
-)  # 2^52: adding it leaves an integer in the low bits of the mantissa
+_MAGIC_BITS = np.uint64(0x4330000000000000)  # 2^52: adding it leaves an integer in the low bits of the mantissa
 _MAGIC = 4503599627370496.0
 
 
 @_inline
-def _philox(block, image, key0, key1, word):  # type: ignore[no-untyped-def]
+def _philox(block, image, key0, key1, word):
     """Two 64-bit random words for the counter (block, image, word) under the key."""
     c0 = np.uint64(block) & _MASK
     c1 = np.uint64(image) & _MASK
@@ -87,7 +88,7 @@ def _philox(block, image, key0, key1, word):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _log(x):  # type: ignore[no-untyped-def]
+def _log(x):
     """Natural logarithm of a positive, normal double; error below 1 ulp (the algorithm of fdlibm's e_log.c).
 
     The integer exponent becomes a double by way of 2^52, since SIMD units before AVX-512 cannot convert it.
@@ -111,14 +112,14 @@ def _log(x):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _exponential(word):  # type: ignore[no-untyped-def]
+def _exponential(word):
     """A standard exponential from 64 random bits: -log of an odd multiple of 2^-53, so never 0 and never infinite."""
     u = _double((word >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
     return -_log(u)
 
 
 @_jit
-def _exponentials(block, image, key0, key1, word, out):  # type: ignore[no-untyped-def]
+def _exponentials(block, image, key0, key1, word, out):
     """Fill `out[:BATCH]` with the exponentials of the blocks from `block` on; `out[BATCH]` becomes +inf, a stop."""
     half = BATCH // 2
     for i in range(half):
@@ -129,7 +130,7 @@ def _exponentials(block, image, key0, key1, word, out):  # type: ignore[no-untyp
 
 
 @_jit
-def exponentials(count, image, key):  # type: ignore[no-untyped-def]
+def exponentials(count, image, key):
     """The first `count` standard exponentials of a stream (float64), as the arrivals of an image use them."""
     out = np.empty(count)
     buffer = np.empty(BATCH + 1)
@@ -143,7 +144,7 @@ def exponentials(count, image, key):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def logarithm(x):  # type: ignore[no-untyped-def]
+def logarithm(x):
     """Natural logarithm of an array of positive doubles: the same bits on every machine."""
     out = np.empty(x.size)
     for i in range(x.size):
@@ -155,7 +156,7 @@ def logarithm(x):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, delays, found):  # type: ignore[no-untyped-def]
+def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, delays, found):
     """Which of a row's `count` events have a child.
 
     Each has one with probability 1 - exp(-hazard), independently. Instead of a draw for each event, a unit-rate
@@ -184,7 +185,7 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
 
 
 @_jit
-def _begin_image(image, key, child_key, buffer, places, distances):  # type: ignore[no-untyped-def]
+def _begin_image(image, key, child_key, buffer, places, distances):
     """Where the draws of an image start. places: (block, draw, child block); distances: to the next event, child."""
     _exponentials(np.uint64(0), image, key[0], key[1], key[2], buffer)
     places[0] = 0
@@ -212,7 +213,7 @@ def _candidates(
     distances,
     parents,
     delays,
-):  # type: ignore[no-untyped-def]
+):
     """Draw the next pixels of an image: a Poisson process in each, with its afterpulses among them.
 
     One unit-rate Poisson process runs along the image, pixel after pixel, each pixel being `rate * exposure` long:
@@ -308,7 +309,7 @@ def _candidates(
 
 
 @_jit
-def _expected(rates, exposure):  # type: ignore[no-untyped-def]
+def _expected(rates, exposure):
     total = 0.0
     for p in range(rates.size):
         total += rates[p]
@@ -316,13 +317,13 @@ def _expected(rates, exposure):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _room(expected):  # type: ignore[no-untyped-def]
+def _room(expected):
     """Entries that nearly always suffice for so many expected events (what does not fit is drawn again)."""
     return int(1.02 * expected + 8.0 * np.sqrt(expected)) + 2 * BATCH + 64
 
 
 @_jit
-def arrivals(rates, exposure, images, key):  # type: ignore[no-untyped-def]
+def arrivals(rates, exposure, images, key):
     """A Poisson process in every row.
 
     rates: (images, pixels) 1/s; images: (images,) uint64, the numbers that key the draws; key: (3,) uint64.
@@ -369,7 +370,7 @@ def arrivals(rates, exposure, images, key):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _grown(array, used, needed):  # type: ignore[no-untyped-def]
+def _grown(array, used, needed):
     """`array`, or a larger copy of its first `used` entries where `needed` do not fit."""
     if needed <= array.size:
         return array
@@ -379,7 +380,7 @@ def _grown(array, used, needed):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def children(offsets, hazards, images, key):  # type: ignore[no-untyped-def]
+def children(offsets, hazards, images, key):
     """Which events have a child: each one with probability 1 - exp(-hazard of its pixel).
 
     offsets: (images * pixels + 1,); hazards: (pixels,). Returns (parent (children,) int64, index of the event;
@@ -413,7 +414,7 @@ def children(offsets, hazards, images, key):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def uniforms(offsets, pixels, images, key):  # type: ignore[no-untyped-def]
+def uniforms(offsets, pixels, images, key):
     """A number from (0, 1) for each event, drawn image by image. Returns (events,) float64."""
     out = np.empty(offsets[-1])
     for i in range(images.size):
@@ -425,7 +426,7 @@ def uniforms(offsets, pixels, images, key):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def row_totals(values, offsets):  # type: ignore[no-untyped-def]
+def row_totals(values, offsets):
     """Sum of each row's entries, as float64; that of integers is exact."""
     out = np.zeros(offsets.size - 1)
     for row in range(offsets.size - 1):
@@ -438,7 +439,7 @@ def row_totals(values, offsets):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def merge(times, offsets, extra, extra_rows):  # type: ignore[no-untyped-def]
+def merge(times, offsets, extra, extra_rows):
     """Sort further events into their rows.
 
     extra: (m,) s, any order; extra_rows: (m,) int64, ascending. Returns (times, offsets, origin): `origin` says
@@ -475,7 +476,7 @@ def merge(times, offsets, extra, extra_rows):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _record(times, stamps, start, stop, dead_time, out, used):  # type: ignore[no-untyped-def]
+def _record(times, stamps, start, stop, dead_time, out, used):
     """Append the stamps of a row's events that are more than the dead time after the last one appended.
 
     Non-paralyzable (paper, lines 24-29): what is not recorded hides nothing.
@@ -491,7 +492,7 @@ def _record(times, stamps, start, stop, dead_time, out, used):  # type: ignore[n
 
 
 @_jit
-def non_paralyzable(times, offsets, dead_times):  # type: ignore[no-untyped-def]
+def non_paralyzable(times, offsets, dead_times):
     """Remove what a non-paralyzable dead time hides. dead_times: (pixels,) s. Returns the kept indices (int64)."""
     pixels = dead_times.size
     indices = np.arange(times.size)
@@ -503,7 +504,7 @@ def non_paralyzable(times, offsets, dead_times):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def take(offsets, kept):  # type: ignore[no-untyped-def]
+def take(offsets, kept):
     """The offsets of the rows when only the events `kept` (ascending indices) remain."""
     new = np.zeros_like(offsets)
     k = 0
@@ -515,7 +516,7 @@ def take(offsets, kept):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def avalanches(times, pixel, parent, order, dead_times, frame_period, frame_time):  # type: ignore[no-untyped-def]
+def avalanches(times, pixel, parent, order, dead_times, frame_period, frame_time):
     """What fires under `rules: device`: one pass in time order.
 
     An event fires if its parent fired (parent -1: it has none) and its pixel is not blind. With `frame_period` = 0
@@ -548,13 +549,13 @@ def avalanches(times, pixel, parent, order, dead_times, frame_period, frame_time
 
 
 @_inline
-def _nearest(x):  # type: ignore[no-untyped-def]
+def _nearest(x):
     """The integer nearest to 0 <= x < 2^52, as uint64 (ties to even)."""
     return _bits(x + _MAGIC) & _MANTISSA
 
 
 @_inline
-def _frame_of(time, frame_period):  # type: ignore[no-untyped-def]
+def _frame_of(time, frame_period):
     """(frame, seconds since its start) of a moment; the number of the frame is a double."""
     frame = np.floor(time / frame_period)
     since = time - frame * frame_period
@@ -564,14 +565,14 @@ def _frame_of(time, frame_period):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def nearest_ticks(times, tick, out):  # type: ignore[no-untyped-def]
+def nearest_ticks(times, tick, out):
     """Round to the nearest multiple of the tick (paper, lines 30-32). `out` is unsigned and of the size of `times`."""
     for i in range(times.size):
         out[i] = _nearest(times[i] / tick)
 
 
 @_inline
-def _row_frames(frame, first, start, stop, bits, row, out, used):  # type: ignore[no-untyped-def]
+def _row_frames(frame, first, start, stop, bits, row, out, used):
     """One row's frames from the frame number (from 1 on; 0: in none) and the stamp of each of its events.
 
     Sets the row's bits (most significant first) and appends the first stamp of each frame that has an event.
@@ -601,7 +602,7 @@ def _row_frames(frame, first, start, stop, bits, row, out, used):  # type: ignor
 
 
 @_inline
-def _flush(word, number, bits, row):  # type: ignore[no-untyped-def]
+def _flush(word, number, bits, row):
     """Write 64 frames' bits, the `number`-th such word from 1 on (0: there is none yet)."""
     if number > 0:
         base = np.uint64(8) * (number - np.uint64(1))
@@ -610,7 +611,7 @@ def _flush(word, number, bits, row):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def frame_readout(times, offsets, frames, frame_time, frame_period, out):  # type: ignore[no-untyped-def]
+def frame_readout(times, offsets, frames, frame_time, frame_period, out):
     """Bin events into frames: bits, and the first moment (s since its start) of every frame that has an event.
 
     `out` has room for one more than there are events.
@@ -636,14 +637,14 @@ def frame_readout(times, offsets, frames, frame_time, frame_period, out):  # typ
 
 
 @_inline
-def _waited(stamps, ones, frames, frame_time, tick):  # type: ignore[no-untyped-def]
+def _waited(stamps, ones, frames, frame_time, tick):
     if tick > 0.0:
         return stamps * tick + (frames - ones) * frame_time
     return stamps + (frames - ones) * frame_time
 
 
 @_jit
-def _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first):  # type: ignore[no-untyped-def]
+def _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first):
     """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on."""
     last_frame = np.float64(frames)
     if tick > 0.0:
@@ -683,7 +684,7 @@ def paper_line(
     want_stamps,
     ticks,
     firsts,
-):  # type: ignore[no-untyped-def]
+):
     """Detection to readout under `rules: paper`, for a sensor with nothing but afterpulsing, dead time and a TDC.
 
     The same per-image functions as the staged line, run one image at a time in buffers that stay in the cache.
@@ -799,7 +800,7 @@ def paper_line(
 
 
 @_jit
-def _tile_tr(times, tile_offsets, dead_times, tick, stamps, ticks, used, first_row, offsets, counts, span):  # type: ignore[no-untyped-def]
+def _tile_tr(times, tile_offsets, dead_times, tick, stamps, ticks, used, first_row, offsets, counts, span):
     """The TR readout of some pixels: stamps, then the dead time; appended to `ticks` from `used` on."""
     for i in range(np.uint64(tile_offsets[tile_offsets.size - 1])):
         stamps[i] = _nearest(times[i] / tick)
@@ -833,7 +834,7 @@ def _tile_frames(
     first_offsets,
     ones,
     waited,
-):  # type: ignore[no-untyped-def]
+):
     """The frames of some pixels, their stamps appended to `firsts` from `used` on."""
     empty = frames * frame_time
     used = np.uint64(used)
@@ -854,7 +855,7 @@ def _tile_frames(
 
 
 @_jit
-def spans(times, offsets):  # type: ignore[no-untyped-def]
+def spans(times, offsets):
     """(counts (rows,) int32, last minus first entry of each row (rows,) float64; 0 where there are fewer than two)."""
     rows = offsets.size - 1
     counts = np.zeros(rows, np.int32)
@@ -871,7 +872,7 @@ def spans(times, offsets):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def row_differences(values, offsets):  # type: ignore[no-untyped-def]
+def row_differences(values, offsets):
     """Each entry minus the one before it in its row; the first of a row as it is. The same type."""
     out = np.empty_like(values)
     for i in range(np.uint64(1), np.uint64(values.size)):
@@ -884,7 +885,7 @@ def row_differences(values, offsets):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def row_sums(differences, offsets):  # type: ignore[no-untyped-def]
+def row_sums(differences, offsets):
     """The inverse of `row_differences`."""
     out = np.empty_like(differences)
     for row in range(offsets.size - 1):
@@ -898,7 +899,7 @@ def row_sums(differences, offsets):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def pack_rows(bits, width, rows):  # type: ignore[no-untyped-def]
+def pack_rows(bits, width, rows):
     """Put rows of `width` bits next to each other, without the padding to whole bytes at the end of each.
 
     bits: (n * rows, ceil(width / 8)) uint8, most significant bit first, padding 0.
@@ -920,7 +921,7 @@ def pack_rows(bits, width, rows):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def unpack_rows(packed, width, rows):  # type: ignore[no-untyped-def]
+def unpack_rows(packed, width, rows):
     """The inverse of `pack_rows`."""
     n, size = packed.shape
     bytes_per_row = (width + 7) // 8

@@ -16,9 +16,7 @@ from .config import Experiment
 from .images import Images
 
 _PROBE = 64  # images a level
-_BESIDES_ENCODING = (
-    1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
-)
+_BESIDES_ENCODING = 1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
 
 
 def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) -> dict[str, Any]:
@@ -46,13 +44,9 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
         row["bytes"] = int(size)
         row["seconds"] = seconds * _BESIDES_ENCODING / jobs
         levels.append(row)
-    total = {
-        key: sum(row[key] for row in levels)
-        for key in ("images", "photons", "detections", "bytes", "seconds")
-    }
+    total = {key: sum(row[key] for row in levels) for key in ("images", "photons", "detections", "bytes", "seconds")}
     largest = max(
-        (s.stop - s.start)
-        * dataset.expected_per_image(experiment, experiment.level(s.level), splits[s.split])[1]
+        (s.stop - s.start) * dataset.expected_per_image(experiment, experiment.level(s.level), splits[s.split])[1]
         for s in dataset.shards_of(experiment, splits)
         if s.level is not None
     )
@@ -93,9 +87,7 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
 
 def _uniform(experiment: Experiment) -> bool:
     return all(
-        np.ndim(getattr(effect, name)) == 0
-        for effect in experiment.sensor.effects
-        for name in effect.parameters
+        np.ndim(getattr(effect, name)) == 0 for effect in experiment.sensor.effects for name in effect.parameters
     )
 
 
@@ -119,9 +111,7 @@ def _resident() -> int:
 
 def text(estimated: Mapping[str, Any], root: Path) -> str:
     """The estimate for people."""
-    lines = [
-        f"{'light level':>14}  {'images':>9}  {'photons':>9}  {'detections':>10}  {'size':>8}  {'time':>8}"
-    ]
+    lines = [f"{'light level':>14}  {'images':>9}  {'photons':>9}  {'detections':>10}  {'size':>8}  {'time':>8}"]
     for row in [*estimated["levels"], {"level": "all", **estimated["total"]}]:
         lines.append(
             f"{row['level']:>14}  {row['images']:>9,}  {row['photons']:>9.3g}  {row['detections']:>10.4g}  "

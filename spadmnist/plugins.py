@@ -70,9 +70,7 @@ class Parameter:
             high is not None and (value > high or (self.open_bounds and value == high))
         )
         if outside or not np.isfinite(value):
-            raise ValueError(
-                f"{units.show(value, self.unit)} is not possible; {self.name} is {self.allowed()}"
-            )
+            raise ValueError(f"{units.show(value, self.unit)} is not possible; {self.name} is {self.allowed()}")
 
 
 def parameter(
@@ -95,9 +93,7 @@ def parameter(
     off: the value at which the effect vanishes. bounds: what is possible. search: where a fit looks.
     per_pixel: it may be a map from a file or a distribution; by_wavelength: it may be a table over the wavelength.
     """
-    return Parameter(
-        default, unit, about, symbol, bounds, open_bounds, off, search, per_pixel, by_wavelength, required
-    )
+    return Parameter(default, unit, about, symbol, bounds, open_bounds, off, search, per_pixel, by_wavelength, required)
 
 
 # --- values as a config gives them --------------------------------------------------------------------------------
@@ -142,9 +138,7 @@ class Distribution:
             return rng.normal(self.numbers[0], self.numbers[1], pixels)
         if self.kind == "lognormal":
             return self.numbers[0] * np.exp(self.numbers[1] * rng.standard_normal(pixels))
-        which = np.searchsorted(
-            np.cumsum([share for share, _ in self.parts]), rng.random(pixels), side="right"
-        )
+        which = np.searchsorted(np.cumsum([share for share, _ in self.parts]), rng.random(pixels), side="right")
         drawn = np.stack([part.draw(rng, pixels) for _, part in self.parts])
         return drawn[np.minimum(which, len(self.parts) - 1), np.arange(pixels)]
 
@@ -191,9 +185,7 @@ def _read_mapping(declared: Parameter, raw: Mapping[Any, Any], base: Path, probl
         return MapFile((base / raw["file"]).resolve())
     if keys & {"normal", "lognormal", "mixture"}:
         if not declared.per_pixel:
-            problem(
-                (), f"{declared.name} is one number for the whole array; a distribution is not allowed here"
-            )
+            problem((), f"{declared.name} is one number for the whole array; a distribution is not allowed here")
             return None
         return _read_distribution(declared, raw, (), problem)
     if declared.by_wavelength:
@@ -232,9 +224,7 @@ def _read_table(declared: Parameter, raw: Mapping[Any, Any], problem: Problem) -
     return ByWavelength(tuple(w for w, _ in entries), tuple(v for _, v in entries)) if good else None
 
 
-def _read_distribution(
-    declared: Parameter, raw: Any, path: tuple[Any, ...], problem: Problem
-) -> Distribution | None:
+def _read_distribution(declared: Parameter, raw: Any, path: tuple[Any, ...], problem: Problem) -> Distribution | None:
     kinds = [k for k in raw if k in (*_DISTRIBUTIONS, "mixture")] if isinstance(raw, Mapping) else []
     extra = [k for k in raw if k not in (*kinds, "share")] if isinstance(raw, Mapping) else []
     if len(kinds) != 1 or extra:
@@ -254,9 +244,7 @@ def _read_distribution(
     return None if centre is None or sigma is None else Distribution(kind, (centre, sigma))
 
 
-def _read_mixture(
-    declared: Parameter, body: Any, path: tuple[Any, ...], problem: Problem
-) -> Distribution | None:
+def _read_mixture(declared: Parameter, body: Any, path: tuple[Any, ...], problem: Problem) -> Distribution | None:
     if not isinstance(body, list) or not body:
         problem(path, "a mixture is a list of distributions, each with its share")
         return None
@@ -264,9 +252,7 @@ def _read_mixture(
     parts = []
     for i, item in enumerate(body):
         if not isinstance(item, Mapping) or "share" not in item:
-            problem(
-                (*path, i), "each part of a mixture needs a share, for example {share: 0.03, normal: {...}}"
-            )
+            problem((*path, i), "each part of a mixture needs a share, for example {share: 0.03, normal: {...}}")
             return None
         share = _read_number(share_of, item["share"], (*path, i, "share"), problem)
         part = _read_distribution(declared, item, (*path, i), problem)
@@ -302,9 +288,7 @@ def _read_map(declared: Parameter, path: Path, pixels: int) -> np.ndarray:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(
-            f"{path}: cannot be read as a .npy map ({error}); write one with numpy.save"
-        ) from None
+        raise InputError(f"{path}: cannot be read as a .npy map ({error}); write one with numpy.save") from None
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.size != pixels:
         shape = getattr(values, "shape", None)
         raise InputError(
@@ -313,9 +297,7 @@ def _read_map(declared: Parameter, path: Path, pixels: int) -> np.ndarray:
         )
     flat = values.astype(np.float64).ravel()
     for index in np.flatnonzero(~np.isfinite(flat))[:1]:
-        raise InputError(
-            f"{path}: entry {index} of the map is {flat[index]}; every pixel needs a finite number"
-        )
+        raise InputError(f"{path}: entry {index} of the map is {flat[index]}; every pixel needs a finite number")
     for index in (int(flat.argmin()), int(flat.argmax())):
         try:
             declared.check(float(flat[index]))
@@ -456,9 +438,7 @@ def loaded_files() -> dict[Path, str]:
 def blame(effect: Plugin, error: BaseException) -> EffectError:
     """An error that a plug-in's own code raised, as a sentence with the plug-in, its file and the line."""
     file = source_file(type(effect))
-    return EffectError(
-        f"{_place(error, Path(file))}: the {effect.registry.kind} {effect.name} failed: {_what(error)}"
-    )
+    return EffectError(f"{_place(error, Path(file))}: the {effect.registry.kind} {effect.name} failed: {_what(error)}")
 
 
 def _what(error: BaseException) -> str:

@@ -119,13 +119,9 @@ class Recorded:
         def joined(name: str) -> np.ndarray | None:
             return None if getattr(one, name) is None else np.concatenate([getattr(p, name) for p in parts])
 
-        frames = (
-            None if one.frames is None else Frames.join([p.frames for p in parts if p.frames is not None])
-        )
+        frames = None if one.frames is None else Frames.join([p.frames for p in parts if p.frames is not None])
         tr = None if one.tr is None else Events.join([p.tr for p in parts if p.tr is not None])
-        return Recorded(
-            one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited")
-        )
+        return Recorded(one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited"))
 
 
 def summarised(pixels: int, tr: Events | None, frames: Frames | None) -> Recorded:

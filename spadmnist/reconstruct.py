@@ -54,11 +54,11 @@ class Method(Plugin, abstract=True):
         """The readouts that must be recorded."""
         return tuple(sorted({COLUMNS[c] for c in cls.columns}))
 
-    def estimate(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
+    def estimate(self, settings: Settings, *columns: Any, **named: Any) -> np.ndarray:
         """The image from the columns, float64; `+inf` where a saturated pixel has no finite estimate."""
         raise TypeError(f"{self.name} must define estimate")
 
-    def saturated(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
+    def saturated(self, settings: Settings, *columns: Any, **named: Any) -> np.ndarray:
         """Where the formula had no answer of its own and a rule stands in."""
         return np.zeros(columns[0].shape, bool)
 
@@ -125,7 +125,7 @@ class PassiveFreeRunning(Method):
 
 
 class InterPhoton(Method):
-    """Detections between the first and the last over the live time between them: (N - 1) / (q (X_N - X_1 - (N - 1) tau_d)).
+    """Intervals between first and last detection over their live time: (N - 1) / (q (X_N - X_1 - (N - 1) tau_d)).
 
     Fewer than two detections give 0. Rounded stamps can leave no live time: it is taken as at least half a tick per
     interval, and such pixels are counted. Source: Suonsivu et al., eq. 4c.

@@ -53,6 +53,26 @@ def method_page(name: str) -> str:
     return _page(cls, facts, ["In a config:", "", f"  reconstruct: [{cls.name}]"])
 
 
+def as_data(kind: str, name: str | None = None) -> list[dict[str, Any]] | dict[str, Any]:
+    """The reference of `kind` ("effect" or "method") for programs: all, or the one of that name.
+
+    Raises KeyError with a sentence where there is none.
+    """
+    registry = Effect.registry if kind == "effect" else Method.registry
+    return _data(registry.find(name)) if name else [_data(registry.find(known)) for known in registry]
+
+
+def _data(cls: type[Plugin]) -> dict[str, Any]:
+    out: dict[str, Any] = {"name": cls.name, "about": inspect.getdoc(cls)}
+    if issubclass(cls, Effect):
+        out |= {"stage": cls.stage}
+    if issubclass(cls, Method):
+        out |= {"readouts": list(cls.readouts()), "unit": cls.unit, "normalised": cls.normalised}
+    facts = ("unit", "about", "symbol", "default", "bounds", "off", "search", "per_pixel", "by_wavelength")
+    out["parameters"] = {key: {f: getattr(p, f) for f in facts} for key, p in cls.parameters.items()}
+    return out
+
+
 def _page(cls: type[Plugin], facts: Sequence[str], paste: Sequence[str]) -> str:
     """Name and facts, the file if it is a user's, docstring, parameters, YAML."""
     head = [cls.name, "; ".join(facts)]

@@ -185,8 +185,7 @@ def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     tables = []
     for group in groups:
         lines = [
-            row[0].ljust(widths[0]) + "".join("  " + row[i].rjust(widths[i]) for i in group)
-            for row in (header, *rows)
+            row[0].ljust(widths[0]) + "".join("  " + row[i].rjust(widths[i]) for i in group) for row in (header, *rows)
         ]
         tables.append("\n".join(line.rstrip() for line in lines))
     return "\n\n".join(tables)
@@ -204,6 +203,8 @@ def _number(value: float | None) -> str:
     """Four digits, never in powers of ten."""
     if value is None:
         return "-"
+    if value == 0:
+        return "0"
     if value >= 1000:
         return f"{value:,.0f}"
     decimals = 4 if value < 1 else 3 - int(math.log10(value))
@@ -213,7 +214,7 @@ def _number(value: float | None) -> str:
 def _percent(share: float | None) -> str:
     if share is None:
         return "-"
-    return f"{100 * share:.1f} %" if share >= 0.0995 or share == 0 else f"{100 * share:.2g} %"
+    return f"{100 * share:.1f} %" if share >= 0.0995 else f"{100 * share:.2g} %"
 
 
 def _bytes(size: float) -> str:
@@ -232,8 +233,9 @@ _CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstr
 _SMALL, _LARGE = 168, 256  # points of the picture: images are magnified up to one, and reduced to the other
 _LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
 _PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
-_TOP, _BOTTOM, _GAP, _CAPTION = 92, 100, 16, 34  # above and below the cells, between them, under each
-_DPI = 100
+_TOP, _GAP, _CAPTION, _LINE = 92, 16, 34, 18  # above the cells, between them, below each; small print
+_DPI = 128  # a power of two: the size in points comes out whole
+_PAGE = (214, 223, 236)  # no grey, so that every cell stands out from it
 
 
 @dataclass(frozen=True)
@@ -277,9 +279,7 @@ class _Cell:
     caption: str
 
 
-def sheet(
-    dataset: Dataset, path: str | Path, levels: Sequence[str] | None = None, count: int | None = None
-) -> None:
+def sheet(dataset: Dataset, path: str | Path, levels: Sequence[str] | None = None, count: int | None = None) -> None:
     """Draw some training images in all readouts and reconstructions, a row for each light level, as a PNG.
 
     levels: as written in the config, all by default. count: images in a cell, with different labels as far as
@@ -397,7 +397,7 @@ def _basis(part: Part, split: str) -> str | None:
     n = _at_hand(part)
     if n == len(part):
         return f"all {n:,} {split} images"
-    return f"the first {n:,} of {len(part):,} {split} images (the dataset's own rest on all)"
+    return f"{n:,} of the {len(part):,} {split} images (the dataset's own median is over all)"
 
 
 # --- from numbers to colours
@@ -498,10 +498,10 @@ def _mosaic(images: np.ndarray) -> np.ndarray:
     across = min(range(1, n + 1), key=lambda k: (max(k * columns, -(-n // k) * rows), k))
     side = max(across * columns, -(-n // across) * rows)
     images = _reduced(images, -(-side // _LARGE)) if side > _LARGE else images
-    zoom = max(1, _SMALL // side)
+    zoom = next((z for z in (-(-_SMALL // side), _SMALL // side) if 1 <= z <= _LARGE // side), 1)
     images = images.repeat(zoom, axis=1).repeat(zoom, axis=2)
     _, height, width, _ = images.shape
-    page = np.full((-(-n // across) * (height + 2) - 2, across * (width + 2) - 2, 3), 255, np.uint8)
+    page = np.full((-(-n // across) * (height + 2) - 2, across * (width + 2) - 2, 3), _PAGE, np.uint8)
     for i, image in enumerate(images):
         y, x = i // across * (height + 2), i % across * (width + 2)
         page[y : y + height, x : x + width] = image
@@ -532,45 +532,45 @@ def _draw(
     # a bold letter is about 8 points wide, one of the small print 6
     wide = max(width, 160, *(8 * len(cell.title) for cell in columns))
     left = 32 + 8 * max(map(len, rows))
-    full = left + len(columns) * (wide + _GAP)
-    tall = _TOP + len(rows) * (height + _CAPTION) + _BOTTOM
+    full = left + len(columns) * (wide + _GAP) + _GAP
+    foot = ["Grey runs from 0, black, to the value below the cell, white, if the head says nothing else."]
+    if basis is not None:
+        foot.append(
+            f"Fluxes are divided by the median of the non-zero pixels of {basis}; "
+            f"what is above {_CLIP:g} is drawn as {_CLIP:g}."
+        )
+    lines = len(foot) + (times is not None)
+    tall = _TOP + len(rows) * (height + _CAPTION) + _LINE * lines + 2 * _GAP
     if max(full, tall) >= 1 << 16:
         raise SpadError(f"a sheet of {len(rows)} light levels is too large for a picture; name fewer levels")
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor="white")
+        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor=[c / 255 for c in _PAGE])
 
-        def text(x: int, y: int, words: str, size: int = 8, color: str = "0.3", **style: Any) -> None:
-            figure.text(x / full, 1 - y / tall, words, fontsize=size, color=color, va="top", **style)
+        def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
+            points = size * 72 / _DPI
+            figure.text(x / full, 1 - y / tall, words, fontsize=points, color=color, va="top", **style)
 
         def picture(x: int, y: int, pixels: np.ndarray) -> None:
             figure.figimage(pixels, x, tall - y - len(pixels))
 
-        text(16, 16, f"Each row is one light level; each cell shows {which}.", 10, "black")
+        text(16, 16, f"Each row is one light level; each cell shows {which}.", 14, "black")
         for k, cell in enumerate(columns):
-            text(left + k * (wide + _GAP), _TOP - 40, cell.title, 9, "black", weight="bold")
+            text(left + k * (wide + _GAP), _TOP - 40, cell.title, 12, "black", weight="bold")
             text(left + k * (wide + _GAP), _TOP - 22, cell.subtitle)
         for r, (level, cells) in enumerate(rows.items()):
             y = _TOP + r * (height + _CAPTION)
-            text(16, y + height // 2 - 7, level, 9, "black", weight="bold")
+            text(16, y + height // 2 - 7, level, 12, "black", weight="bold")
             for k, cell in enumerate(cells):
                 picture(left + k * (wide + _GAP), y, pages[level][k])
                 text(left + k * (wide + _GAP), y + height + 4, cell.caption)
 
-        y = tall - _BOTTOM + 16
-        foot = [
-            "Grey runs from 0, black, to the value below the cell, white, unless the head says otherwise."
-        ]
-        if basis is not None:
-            foot.append(
-                f"Fluxes are divided by the median of the non-zero pixels of {basis}; "
-                f"what is above {_CLIP:g} is drawn as {_CLIP:g}."
-            )
+        y = tall - _LINE * lines - _GAP
         for line, words in enumerate(foot):
-            text(left, y + 18 * line, words)
+            text(left, y + _LINE * line, words)
         if times is not None:
-            y += 18 * len(foot) + 4
+            y += _LINE * len(foot)
             text(left, y, "TR, first detection:")
             bar = np.broadcast_to(_colours(np.linspace(0, 1, 240)), (12, 240, 3))
             text(left + 125, y, units.show(times[0], "s"))

@@ -110,9 +110,7 @@ class Sensor:
             rate = self._call(effect, "apply", rate, conditions)
         if rate.size and not 0 <= rate.min() <= rate.max() < np.inf:
             culprit = (self.at("dark") or self.at("detection") or self.at("light"))[-1]
-            raise EffectError(
-                f"{source_file(type(culprit))}: a rate is negative or not finite after {culprit.name}"
-            )
+            raise EffectError(f"{source_file(type(culprit))}: a rate is negative or not finite after {culprit.name}")
         return rate, light
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
@@ -154,23 +152,17 @@ class Sensor:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1]
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + photons.shape[1]))))
         parts = [
-            self._staged(
-                photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts
-            )
+            self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts)
             for i in range(0, len(photons), step)
         ]
         return Recorded.join(parts)
 
     @cached_property
     def is_paper_line(self) -> bool:
-        """Nothing happens after the Poisson draw but afterpulsing, a dead time and a converter, by the paper's rules."""
+        """By the paper's rules, nothing follows the Poisson draw but afterpulsing, a dead time and a converter."""
         later = [e for e in self.effects if e.stage not in ("light", "detection", "dark")]
         kinds = [type(e) for e in later]
-        return (
-            self.rules == "paper"
-            and set(kinds) <= {Afterpulsing, DeadTime, Tdc}
-            and len(set(kinds)) == len(kinds)
-        )
+        return self.rules == "paper" and set(kinds) <= {Afterpulsing, DeadTime, Tdc} and len(set(kinds)) == len(kinds)
 
     def _fused(
         self, photons: np.ndarray, conditions: Conditions, streams: Streams, readouts: Collection[str]
@@ -250,17 +242,13 @@ class Sensor:
             frames = self._frames(candidates, conditions, streams, "str" in readouts)
         return summarised(pixels, tr, frames)
 
-    def _arrivals(
-        self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams
-    ) -> Events:
+    def _arrivals(self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams) -> Events:
         """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""
         pixels = rate.shape[1]
         varying = self.at("arrival")
         if not varying:
             key = streams.key("photons and dark counts")
-            times, offsets = kernels.arrivals(
-                np.ascontiguousarray(rate), conditions.exposure, streams.images, key
-            )
+            times, offsets = kernels.arrivals(np.ascontiguousarray(rate), conditions.exposure, streams.images, key)
             return Events(times, offsets, pixels)
         parts = {"light": light, "dark": rate - light}
         most = dict(parts)
@@ -268,9 +256,7 @@ class Sensor:
             most[effect.acts_on] = most[effect.acts_on] * self._call(effect, "maximum", conditions)
         drawn = most["light"] + most["dark"]
         key = streams.key("photons and dark counts")
-        times, offsets = kernels.arrivals(
-            np.ascontiguousarray(drawn), conditions.exposure, streams.images, key
-        )
+        times, offsets = kernels.arrivals(np.ascontiguousarray(drawn), conditions.exposure, streams.images, key)
         events = Events(times, offsets, pixels)
         rows = events.rows
         now = {kind: part.ravel()[rows] for kind, part in parts.items()}
@@ -289,9 +275,7 @@ class Sensor:
         for effect in self.at("gate"):
             mask = np.asarray(self._call(effect, "open", events.times, conditions))
             if mask.dtype != bool or mask.shape != events.times.shape:
-                raise EffectError(
-                    f"{source_file(type(effect))}: {effect.name}.open must return one bool per time"
-                )
+                raise EffectError(f"{source_file(type(effect))}: {effect.name}.open must return one bool per time")
             events = events.keep(mask)
         return events
 
@@ -335,9 +319,7 @@ class Sensor:
         merged, offsets, _ = kernels.merge(events.times, events.offsets, extra[order], extra_rows[order])
         return self._gate(Events(merged, offsets, events.pixels), conditions)
 
-    def _latent(
-        self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray
-    ) -> _Latent:
+    def _latent(self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray) -> _Latent:
         """Rules of a device: everything that may happen, generation after generation."""
         rows = len(events.offsets) - 1
         times, row_of, parents = [events.times], [events.rows], [np.full(len(events), -1, np.int64)]
@@ -345,9 +327,7 @@ class Sensor:
         known = len(events)
         for generation in range(_GENERATIONS):
             found = [
-                self._spawn(
-                    effect, current, streams, dead_times, f"/generation {generation}" if generation else ""
-                )
+                self._spawn(effect, current, streams, dead_times, f"/generation {generation}" if generation else "")
                 for effect in self.at("correlated")
             ]
             if not found:
@@ -373,9 +353,7 @@ class Sensor:
                 f"the cascade of avalanches does not end ({_GENERATIONS} generations); "
                 "lower the probabilities of the correlated effects"
             )
-        return _Latent(
-            np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels
-        )
+        return _Latent(np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels)
 
     def _frames(self, events: Events, conditions: Conditions, streams: Streams, stamped: bool) -> Frames:
         pixels = events.pixels
@@ -396,9 +374,7 @@ class Sensor:
             if first.ticks is not None and first.tick is not None:
                 none = no_detection(conditions.frame_time, first.tick)
                 # what rounds to the end of the frame would mean 'none'
-                first = Events(
-                    None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick
-                )
+                first = Events(None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick)
                 first = self._narrow(first, conditions.frame_time, "STR stamps")
         return Frames(bits, first, conditions.frames, conditions.frame_time, pixels)
 
@@ -407,9 +383,7 @@ class Sensor:
             return events
         kind = unsigned_for(end / events.tick, what)
         if len(events.ticks) and int(events.ticks.max()) > np.iinfo(kind).max:
-            raise SpadError(
-                f"{what}: a stamp of {int(events.ticks.max())} ticks does not fit {np.dtype(kind)}"
-            )
+            raise SpadError(f"{what}: a stamp of {int(events.ticks.max())} ticks does not fit {np.dtype(kind)}")
         return Events(None, events.offsets, events.pixels, events.ticks.astype(kind, copy=False), events.tick)
 
     # --- calling effects ------------------------------------------------------------------------------------------
@@ -431,15 +405,9 @@ class Sensor:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""
         after = self._call(effect, "apply", events, self._rng(effect, streams))
         if not effect.counted:
-            wrong = (
-                after.problem()
-                if isinstance(after, Events)
-                else f"it is a {type(after).__name__}, not Events"
-            )
+            wrong = after.problem() if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
             if wrong:
-                raise EffectError(
-                    f"{source_file(type(effect))}: what {effect.name}.apply returns is wrong: {wrong}"
-                )
+                raise EffectError(f"{source_file(type(effect))}: what {effect.name}.apply returns is wrong: {wrong}")
         return after
 
 

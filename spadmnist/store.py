@@ -149,9 +149,7 @@ def sweep(tmp: str | os.PathLike[str]) -> int:
     """
     count = 0
     if Path(tmp).is_symlink() or Path(tmp).parent.is_symlink():
-        raise SpadError(
-            f"{tmp}: there is a symbolic link on the way, and what it leads to is not removed; remove it"
-        )
+        raise SpadError(f"{tmp}: there is a symbolic link on the way, and what it leads to is not removed; remove it")
     try:
         entries = list(os.scandir(tmp))
     except FileNotFoundError:
@@ -219,9 +217,7 @@ def _inside(root: Path, relative: str) -> Path:
         folder = folder / part
         _make_folder(folder)
         if folder.is_symlink():
-            raise SpadError(
-                f"{folder}: this is a symbolic link; inside a dataset only real folders are written to"
-            )
+            raise SpadError(f"{folder}: this is a symbolic link; inside a dataset only real folders are written to")
     return root / relative
 
 
@@ -327,9 +323,7 @@ def encoded_size(columns: Mapping[str, Column], format: str) -> int:
     return len(_hdf5_image(checked, {}))
 
 
-def append_columns(
-    root: str | os.PathLike[str], path: str, columns: Mapping[str, Column], format: str
-) -> Files:
+def append_columns(root: str | os.PathLike[str], path: str, columns: Mapping[str, Column], format: str) -> Files:
     """Add arrays to a shard; the files that are new or changed.
 
     The shard is then, byte for byte, what `write_shard` makes of all columns at once. Arrays of the same name
@@ -358,9 +352,7 @@ def append_columns(
         _workspace(_inside(root, ".spadmnist/tmp/x").parent) as work,
     ):
         for i, unit in enumerate(pending):
-            mine = {
-                f"unit{file.removeprefix(unit)}": files[file] for file in files if file.startswith(f"{unit}/")
-            }
+            mine = {f"unit{file.removeprefix(unit)}": files[file] for file in files if file.startswith(f"{unit}/")}
             written = _put_tree(work / f"new{i}", mine)
             records |= {f"{relative}/{unit}{name.removeprefix('unit')}": r for name, r in written.items()}
         for i, unit in enumerate(pending):
@@ -418,14 +410,10 @@ def _check_columns(columns: Mapping[str, Column], path: str) -> dict[str, Column
         if not column.about:
             raise ValueError(f"{where} has no description; say in `about` what it is")
         if column.rows_per_chunk is not None and column.rows_per_chunk < 1:
-            raise ValueError(
-                f"{where}: rows_per_chunk is {column.rows_per_chunk}; it must be 1 or more, or None"
-            )
+            raise ValueError(f"{where}: rows_per_chunk is {column.rows_per_chunk}; it must be 1 or more, or None")
         reserved = sorted(_RESERVED & set(column.attributes))
         if reserved:
-            raise ValueError(
-                f"{where}: attribute {reserved[0]!r} has a meaning of its own; choose another name"
-            )
+            raise ValueError(f"{where}: attribute {reserved[0]!r} has a meaning of its own; choose another name")
         checked[name] = Column(
             np.ascontiguousarray(data, data.dtype.newbyteorder("<")),
             column.dims,
@@ -444,9 +432,7 @@ def _check_tree(shapes: Mapping[str, tuple[tuple[str, ...], tuple[int, ...]]], p
     for name in shapes:
         inner = next((other for other in shapes if other.startswith(f"{name}/")), None)
         if inner:
-            raise ValueError(
-                f"{path}: {name!r} is an array, so {inner!r} cannot lie in it; rename one of them"
-            )
+            raise ValueError(f"{path}: {name!r} is an array, so {inner!r} cannot lie in it; rename one of them")
     sizes: dict[tuple[str, str], tuple[int, str]] = {}
     for name, (dims, shape) in sorted(shapes.items()):
         for dim, size in zip(dims, shape, strict=True):
@@ -459,9 +445,7 @@ def _check_tree(shapes: Mapping[str, tuple[tuple[str, ...], tuple[int, ...]]], p
     for name, (dims, _) in shapes.items():
         last = name.rpartition("/")[2]
         if (_group_of(name), last) in sizes and dims != (last,):
-            raise ValueError(
-                f"{path}: {name!r} has the name of a dimension but other axes {dims}; rename one of them"
-            )
+            raise ValueError(f"{path}: {name!r} has the name of a dimension but other axes {dims}; rename one of them")
 
 
 def _group_of(name: str) -> str:
@@ -491,8 +475,7 @@ def _rows(shape: tuple[int, ...], itemsize: int, wanted: int | None, where: str)
     row = math.prod(max(size, 1) for size in shape[1:]) * itemsize
     if row > _LARGEST_CHUNK:
         raise ValueError(
-            f"{where}: one row has {row} bytes, more than a chunk may have ({_LARGEST_CHUNK}); "
-            "split the array"
+            f"{where}: one row has {row} bytes, more than a chunk may have ({_LARGEST_CHUNK}); split the array"
         )
     return max(1, min(wanted or shape[0], shape[0], _LARGEST_CHUNK // row))
 
@@ -700,14 +683,10 @@ def _put_attributes(node: Any, attributes: Mapping[str, Any]) -> None:
     import h5py
 
     for name, value in sorted(attributes.items()):
-        texts = [
-            text.encode() for text in (value if isinstance(value, list) else [value]) if isinstance(text, str)
-        ]
+        texts = [text.encode() for text in (value if isinstance(value, list) else [value]) if isinstance(text, str)]
         if texts:
             dtype = h5py.string_dtype("utf-8", max(1, *map(len, texts)))
-            node.attrs.create(
-                name, np.array(texts if isinstance(value, list) else texts[0], dtype), dtype=dtype
-            )
+            node.attrs.create(name, np.array(texts if isinstance(value, list) else texts[0], dtype), dtype=dtype)
         else:
             node.attrs[name] = value
 
@@ -888,9 +867,7 @@ class ShardReader:
         try:
             at = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             for i, part in enumerate(parts):
-                kind = (
-                    os.O_DIRECTORY if folder or i < len(parts) - 1 else os.O_NONBLOCK
-                )  # never wait for a pipe
+                kind = os.O_DIRECTORY if folder or i < len(parts) - 1 else os.O_NONBLOCK  # never wait for a pipe
                 above, at = at, os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | kind, dir_fd=at)
                 os.close(above)
         except OSError as error:
@@ -899,9 +876,7 @@ class ShardReader:
             if error.errno == errno.ENOENT:
                 raise _Missing(self._refuse(file, "this file is missing")) from None
             if error.errno in (errno.ELOOP, errno.ENOTDIR):
-                raise self._refuse(
-                    file, "a symbolic link, or a file in place of a folder, is in the way"
-                ) from None
+                raise self._refuse(file, "a symbolic link, or a file in place of a folder, is in the way") from None
             raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
         return at
 
@@ -974,9 +949,7 @@ class ShardReader:
             if type(rows) is not int or rows != _rows(shape, dtype.itemsize, rows, name):
                 raise ValueError
             codec = next(
-                codec
-                for codec in _CODECS
-                if _array_document(shape, dtype, dims, rows, codec, attributes) == document
+                codec for codec in _CODECS if _array_document(shape, dtype, dims, rows, codec, attributes) == document
             )
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, StopIteration):
             raise self._refuse(file, "this is not an array as spadmnist writes it") from None
@@ -999,11 +972,7 @@ class ShardReader:
             raise self._refuse(file, "its table of chunks is damaged")
         places = np.frombuffer(table[:-4], "<u8").reshape(count, 2)
         ends = np.cumsum(places[:, 1])
-        if (
-            (places[:, 1] > length).any()
-            or (places[:, 0] != ends - places[:, 1]).any()
-            or ends[-1] != length - size
-        ):
+        if (places[:, 1] > length).any() or (places[:, 0] != ends - places[:, 1]).any() or ends[-1] != length - size:
             raise self._refuse(file, "its table of chunks does not fit the file")
         return [(int(offset), int(size)) for offset, size in places]
 
@@ -1066,9 +1035,7 @@ def _hdf5_array(dataset: Any, file: str) -> _Array:
         plist = dataset.id.get_create_plist()
         filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
         if filters != _HDF5_FILTERS or dataset.chunks != (rows, *shape[1:]):
-            raise _Damaged(
-                f"{where} is not stored as spadmnist stores it (chunks {dataset.chunks}, filters {filters})"
-            )
+            raise _Damaged(f"{where} is not stored as spadmnist stores it (chunks {dataset.chunks}, filters {filters})")
         found: dict[int, tuple[int, int]] = {}
 
         def note(chunk: Any) -> None:
@@ -1095,9 +1062,7 @@ def _get_attributes(node: Any) -> dict[str, Any]:
             continue
         dtype = node.attrs.get_id(name).dtype
         if dtype.kind not in "Sif":
-            raise _Damaged(
-                f"attribute {name} of {node.name} is {dtype}, not a number or text of fixed length"
-            )
+            raise _Damaged(f"attribute {name} of {node.name} is {dtype}, not a number or text of fixed length")
         value = np.asarray(node.attrs[name])
         attributes[name] = (np.strings.decode(value, "utf-8") if dtype.kind == "S" else value).tolist()
     return attributes

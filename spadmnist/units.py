@@ -97,9 +97,7 @@ def parse(value: object, unit: str) -> Quantity:
         raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
     if isinstance(value, (int, float)):
         if unit:
-            raise ValueError(
-                f'{value!r} has no unit; {_a(name)} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
-            )
+            raise ValueError(_no_unit(value, unit))
         text = repr(value)
     else:
         text = value.strip()
@@ -109,9 +107,7 @@ def parse(value: object, unit: str) -> Quantity:
     number, written = match.groups()
     if written not in units:
         if not written:
-            raise ValueError(
-                f'{value!r} has no unit; {_a(name)} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
-            )
+            raise ValueError(_no_unit(value, unit))
         raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
     try:
         # exact decimal arithmetic, so that 1000 mlux and 1 lux are the same double
@@ -121,6 +117,11 @@ def parse(value: object, unit: str) -> Quantity:
     if not math.isfinite(si):
         raise ValueError(f"{value!r} is too large for {_a(name)}")
     return Quantity(si, text, unit)
+
+
+def _no_unit(value: object, unit: str) -> str:
+    name, _, sample = _DIMENSIONS[unit]
+    return f'{value!r} has no unit; {_a(name)} is a number and a unit ({allowed_units(unit)}), for example "{sample}"'
 
 
 def _a(name: str) -> str:
@@ -139,9 +140,7 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     >>> show(5e-8, "s")
     '50 ns'
     """
-    units = {
-        u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"
-    }
+    units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"}
     if unit == "W/m^2":
         units = {u: f for u, f in units.items() if u.endswith("/cm^2")}
     if value == 0 or not math.isfinite(value) or len(units) == 1:

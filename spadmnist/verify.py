@@ -117,9 +117,7 @@ def repair(
     experiment = _experiment(root, manifest, damage)
     if manifest is not None and manifest["versions"] != factory.versions():
         wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions()[k] != v)
-        raise SpadError(
-            f"{root}: was made with {wanted}; install these versions to make the same bytes again"
-        )
+        raise SpadError(f"{root}: was made with {wanted}; install these versions to make the same bytes again")
     splits = _images(root, manifest, experiment, damage, images_dir)
     identity = factory.identity(experiment, splits)
     if manifest is not None:
@@ -160,9 +158,7 @@ def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage) -> 
     text = factory.config_text(manifest["config"])
     lost = [name for name in manifest["maps"] if name in {*damage.changed, *damage.missing}]
     if lost:
-        raise SpadError(
-            f"{root / lost[0]}: the sensor's map is lost, and it cannot be made again; put it back"
-        )
+        raise SpadError(f"{root / lost[0]}: the sensor's map is lost, and it cannot be made again; put it back")
     return config.build(config.document.parse(text, str(root / CONFIG)), root)
 
 

@@ -32,9 +32,7 @@ class Record:
     """What one pixel gives in one exposure: three readouts, and the events they were made from."""
 
     tr: list[float]  # s: stamps of the recorded events, rounded to the resolution
-    str: list[
-        float
-    ]  # s: one per frame, first event from the start of the frame, frame_time where there is none
+    str: list[float]  # s: one per frame, first event from the start of the frame, frame_time where there is none
     qis: list[int]  # one bit per frame
     events: list[float]  # s: the sorted stream before dead time, frames and rounding (after line 19)
 

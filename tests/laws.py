@@ -40,18 +40,14 @@ def z_bound(alpha: float = FALSE_ALARM) -> float:
 # ---- one sample against a known law -----------------------------------------------------------------------
 
 
-def poisson_mean(
-    total: int, expected: float, alpha: float = FALSE_ALARM, what: str = "Poisson total"
-) -> float:
+def poisson_mean(total: int, expected: float, alpha: float = FALSE_ALARM, what: str = "Poisson total") -> float:
     """`total` was drawn from a Poisson law of mean `expected` (exact)."""
     law = stats.poisson(expected)
     p = _two_tails(law.cdf(total), law.sf(total - 1))
     return _judge(p, alpha, what, f"{total}", f"{expected:.6g} ± {math.sqrt(expected):.3g}")
 
 
-def share_is(
-    successes: int, trials: int, probability: float, alpha: float = FALSE_ALARM, what: str = "share"
-) -> float:
+def share_is(successes: int, trials: int, probability: float, alpha: float = FALSE_ALARM, what: str = "share") -> float:
     """`successes` were drawn from a binomial law (exact)."""
     law = stats.binom(trials, probability)
     p = _two_tails(law.cdf(successes), law.sf(successes - 1))
@@ -69,9 +65,7 @@ def mean_is(
     return _judge(p, alpha, what, f"{mean:.6g} ± {math.sqrt(variance / x.size):.2g}", f"{expected:.6g}")
 
 
-def variance_is(
-    values: ArrayLike, expected: float, alpha: float = FALSE_ALARM, what: str = "variance"
-) -> float:
+def variance_is(values: ArrayLike, expected: float, alpha: float = FALSE_ALARM, what: str = "variance") -> float:
     """Independent `values` have the variance `expected`."""
     x = _sample(values, 1000)
     squares = (x - x.mean()) ** 2 * (x.size / (x.size - 1))
@@ -90,9 +84,7 @@ def distribution_is(
     steps = np.arange(x.size + 1) / x.size
     distance = float(max((steps[1:] - law).max(), (law - steps[:-1]).max()))
     p = float(stats.kstwo.sf(distance, x.size))
-    return _judge(
-        p, alpha, what, f"distance {distance:.4g} from the law, {x.size} values", _ks_bound(x.size, alpha)
-    )
+    return _judge(p, alpha, what, f"distance {distance:.4g} from the law, {x.size} values", _ks_bound(x.size, alpha))
 
 
 def histogram_is(
@@ -166,9 +158,7 @@ def same_mean(a: ArrayLike, b: ArrayLike, alpha: float = FALSE_ALARM, what: str 
     if squared_error > 0:
         freedom = squared_error**2 / (part_x**2 / (x.size - 1) + part_y**2 / (y.size - 1))
     p = _mean_p(mean_x - mean_y, squared_error, third_x / x.size**2 - third_y / y.size**2, freedom)
-    return _judge(
-        p, alpha, what, f"{mean_x:.6g} ± {math.sqrt(part_x):.2g}", f"{mean_y:.6g} ± {math.sqrt(part_y):.2g}"
-    )
+    return _judge(p, alpha, what, f"{mean_x:.6g} ± {math.sqrt(part_x):.2g}", f"{mean_y:.6g} ± {math.sqrt(part_y):.2g}")
 
 
 def same_variance(a: ArrayLike, b: ArrayLike, alpha: float = FALSE_ALARM, what: str = "variances") -> float:
@@ -200,9 +190,7 @@ def same_histogram(a: ArrayLike, b: ArrayLike, alpha: float = FALSE_ALARM, what:
     return _judge(p, alpha, what, f"deviance {deviance:.4g}", _chi2_bound(freedom, alpha))
 
 
-def same_distribution(
-    a: ArrayLike, b: ArrayLike, alpha: float = FALSE_ALARM, what: str = "distributions"
-) -> float:
+def same_distribution(a: ArrayLike, b: ArrayLike, alpha: float = FALSE_ALARM, what: str = "distributions") -> float:
     """Two continuous samples have one law (Kolmogorov and Smirnov, asymptotic)."""
     x, y = np.sort(_sample(a, 50)), np.sort(_sample(b, 50))
     both = np.concatenate([x, y])

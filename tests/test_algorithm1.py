@@ -41,9 +41,7 @@ def test_white_at_2560_mlux() -> None:
     assert flux == pytest.approx(2.618e5, rel=2e-4)
     assert algorithm1.photon_flux(0, 255, 2.560, 25e-12, 555e-9) == 0
     assert algorithm1.photon_flux(51, 255, 2.560, 25e-12, 555e-9) == pytest.approx(flux / 5)
-    assert algorithm1.photon_flux(255, 255, 2.560, 25e-12, 555e-9, fill_factor=0.25) == pytest.approx(
-        flux / 4
-    )
+    assert algorithm1.photon_flux(255, 255, 2.560, 25e-12, 555e-9, fill_factor=0.25) == pytest.approx(flux / 4)
     assert algorithm1.photon_flux(255, 255, 2.560, 25e-12, 1110e-9) == pytest.approx(flux * 2)
 
 
@@ -187,9 +185,7 @@ def test_no_light_no_dark_counts_no_events() -> None:
 def test_afterpulse_delay() -> None:
     """Certain afterpulses of rare events: exactly one child each, at the dead time and an exponential."""
     pairs = [
-        r.events
-        for r in _pixels(3, 20_000, 100.0, afterpulsing=1.0, lifetime=300e-9, dead_time=200e-9)
-        if r.events
+        r.events for r in _pixels(3, 20_000, 100.0, afterpulsing=1.0, lifetime=300e-9, dead_time=200e-9) if r.events
     ]
     delays = [events[1] - events[0] for events in pairs if len(events) == 2]
     assert len(delays) > 1500
@@ -220,9 +216,7 @@ def test_afterpulses_make_the_counts_wider_than_poisson() -> None:
 def test_a_blocked_event_has_afterpulses_too() -> None:
     """Parents are all events before the dead time: the events do not depend on it but for the delay."""
     rate, dead = 2e7, 50e-9
-    records = _pixels(
-        6, 300, rate, exposure=20e-6, frame_time=200e-9, dead_time=dead, afterpulsing=0.1, lifetime=1e-12
-    )
+    records = _pixels(6, 300, rate, exposure=20e-6, frame_time=200e-9, dead_time=dead, afterpulsing=0.1, lifetime=1e-12)
     numbers = [len(r.events) for r in records]
     laws.mean_is(numbers, rate * (20e-6 + 0.1 * (20e-6 - dead - 1e-12)), what="events at x = 1")
 
@@ -270,17 +264,13 @@ def test_qis_and_str_laws(rate: float) -> None:
     laws.histogram_is(sums, lambda k: stats.binom.pmf(k, 100, hit))
     stamps = [d for r in records for d in r.str if d < 10e-6]
     assert len(stamps) == sum(sums)
-    laws.distribution_is(
-        stamps, lambda d: np.expm1(-rate * d) / math.expm1(-rate * 10e-6), what="first arrivals"
-    )
+    laws.distribution_is(stamps, lambda d: np.expm1(-rate * d) / math.expm1(-rate * 10e-6), what="first arrivals")
 
 
 def test_estimators_return_the_flux() -> None:
     """Bright enough that the dead time matters: `counts` misses the flux, the three others find it."""
     flux, pdp, dead = 2e7, 0.5, 50e-9
-    records = _pixels(
-        10, 200, flux, pdp=pdp, exposure=100e-6, frame_time=1e-6, dead_time=dead, resolution=1e-10
-    )
+    records = _pixels(10, 200, flux, pdp=pdp, exposure=100e-6, frame_time=1e-6, dead_time=dead, resolution=1e-10)
     recorded = [len(r.tr) for r in records]
     biased = [algorithm1.counts(n, pdp, 100e-6) for n in recorded]
     laws.mean_is(biased, flux / (1 + pdp * flux * dead), error=flux * 1e-3)

@@ -204,14 +204,10 @@ def header(*shape: int) -> bytes:
         pytest.param(header(2**32 - 1, 2**32 - 1, 2**32 - 1), ["4294967295", "allowed"], id="2^96 bytes"),
         pytest.param(header(0, 28, 28), ["0 x 28 x 28", "at least one"], id="nothing"),
         pytest.param(PACKED[:-12], ["gzip data are damaged"], id="truncated gzip"),
-        pytest.param(
-            PACKED[:30] + b"\xff\xff\xff" + PACKED[33:], ["gzip data are damaged"], id="flipped gzip"
-        ),
+        pytest.param(PACKED[:30] + b"\xff\xff\xff" + PACKED[33:], ["gzip data are damaged"], id="flipped gzip"),
         pytest.param(PACKED[:-8] + b"\0" * 8, ["gzip data are damaged"], id="wrong checksum"),
         pytest.param(gzip.compress(header(9, 28, 28) + b"12"), ["only 2 follow"], id="short inside gzip"),
-        pytest.param(
-            gzip.compress(header(8000, 999, 999)), ["more than the file can hold"], id="memory bomb"
-        ),
+        pytest.param(gzip.compress(header(8000, 999, 999)), ["more than the file can hold"], id="memory bomb"),
         pytest.param(PACKED + b"junk", ["gzip data are damaged"], id="junk after gzip"),
     ],
 )
@@ -235,9 +231,7 @@ def test_gzip_bomb_stops_at_the_declared_size(tmp_path: Path) -> None:
     base=st.sampled_from([GOOD, PACKED]),
     edits=st.lists(st.tuples(st.integers(0, 99), st.binary(max_size=3), st.integers(0, 3)), max_size=3),
 )
-def test_mutated_idx_is_refused_or_right(
-    tmp_path: Path, base: bytes, edits: list[tuple[int, bytes, int]]
-) -> None:
+def test_mutated_idx_is_refused_or_right(tmp_path: Path, base: bytes, edits: list[tuple[int, bytes, int]]) -> None:
     """Never another exception, and what comes out is what an honest reading of the bytes gives."""
     data = base
     for at, new, removed in edits:
@@ -278,9 +272,7 @@ def test_where_idx_files_are_looked_for(tmp_path: Path, monkeypatch: pytest.Monk
     write(tmp_path / "base", only_here=PIXELS)
 
     def level(**where: Any) -> int:
-        return int(
-            Idx(train_images="a").load(SHAPE, base=tmp_path / "base", **where)["train"].pixels[0, 0, 0]
-        )
+        return int(Idx(train_images="a").load(SHAPE, base=tmp_path / "base", **where)["train"].pixels[0, 0, 0])
 
     assert level() == 0
     monkeypatch.setenv("SPADMNIST_DATA", str(tmp_path / "data"))
@@ -338,9 +330,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
     return files
 
 
-def put(
-    files: dict[str, bytes], folder: Path, rename: Callable[[str], str] = str, pack: bool = False
-) -> None:
+def put(files: dict[str, bytes], folder: Path, rename: Callable[[str], str] = str, pack: bool = False) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         (folder / rename(name)).write_bytes(gzip.compress(data) if pack else data)
@@ -463,9 +453,7 @@ def test_the_second_mirror_helps(
 
 def test_all_mirrors_wrong(tiny: dict[str, bytes], mirrors: Mirrors) -> None:
     mirrors.pages["/second/train-images-idx3-ubyte.gz"] = b"<html>"
-    refused(
-        lambda: Mnist().load(SHAPE), mirrors.url("first"), "404", mirrors.url("second"), "sends another file"
-    )
+    refused(lambda: Mnist().load(SHAPE), mirrors.url("first"), "404", mirrors.url("second"), "sends another file")
 
 
 def test_offline(tiny: dict[str, bytes], tmp_path: Path) -> None:
@@ -528,9 +516,7 @@ def test_flat_folder(tmp_path: Path) -> None:
 
 def test_classes_and_splits(tmp_path: Path) -> None:
     root = tmp_path / "f"
-    for i, name in enumerate(
-        ["train/cat/2.png", "train/ant/1.png", "train/cat/deep/0.png", "test/bee/0.png"]
-    ):
+    for i, name in enumerate(["train/cat/2.png", "train/ant/1.png", "train/cat/deep/0.png", "test/bee/0.png"]):
         save(root / name, GREY + np.uint8(i))
     save(root / "val/cat/0.png", GREY)
     splits = load_folder(root)
@@ -582,12 +568,7 @@ def png(columns: int, rows: int, depth: int, kind: int, data: bytes) -> bytes:
         return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
     start = struct.pack(">IIBBBBB", columns, rows, depth, kind, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", start)
-        + chunk(b"IDAT", zlib.compress(data))
-        + chunk(b"IEND", b"")
-    )
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
 
 
 def see_through() -> bytes:
@@ -667,9 +648,7 @@ def test_splits_that_differ(tmp_path: Path) -> None:
 
 def test_brighter_than_white(tmp_path: Path) -> None:
     save(tmp_path / "f" / "a.png", GREY)
-    refused(
-        lambda: load_folder(tmp_path / "f", white=10), "a.png", "grey level 11", "white is 10", "raise white"
-    )
+    refused(lambda: load_folder(tmp_path / "f", white=10), "a.png", "grey level 11", "white is 10", "raise white")
 
 
 def test_folders_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -758,9 +737,7 @@ def test_npy_of_truth_values(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("save_npz", [np.savez, np.savez_compressed])
 def test_npz(tmp_path: Path, names: tuple[str, ...], save_npz: Callable[..., None]) -> None:
-    arrays = dict(
-        zip(names, (PIXELS, LABELS.astype(np.int64)[:, None], PIXELS[:2], LABELS[:2]), strict=False)
-    )
+    arrays = dict(zip(names, (PIXELS, LABELS.astype(np.int64)[:, None], PIXELS[:2], LABELS[:2]), strict=False))
     save_npz(tmp_path / "x.npz", extra=np.zeros(3), **arrays)
     splits = load_array(tmp_path / "x.npz")
     assert list(splits) == (["train", "test"] if len(names) == 4 else ["train"])
@@ -861,9 +838,7 @@ def boasting() -> bytes:
         pytest.param(npy_bytes() + b"!", ["60 bytes, but 61 follow", "store it again"], id="extra"),
         pytest.param(npy_bytes()[:20], ["header is damaged"], id="cut header"),
         pytest.param(declaring("(10**9,)"), ["header is damaged"], id="expression"),
-        pytest.param(
-            declaring("(" + "1, " * 9999 + ")"), ["header is damaged (ValueError)"], id="long header"
-        ),
+        pytest.param(declaring("(" + "1, " * 9999 + ")"), ["header is damaged (ValueError)"], id="long header"),
         pytest.param(declaring("(("), ["header is damaged"], id="syntax"),
         pytest.param(declaring("(-2, -3, 1)"), ["(-2, -3, 1)", "store it again"], id="negative shape"),
         pytest.param(declaring("(99999999999, 28, 28)"), ["declares", "allowed", "fewer"], id="absurd"),
@@ -963,9 +938,7 @@ def test_digits_can_be_told_apart() -> None:
 def test_digits_of_other_sizes() -> None:
     part = Digits(train=3, test=0, rows=16, columns=40).load(SHAPE)["train"]
     assert part.size == (16, 40) and (part.pixels.max(axis=(1, 2)) == 255).all()
-    refused(
-        lambda: Digits(train=10**6, rows=4096, columns=4096).load(SHAPE), "1000000 digits", "allowed", "fewer"
-    )
+    refused(lambda: Digits(train=10**6, rows=4096, columns=4096).load(SHAPE), "1000000 digits", "allowed", "fewer")
 
 
 def test_digits_are_the_same_everywhere() -> None:

@@ -328,9 +328,7 @@ def test_frame_readout(data: tuple[np.ndarray, np.ndarray], frames: int, live: f
             if event - frame * period < live * period:
                 inside.setdefault(frame, event - frame * period)
         assert np.flatnonzero(unpacked[row]).tolist() == sorted(inside)
-        assert out[first_offsets[row] : first_offsets[row + 1]].tolist() == [
-            inside[f] for f in sorted(inside)
-        ]
+        assert out[first_offsets[row] : first_offsets[row + 1]].tolist() == [inside[f] for f in sorted(inside)]
 
 
 def test_no_moment_falls_between_two_frames_without_a_gap() -> None:
@@ -418,11 +416,7 @@ def test_arrivals_are_one_process_along_the_image(rates: np.ndarray, exposure: f
     rates = rates / exposure
     images = np.arange(7, 7 + len(rates), dtype=np.uint64)
     times, offsets = kernels.arrivals(rates, exposure, images, KEY)
-    plain = [
-        row
-        for i, image in enumerate(images.tolist())
-        for row in plain_arrivals(rates[i], exposure, image, KEY)
-    ]
+    plain = [row for i, image in enumerate(images.tolist()) for row in plain_arrivals(rates[i], exposure, image, KEY)]
     assert rows_of(times, offsets) == plain
     assert np.all(times < exposure)
 

@@ -42,18 +42,12 @@ UNIFORM: dict[str, Draw] = {
         rng.exponential(size=100), rng.exponential(size=2000), alpha=0
     ),
     "same_mean, Poisson": lambda rng: laws.same_mean(rng.poisson(1.0, 100), rng.poisson(1.0, 2000), alpha=0),
-    "same_mean, other variances": lambda rng: laws.same_mean(
-        rng.normal(0, 3, 100), rng.normal(0, 1, 200), alpha=0
-    ),
-    "same_variance, normal": lambda rng: laws.same_variance(
-        rng.normal(size=200), rng.normal(size=2000), alpha=0
-    ),
+    "same_mean, other variances": lambda rng: laws.same_mean(rng.normal(0, 3, 100), rng.normal(0, 1, 200), alpha=0),
+    "same_variance, normal": lambda rng: laws.same_variance(rng.normal(size=200), rng.normal(size=2000), alpha=0),
     "same_variance, exponential": lambda rng: laws.same_variance(
         rng.exponential(size=200), rng.exponential(size=2000), alpha=0
     ),
-    "same_variance, Poisson": lambda rng: laws.same_variance(
-        rng.poisson(2.0, 200), rng.poisson(2.0, 2000), alpha=0
-    ),
+    "same_variance, Poisson": lambda rng: laws.same_variance(rng.poisson(2.0, 200), rng.poisson(2.0, 2000), alpha=0),
     "same_histogram": lambda rng: laws.same_histogram(rng.poisson(3.0, 300), rng.poisson(3.0, 5000), alpha=0),
     "same_histogram, equal sizes": lambda rng: laws.same_histogram(
         rng.poisson(9.0, 500), rng.poisson(9.0, 500), alpha=0
@@ -68,16 +62,10 @@ CONSERVATIVE: dict[str, Draw] = {
     "poisson_mean, few": lambda rng: laws.poisson_mean(rng.poisson(4.0), 4.0, alpha=0),
     "share_is, few": lambda rng: laws.share_is(rng.binomial(50, 0.05), 50, 0.05, alpha=0),
     "same_poisson, few": lambda rng: laws.same_poisson(rng.poisson(4.0), 1, rng.poisson(40.0), 10, alpha=0),
-    "same_share, few": lambda rng: laws.same_share(
-        rng.binomial(50, 0.1), 50, rng.binomial(500, 0.1), 500, alpha=0
-    ),
+    "same_share, few": lambda rng: laws.same_share(rng.binomial(50, 0.1), 50, rng.binomial(500, 0.1), 500, alpha=0),
     "mean_is, rare": lambda rng: laws.mean_is(rng.poisson(0.2, 100), 0.2, alpha=0),
-    "histogram_is, two bins": lambda rng: laws.histogram_is(
-        rng.poisson(0.1, 200), _poisson_pmf(0.1), alpha=0
-    ),
-    "same_histogram, two bins": lambda rng: laws.same_histogram(
-        rng.poisson(0.1, 200), rng.poisson(0.1, 2000), alpha=0
-    ),
+    "histogram_is, two bins": lambda rng: laws.histogram_is(rng.poisson(0.1, 200), _poisson_pmf(0.1), alpha=0),
+    "same_histogram, two bins": lambda rng: laws.same_histogram(rng.poisson(0.1, 200), rng.poisson(0.1, 2000), alpha=0),
     "same_distribution, ties": lambda rng: laws.same_distribution(
         rng.poisson(3.0, 200), rng.poisson(3.0, 2000), alpha=0
     ),
@@ -96,9 +84,7 @@ def test_p_values_where_nothing_is_wrong(name: str) -> None:
         below = int((p < level).sum())
         assert below <= law.isf(1e-6), f"{name}: {below} of {REPLICATIONS} p-values are below {level}"
         if name in UNIFORM:
-            assert below >= law.ppf(1e-6), (
-                f"{name}: only {below} of {REPLICATIONS} p-values are below {level}"
-            )
+            assert below >= law.ppf(1e-6), f"{name}: only {below} of {REPLICATIONS} p-values are below {level}"
 
 
 # A fault that each assertion must catch, at the false-alarm rate the tests use.
@@ -111,9 +97,7 @@ FAULTS: dict[str, Draw] = {
     "distribution_is": lambda rng: laws.distribution_is(rng.gamma(1.6, 1 / 1.6, size=2000), _exponential_cdf),
     "histogram_is": lambda rng: laws.histogram_is(rng.negative_binomial(4.0, 0.5, 2000), _poisson_pmf(4.0)),
     "same_poisson": lambda rng: laws.same_poisson(rng.poisson(1.1e4), 1, rng.poisson(9e4), 9),
-    "same_share": lambda rng: laws.same_share(
-        rng.binomial(5000, 0.35), 5000, rng.binomial(90_000, 0.3), 90_000
-    ),
+    "same_share": lambda rng: laws.same_share(rng.binomial(5000, 0.35), 5000, rng.binomial(90_000, 0.3), 90_000),
     "same_mean": lambda rng: laws.same_mean(rng.poisson(1.2, 2000), rng.poisson(1.0, 20_000)),
     "same_variance": lambda rng: laws.same_variance(rng.normal(0, 1.2, 1000), rng.normal(size=10_000)),
     "same_histogram, same mean": lambda rng: laws.same_histogram(

@@ -354,8 +354,7 @@ def test_a_level_is_keyed_by_its_value() -> None:
     one = experiment(PAPER_TEXT)
     photons = one.photons(one.levels[0], images.pixels, 255.0)
     keys = [
-        one.streams(Level("x", kind, 1.0), "train", np.arange(3, dtype=np.uint64))
-        for kind in ("lux", "irradiance")
+        one.streams(Level("x", kind, 1.0), "train", np.arange(3, dtype=np.uint64)) for kind in ("lux", "irradiance")
     ]
     a, b = (one.sensor.expose(photons, one.conditions, key, ("tr",)) for key in keys)
     assert a.tr is not None and b.tr is not None and not np.array_equal(a.tr.times, b.tr.times)
@@ -406,9 +405,7 @@ def _jitter(self: Any, events: Events, rng: np.random.Generator) -> Events:
 
 
 def _jitter_in_place(self: Any, events: Events, rng: np.random.Generator) -> Events:
-    return Events(
-        np.abs(events.times - 1e-9 * rng.exponential(size=len(events))), events.offsets, events.pixels
-    )
+    return Events(np.abs(events.times - 1e-9 * rng.exponential(size=len(events))), events.offsets, events.pixels)
 
 
 def _neighbours(self: Any, events: Events, rng: np.random.Generator) -> Children:
@@ -498,8 +495,7 @@ def test_an_earlier_stage_does_not_see_a_later_stranger(stage: str) -> None:
     images = grey_images(BLOCK)
     for rules in ("paper", "device"):
         plain, one = (
-            experiment(PAPER_TEXT + more, rules=rules, readouts="[tr, qis]")
-            for more in ("", ", stranger: {}")
+            experiment(PAPER_TEXT + more, rules=rules, readouts="[tr, qis]") for more in ("", ", stranger: {}")
         )
         made = [x.simulate(x.levels[0], "train", images, 0, BLOCK) for x in (plain, one)]
         assert_same(*made)
@@ -568,9 +564,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("stage", "hooks", "wrong"), BAD, ids=[f"{stage}-{wrong}" for stage, _, wrong in BAD]
-)
+@pytest.mark.parametrize(("stage", "hooks", "wrong"), BAD, ids=[f"{stage}-{wrong}" for stage, _, wrong in BAD])
 @pytest.mark.parametrize("rules", ["paper", "device"])
 @pytest.mark.usefixtures("no_trace")
 def test_a_strangers_mistake_is_named(stage: str, hooks: dict[str, Any], wrong: str, rules: str) -> None:

@@ -79,16 +79,11 @@ ATTRIBUTES = {"lux": 2.56, "images": 7, "range": [0, 7], "readouts": ["tr", "qis
 
 
 def tree(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()
-    }
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 def digests(root: Path) -> dict[str, dict[str, object]]:
-    return {
-        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        for name, data in tree(root).items()
-    }
+    return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in tree(root).items()}
 
 
 def check(reader: ShardReader, columns: dict[str, Column]) -> None:
@@ -381,9 +376,7 @@ def test_every_flip_in_data_is_refused(tmp_path: Path, format: str) -> None:
             damaged = bytearray(before)
             damaged[position] ^= 1 << (position % 8)
             path.write_bytes(damaged)
-            with pytest.raises(
-                InputError, match=r"a: .*; the file was changed or damaged: `spadmnist verify"
-            ):
+            with pytest.raises(InputError, match=r"a: .*; the file was changed or damaged: `spadmnist verify"):
                 reader.read("a")
 
 
@@ -391,9 +384,7 @@ def test_every_flip_in_data_is_refused(tmp_path: Path, format: str) -> None:
 def test_links_are_refused(tmp_path: Path, format: str) -> None:
     write_shard(tmp_path / "out", "a/s", some_columns(), {}, format)
     where = tmp_path / "out" / ("data.zarr" if format == "zarr" else "data")
-    inside = (
-        ["a/s/tr/ticks/c.0", "a/s/tr/ticks", "a/s/tr", "a/s", "a"] if format == "zarr" else ["a/s.h5", "a"]
-    )
+    inside = ["a/s/tr/ticks/c.0", "a/s/tr/ticks", "a/s/tr", "a/s", "a"] if format == "zarr" else ["a/s.h5", "a"]
     for name in inside:
         shutil.move(where / name, tmp_path / "elsewhere")
         (where / name).symlink_to(tmp_path / "elsewhere")
@@ -443,9 +434,7 @@ def test_a_bomb_is_refused_before_it_grows(tmp_path: Path, kind: str) -> None:
             print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
         """
     )
-    ran = subprocess.run(
-        [sys.executable, "-c", program, tmp_path], check=True, capture_output=True, text=True
-    )
+    ran = subprocess.run([sys.executable, "-c", program, tmp_path], check=True, capture_output=True, text=True)
     assert int(ran.stdout) < 300_000  # kB
 
 
@@ -618,9 +607,7 @@ def test_a_full_disk(tmp_path: Path, format: str) -> None:
         pytest.skip("mounting a small tmpfs needs root")
     disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True
-    ).returncode:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True).returncode:
         pytest.skip("mounting a tmpfs is not allowed here")
     try:
         write_shard(disk, "first", random_shard(200_000), {}, format)
@@ -633,9 +620,7 @@ def test_a_full_disk(tmp_path: Path, format: str) -> None:
             "command again; what is complete is kept"
         )
         with pytest.raises(SpadError, match="free some space"):
-            append_columns(
-                disk, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format
-            )
+            append_columns(disk, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format)
         with pytest.raises(SpadError, match="free some space"):
             store.commit_file(disk / "manifest.json", os.urandom(2_000_000), store.temporary(disk))
         assert tree(disk) == before and list(store.temporary(disk).iterdir()) == []

@@ -8,13 +8,14 @@ fixes the order and what its hook receives:
 | light | apply(rate, conditions) | photons/s, (images, pixels) -> the same |
 | detection | apply(rate, conditions) | photons/s -> detections/s |
 | dark | apply(rate, conditions) | detections/s -> detections/s |
-| arrival | factor(t, conditions), maximum(conditions) | s, (events,) -> factor on the light (`acts_on = "dark"`: on the dark rate) |
+| arrival | factor(t, conditions), maximum(conditions) | s, (events,) -> factor on the light or the dark rate |
 | gate | open(t, conditions) | s, (events,) -> bool: can the pixel fire? |
 | correlated | spawn(events, rng) | Events -> Children |
 | dead_time | blind_time() | -> s after a detection, one value or one per pixel |
 | timing | apply(events, rng) | Events -> Events |
 | readout | apply(events, rng) | Events -> Events |
 
+An arrival effect acts on the light, or with `acts_on = "dark"` on the dark rate; `maximum` is the largest factor.
 `rng` is a `numpy.random.Generator` of the effect's own for each fixed block of images, or, with `counted = True` on
 the class, a `spadmnist.streams.Draws` for the counter-based kernels.
 """
@@ -80,9 +81,7 @@ class Effect(Plugin, abstract=True):
             raise TypeError(f"{cls.__name__}: {chosen!r} is not a stage; the stages are {', '.join(STAGES)}")
         missing = [hook for hook in STAGES[chosen] if not callable(getattr(cls, hook, None))]
         if missing:
-            raise TypeError(
-                f"{cls.__name__}: an effect at stage {chosen} must define {' and '.join(missing)}"
-            )
+            raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {' and '.join(missing)}")
         super().__init_subclass__(**keywords)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
