@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 
-from . import config, kernels, plugins, reconstruct, store
+from . import config, kernels, plugins, reconstruct, store, units
 from .config import Experiment, Level
 from .errors import InputError, SpadError
 from .events import Events
@@ -195,7 +195,7 @@ def _ragged(
     attributes: dict[str, Any] = {}
     unit = "s"
     if events.ticks is not None:
-        unit = f"{events.tick!r} s"
+        unit = units.show(events.tick, "s", 12)
         attributes = {"tick_s": events.tick}
         if counted:
             values = kernels.row_differences(values, events.offsets)

@@ -713,9 +713,7 @@ def paper_line(
     places = np.empty(3, np.uint64)
     distances = np.empty(2)
     times = np.empty(1)
-    stamps = np.empty(1, ticks.dtype)
     frame = np.empty(1, np.uint32)
-    first = np.empty(1, firsts.dtype)
     parents = np.empty(1, np.int64)
     delays = np.empty(1)
     used = 0
@@ -739,9 +737,7 @@ def paper_line(
             while total < 0:
                 if times.size < room:
                     times = np.empty(room)
-                    stamps = np.empty(room, ticks.dtype)
                     frame = np.empty(room, np.uint32)
-                    first = np.empty(room, firsts.dtype)
                     parents = np.empty(room, np.int64)
                     delays = np.empty(room)
                 total = _candidates(
@@ -769,15 +765,12 @@ def paper_line(
             tile = tile_offsets[: end - begin + 1]
             if want_tr:
                 ticks = _grown(ticks, used, used + total)
-                used = _tile_tr(
-                    times, tile, dead_times[begin:end], tick, stamps, ticks, used, row, offsets, counts, span
-                )
+                used = _tile_tr(times, tile, dead_times[begin:end], tick, ticks, used, row, offsets, counts, span)
             if want_frames:
-                if want_stamps:
-                    firsts = _grown(firsts, first_used, first_used + total + 1)
+                firsts = _grown(firsts, first_used, first_used + total + 1)
+                # in place, too: the first stamps of frames move up over the others
+                first = firsts[first_used:]
                 _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
-                # without STR the stamps go nowhere: back into the scratch that they came from
-                into = firsts if want_stamps else first
                 behind = _tile_frames(
                     frame,
                     first,
@@ -787,8 +780,8 @@ def paper_line(
                     frame_time,
                     tick,
                     bits,
-                    into,
-                    first_used if want_stamps else 0,
+                    firsts,
+                    first_used,
                     first_offsets,
                     ones,
                     waited,
@@ -800,8 +793,12 @@ def paper_line(
 
 
 @_jit
-def _tile_tr(times, tile_offsets, dead_times, tick, stamps, ticks, used, first_row, offsets, counts, span):
-    """The TR readout of some pixels: stamps, then the dead time; appended to `ticks` from `used` on."""
+def _tile_tr(times, tile_offsets, dead_times, tick, ticks, used, first_row, offsets, counts, span):
+    """The TR readout of some pixels: stamps, then the dead time; appended to `ticks` from `used` on.
+
+    Every event's stamp is put there first, and those that are recorded then move up: in place, for memory is slow.
+    """
+    stamps = ticks[used:]
     for i in range(np.uint64(tile_offsets[tile_offsets.size - 1])):
         stamps[i] = _nearest(times[i] / tick)
     k = np.uint64(used)
@@ -866,6 +863,15 @@ def spans(times, offsets):
         if n > 1:
             span[row] = times[offsets[row + 1] - 1] - times[offsets[row]]
     return counts, span
+
+
+@_jit
+def lookup(table, indices):
+    """`table[indices]`, float32; every index is known to lie inside."""
+    out = np.empty(indices.size, np.float32)
+    for i in range(np.uint64(indices.size)):
+        out[i] = table[np.uint64(indices[i])]
+    return out
 
 
 # --- ragged columns on disk ---------------------------------------------------------------------------------------

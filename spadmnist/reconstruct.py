@@ -72,7 +72,7 @@ class Method(Plugin, abstract=True):
         if len(columns) == 1 and columns[0].dtype.kind in "iu":
             # a function of one small integer: worked out once for each value that occurs
             table, where = self._finite(settings, np.arange(int(columns[0].max(initial=0)) + 1))
-            values = table.astype(np.float32).take(columns[0], mode="clip")
+            values = kernels.lookup(table.astype(np.float32), columns[0])
             return values, int(np.count_nonzero(where.take(columns[0]))) if where.any() else 0
         values = np.zeros(columns[0].shape, np.float32)
         saturated = 0

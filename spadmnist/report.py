@@ -410,7 +410,7 @@ def _time_scale(first: Sequence[np.ndarray]) -> tuple[float, float] | None:
     if not len(times):
         return None
     high = _round(float(times.max()), up=True)
-    return min(_round(float(np.quantile(times, 0.01)), up=False), high / 10), high
+    return min(_round(float(np.quantile(times, 0.01, method="lower")), up=False), high / 10), high
 
 
 def _round(value: float, up: bool) -> float:
@@ -462,9 +462,11 @@ def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf
     else:
         grey = scaled.mean(axis=1) if values.ndim == 4 else scaled
         rgb = np.repeat(grey[..., None], 3, axis=-1)
-    caption = f"white: {white:.4g}" if white > 0 else "all 0"
+    caption = "all 0"
     if largest > clip:
-        caption += f" (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
+        caption = f"white: {white:g} (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
+    elif white > 0:
+        caption = f"white: {white:.4g}, mean {float(values.mean(dtype=np.float64)):.3g}"
     return _bytes_of(rgb), caption
 
 
@@ -492,14 +494,21 @@ def _bytes_of(scaled: np.ndarray) -> np.ndarray:
 # --- from colours to a page
 
 
+def _arranged(images: np.ndarray) -> tuple[int, int, int]:
+    """(images side by side, points a pixel takes, pixels a point takes); one of the latter two is 1."""
+    n, rows, columns, _ = images.shape
+    sides = {across: max(across * columns, -(-n // across) * rows) for across in range(1, n + 1)}
+    across = min(sides, key=lambda k: sides[k])
+    side = sides[across]
+    zoom = next((z for z in (-(-_SMALL // side), _SMALL // side) if 1 <= z <= _LARGE // side), 1)
+    return across, zoom, -(-side // _LARGE)
+
+
 def _mosaic(images: np.ndarray) -> np.ndarray:
     """(height, width, 3): the images side by side, in whole points per pixel or whole pixels per point."""
-    n, rows, columns, _ = images.shape
-    across = min(range(1, n + 1), key=lambda k: (max(k * columns, -(-n // k) * rows), k))
-    side = max(across * columns, -(-n // across) * rows)
-    images = _reduced(images, -(-side // _LARGE)) if side > _LARGE else images
-    zoom = next((z for z in (-(-_SMALL // side), _SMALL // side) if 1 <= z <= _LARGE // side), 1)
-    images = images.repeat(zoom, axis=1).repeat(zoom, axis=2)
+    n = len(images)
+    across, zoom, factor = _arranged(images)
+    images = (_reduced(images, factor) if factor > 1 else images).repeat(zoom, axis=1).repeat(zoom, axis=2)
     _, height, width, _ = images.shape
     page = np.full((-(-n // across) * (height + 2) - 2, across * (width + 2) - 2, 3), _PAGE, np.uint8)
     for i, image in enumerate(images):
@@ -539,6 +548,9 @@ def _draw(
             f"Fluxes are divided by the median of the non-zero pixels of {basis}; "
             f"what is above {_CLIP:g} is drawn as {_CLIP:g}."
         )
+    _, _, factor = _arranged(columns[0].pixels)
+    if factor > 1:
+        foot.append(f"Every point is the mean of {factor} x {factor} pixels.")
     lines = len(foot) + (times is not None)
     tall = _TOP + len(rows) * (height + _CAPTION) + _LINE * lines + 2 * _GAP
     if max(full, tall) >= 1 << 16:
@@ -546,7 +558,7 @@ def _draw(
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor=[c / 255 for c in _PAGE])
+        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor="#" + bytes(_PAGE).hex())
 
         def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
             points = size * 72 / _DPI
