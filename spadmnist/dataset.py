@@ -194,7 +194,7 @@ def _ragged(
     about = f"time {since}, pixel after pixel"
     attributes: dict[str, Any] = {}
     unit = "s"
-    if events.ticks is not None:
+    if events.ticks is not None and events.tick is not None:
         unit = units.show(events.tick, "s", 12)
         attributes = {"tick_s": events.tick}
         if counted:

@@ -112,20 +112,28 @@ def _log(x):
 
 
 @_inline
+def _uniform(word):
+    """A number from (0, 1) from 64 random bits: an odd multiple of 2^-53, so neither 0 nor 1."""
+    return _double((word >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
+
+
+@_inline
 def _exponential(word):
-    """A standard exponential from 64 random bits: -log of an odd multiple of 2^-53, so never 0 and never infinite."""
-    u = _double((word >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
-    return -_log(u)
+    """A standard exponential from 64 random bits; never 0 and never infinite."""
+    return -_log(_uniform(word))
 
 
 @_jit
 def _exponentials(block, image, key0, key1, word, out):
     """Fill `out[:BATCH]` with the exponentials of the blocks from `block` on; `out[BATCH]` becomes +inf, a stop."""
     half = BATCH // 2
+    # two loops, each short enough to keep its numbers in the registers of the SIMD unit
     for i in range(half):
         a, b = _philox(np.uint64(block) + np.uint64(i), image, key0, key1, word)
-        out[i] = _exponential(a)
-        out[half + i] = _exponential(b)
+        out[i] = _uniform(a)
+        out[half + i] = _uniform(b)
+    for i in range(BATCH):
+        out[i] = -_log(out[i])
     out[BATCH] = np.inf
 
 
@@ -421,7 +429,7 @@ def uniforms(offsets, pixels, images, key):
         start = offsets[i * pixels]
         for j in range(offsets[(i + 1) * pixels] - start):
             a, _ = _philox(np.uint64(j), images[i], key[0], key[1], key[2])
-            out[start + j] = _double((a >> _12) | _ONE_BITS) - (1.0 - 1.1102230246251565e-16)
+            out[start + j] = _uniform(a)
     return out
 
 
@@ -872,6 +880,44 @@ def lookup(table, indices):
     for i in range(np.uint64(indices.size)):
         out[i] = table[np.uint64(indices[i])]
     return out
+
+
+@_jit
+def inter_photon(counts, span, pdp, dead_time, half_tick):
+    """Flux (1/s) of each row from its detections and the time between first and last (s); paper, eq. 4c.
+
+    Returns (float64 fluxes, rows whose live time was taken as `half_tick` per interval).
+    """
+    out = np.zeros(counts.size)
+    bounded = 0
+    for i in range(np.uint64(counts.size)):
+        if counts[i] >= 2:
+            intervals = np.float64(counts[i]) - 1.0
+            live = span[i] - intervals * dead_time
+            least = intervals * half_tick
+            if live < least:
+                live = least
+                bounded += 1
+            out[i] = intervals / (pdp * live)
+    return out, bounded
+
+
+@_jit
+def first_photon(ones, waited, pdp, least):
+    """Flux (1/s) of each row from its frames with a detection and the time waited (s); paper, eq. 5.
+
+    Returns (float64 fluxes, rows whose waiting time of 0 was taken as `least`).
+    """
+    out = np.zeros(ones.size)
+    bounded = 0
+    for i in range(np.uint64(ones.size)):
+        if ones[i] > 0:
+            time = waited[i]
+            if time <= 0.0:
+                time = least
+                bounded += 1
+            out[i] = ones[i] / (pdp * time)
+    return out, bounded
 
 
 # --- ragged columns on disk ---------------------------------------------------------------------------------------

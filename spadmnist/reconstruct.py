@@ -58,9 +58,9 @@ class Method(Plugin, abstract=True):
         """The image from the columns, float64; `+inf` where a saturated pixel has no finite estimate."""
         raise TypeError(f"{self.name} must define estimate")
 
-    def saturated(self, settings: Settings, *columns: Any, **named: Any) -> np.ndarray:
-        """Where the formula had no answer of its own and a rule stands in."""
-        return np.zeros(columns[0].shape, bool)
+    def saturated(self, settings: Settings, *columns: Any, **named: Any) -> int:
+        """In how many pixels the formula had no answer of its own and a rule stands in."""
+        return 0
 
     def stored_when_saturated(self, settings: Settings) -> float:
         """What a dataset stores where `estimate` is infinite."""
@@ -69,24 +69,22 @@ class Method(Plugin, abstract=True):
     def image(self, recorded: Recorded, settings: Settings) -> tuple[np.ndarray, int]:
         """What a dataset stores: ((rows,) float32, how many of them were saturated)."""
         columns = [getattr(recorded, name) for name in self.columns]
+        values, saturated = np.empty(columns[0].shape, np.float32), 0
         if len(columns) == 1 and columns[0].dtype.kind in "iu":
-            # a function of one small integer: worked out once for each value that occurs
-            table, where = self._finite(settings, np.arange(int(columns[0].max(initial=0)) + 1))
+            # a function of one small integer is worked out once for each value that occurs
+            table = self._finite(settings, np.arange(int(columns[0].max(initial=0)) + 1))
             values = kernels.lookup(table.astype(np.float32), columns[0])
-            return values, int(np.count_nonzero(where.take(columns[0]))) if where.any() else 0
-        values = np.zeros(columns[0].shape, np.float32)
-        saturated = 0
+            return values, self.saturated(settings, *columns)
         for start in range(0, len(values), _ROWS_AT_ONCE):
-            # no detection, no information: 0, and most pixels of a dim image need no arithmetic
-            seen = np.flatnonzero(columns[0][start : start + _ROWS_AT_ONCE]) + start
-            values[seen], where = self._finite(settings, *(column[seen] for column in columns))
-            saturated += int(np.count_nonzero(where))
+            part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
+            values[start : start + _ROWS_AT_ONCE] = self._finite(settings, *part)
+            saturated += self.saturated(settings, *part)
         return values, saturated
 
-    def _finite(self, settings: Settings, *columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _finite(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
         values = self.estimate(settings, *columns)
-        values = np.where(np.isposinf(values), self.stored_when_saturated(settings), values)
-        return values, self.saturated(settings, *columns)
+        infinite = np.isposinf(values)
+        return np.where(infinite, self.stored_when_saturated(settings), values) if infinite.any() else values
 
 
 class Counts(Method):
@@ -115,8 +113,8 @@ class PassiveFreeRunning(Method):
         with np.errstate(divide="ignore"):
             return np.where(live > 0, counts / (settings.pdp * np.where(live > 0, live, 1.0)), np.inf)
 
-    def saturated(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
-        return settings.exposure - counts * settings.dead_time <= 0
+    def saturated(self, settings: Settings, counts: np.ndarray) -> int:
+        return int(np.count_nonzero(settings.exposure - counts * settings.dead_time <= 0))
 
     def stored_when_saturated(self, settings: Settings) -> float:
         if settings.dead_time <= 0:
@@ -133,20 +131,16 @@ class InterPhoton(Method):
 
     columns = ("counts", "span")
 
-    def _live(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
-        return span - (counts - 1) * settings.dead_time
-
-    def _least(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+    def _worked_out(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> tuple[np.ndarray, int]:
         # without a converter two stamps still lie a rounding error apart
         half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.exposure)
-        return np.maximum(counts - 1, 1) * half
+        return kernels.inter_photon(counts, span, settings.pdp, settings.dead_time, half)
 
     def estimate(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
-        live = np.maximum(self._live(settings, counts, span), self._least(settings, counts))
-        return np.where(counts >= 2, (counts - 1) / (settings.pdp * live), 0.0)
+        return self._worked_out(settings, counts, span)[0]
 
-    def saturated(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
-        return (counts >= 2) & (self._live(settings, counts, span) < self._least(settings, counts))
+    def saturated(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> int:
+        return self._worked_out(settings, counts, span)[1]
 
 
 class StrFlux(Method):
@@ -161,12 +155,15 @@ class StrFlux(Method):
     def readouts(cls) -> tuple[str, ...]:
         return ("str",)  # the bits are those of the STR frames
 
-    def estimate(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
+    def _worked_out(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> tuple[np.ndarray, int]:
         half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.frame_time)
-        return ones / (settings.pdp * np.where(waited > 0, waited, settings.frames * half))
+        return kernels.first_photon(ones, waited, settings.pdp, settings.frames * half)
 
-    def saturated(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
-        return waited <= 0
+    def estimate(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
+        return self._worked_out(settings, ones, waited)[0]
+
+    def saturated(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> int:
+        return self._worked_out(settings, ones, waited)[1]
 
 
 class QisCounts(Method):
@@ -198,8 +195,8 @@ class QisLinear(Method):
         # + 0.0: the image of an empty pixel is 0, not -0
         return -settings.frames * kernels.logarithm(empty.ravel()).reshape(empty.shape) + 0.0
 
-    def saturated(self, settings: Settings, ones: np.ndarray) -> np.ndarray:
-        return ones >= settings.frames
+    def saturated(self, settings: Settings, ones: np.ndarray) -> int:
+        return int(np.count_nonzero(ones >= settings.frames))
 
 
 def find(name: str) -> Method:

@@ -252,9 +252,9 @@ def test_fast_line_is_the_literal_algorithm_in_short(name: str) -> None:
 FAULTS: dict[str, tuple[str, dict[str, Any]]] = {
     "dead time too long": ("stress", {"dead_time": 2.1e-6}),
     "afterpulsing too weak": ("stress", {"afterpulsing": 0.27}),
-    "lifetime too long": ("stress", {"lifetime": 3.5e-6}),
-    "PDP too high": ("bright", {"pdp": 0.505}),
-    "no afterpulsing": ("bright", {"afterpulsing": 0.0}),
+    "lifetime too long": ("stress", {"lifetime": 5e-6}),
+    "PDP too high": ("bright", {"pdp": 0.51}),
+    "afterpulsing too strong": ("bright", {"afterpulsing": 0.02}),
     "dark counts too frequent": ("dim", {"dark_count_rate": 120.0}),
 }
 

@@ -1,0 +1,797 @@
+"""The factory: the same bytes however a dataset comes about, and nothing lost whoever is killed whenever."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+import spadmnist
+from spadmnist import config, dataset, factory, plugins, verify
+from spadmnist.errors import SpadError
+from spadmnist.factory import Progress
+
+METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
+COMMAND = str(Path(sys.executable).with_name("spadmnist"))
+LEVELS = ("5 mlux", "40 mlux", "160 mlux", "640 mlux", "2560 mlux")
+
+TEXT = """\
+seed: 3
+scene:
+  images: {{source: digits, train: {train}, test: {test}, rows: 8, columns: 8}}
+  lux: [{lux}]
+recording: {{exposure: 1 ms, frames: {frames}, frame_time: {frame_time}, readouts: [tr, str, qis]}}
+reconstruct: [{methods}]
+sensor:
+  name: small
+  layout: {{rows: 8, columns: 8, pixel_area: 25 um^2}}
+  effects:
+    detection: {{pdp: 0.5}}
+    dark_counts: {{rate: 100 Hz}}
+    afterpulsing: {{probability: 0.5 %, lifetime: 25 ns}}
+    dead_time: {{duration: 50 ns}}
+    tdc: {{resolution: 10 ps}}
+{more}output: {{format: {format}}}
+"""
+
+
+def write_config(
+    path: Path,
+    format: str = "zarr",
+    levels: tuple[str, ...] = LEVELS[::2],
+    methods: tuple[str, ...] = METHODS,
+    train: int = 40,
+    test: int = 12,
+    frames: int = 100,
+    more: str = "",
+) -> Path:
+    """A config of some shards that take milliseconds each."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = TEXT.format(
+        train=train,
+        test=test,
+        lux=", ".join(levels),
+        methods=", ".join(methods),
+        frames=frames,
+        frame_time=f"{1000 / frames!r} us",
+        more=more,
+        format=format,
+    )
+    path.write_text(text)
+    return path
+
+
+def make(
+    file: Path,
+    root: Path,
+    jobs: int = 1,
+    progress: Progress = Progress(),  # noqa: B008
+    **changes: Any,
+) -> factory.Outcome:
+    """`spadmnist generate`, in this process."""
+    experiment = config.read(file, **changes)
+    return factory.generate(experiment, experiment.load_images(), root, jobs, progress)
+
+
+def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """`spadmnist ARGUMENTS`."""
+    return subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=120, **options)
+
+
+def tree(root: Path) -> dict[str, bytes | str]:
+    """Everything below a folder: files by content, links by target, and the empty folders."""
+    found: dict[str, bytes | str] = {}
+    for folder, folders, files in os.walk(root):
+        for name in [*files, *folders]:
+            path = Path(folder, name)
+            if path.is_symlink():
+                found[str(path.relative_to(root))] = f"link to {os.readlink(path)}"
+            elif name in files:
+                found[str(path.relative_to(root))] = path.read_bytes()
+        if not folders and not files:
+            found[str(Path(folder).relative_to(root))] = "empty folder"
+    return found
+
+
+def assert_same(root: Path, expected: dict[str, bytes | str]) -> None:
+    there = tree(root)
+    wrong = sorted(n for n in there.keys() | expected.keys() if there.get(n) != expected.get(n))
+    assert not wrong, f"{len(wrong)} files differ: {wrong[:5]}"
+
+
+def assert_sentence(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit status 2, and on standard error one line a problem."""
+    assert result.returncode == 2, result.stderr
+    assert "Traceback" not in result.stderr and "fault of the program" not in result.stderr, result.stderr
+    for word in words:
+        assert word in result.stderr, result.stderr
+
+
+@pytest.fixture(scope="session", params=["zarr", "hdf5"])
+def format(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="session")
+def made(format: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """(config, dataset): the reference, made by one worker in this process."""
+    home = tmp_path_factory.mktemp(f"made-{format}")
+    file = write_config(home / "small.yaml", format)
+    make(file, home / "out")
+    return file, home / "out"
+
+
+@pytest.fixture(scope="session")
+def many(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """As `made`, with twelve shards, some of which take a tenth of a second."""
+    home = tmp_path_factory.mktemp("many")
+    file = write_config(home / "many.yaml", levels=LEVELS, train=1500, test=300)
+    make(file, home / "out")
+    return file, home / "out"
+
+
+# --- the same bytes -----------------------------------------------------------------------------------------------
+
+
+def test_two_workers_make_the_same_bytes(made: tuple[Path, Path], tmp_path: Path) -> None:
+    make(made[0], tmp_path / "out", jobs=2)
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_shards_in_any_order_make_the_same_bytes(
+    made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_tasks = factory.run_tasks
+
+    def shuffled(function: Any, tasks: Any, keys: Any, jobs: int, done: Any) -> None:
+        run_tasks(function, tasks, random.Random(5).sample(list(keys), len(keys)), jobs, done)
+
+    monkeypatch.setattr(factory, "run_tasks", shuffled)
+    make(made[0], tmp_path / "out")
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_the_surroundings_do_not_show(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """Another folder, config path, time zone, language, umask, hash seed, and process."""
+    (tmp_path / "elsewhere").mkdir()
+    copy = tmp_path / "copy of small.yaml"
+    shutil.copy(made[0], copy)
+    surroundings = {"TZ": "Asia/Kathmandu", "LC_ALL": "C", "LANG": "C", "PYTHONHASHSEED": "12345"}
+    result = run(
+        "generate",
+        os.path.relpath(copy, tmp_path / "elsewhere"),
+        "--output",
+        "../out",
+        "--jobs",
+        2,
+        cwd=tmp_path / "elsewhere",
+        env={**os.environ, **surroundings},
+        umask=0o077,
+    )
+    assert result.returncode == 0, result.stderr
+    assert_same(tmp_path / "out", tree(made[1]))
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_nothing_of_the_run_stays(made: tuple[Path, Path]) -> None:
+    """No state, lock, temporary file, path, host, user or time."""
+    _, root = made
+    names = tree(root)
+    top = {"config.yaml", "manifest.json", "data.zarr" if (root / "data.zarr").exists() else "data"}
+    assert {name.split("/")[0] for name in names} == top
+    private = [str(root.parent), str(Path.cwd()), str(Path.home()) if Path.home() != Path("/") else "/root"]
+    private += [word for word in (platform.node(),) if len(word) > 3]
+    for name, content in names.items():
+        assert isinstance(content, bytes), name
+        for word in private:
+            assert word.encode() not in content, f"{name} holds {word}"
+        if name.endswith((".json", ".yaml")):
+            assert not re.search(rb"20[0-9][0-9]-[01][0-9]-[0-3][0-9]", content), name
+            assert str(time.localtime().tm_year).encode() not in re.sub(rb"[0-9a-f]{64}|: [0-9]+", b"", content)
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, spadmnist.Events):
+        return all(same(getattr(a, n), getattr(b, n)) for n in ("times", "ticks", "offsets", "tick", "pixels"))
+    return type(a) is type(b) and a == b
+
+
+def assert_same_images(a: spadmnist.Part, b: spadmnist.Part, i: Any, j: Any = None) -> None:
+    """Every field of images `i` of one part is that of images `j` of the other."""
+    j = i if j is None else j
+    for field in ("tr", "qis", "str", "images"):
+        assert same(getattr(a, field)[i], getattr(b, field)[j]), field
+    for method in a.reconstruction:
+        assert same(a.reconstruction[method][i], b.reconstruction[method][j]), method
+    if a.labels is not None or b.labels is not None:
+        assert same(a.labels[i], b.labels[j])  # type: ignore[index]
+
+
+def test_an_image_alone_is_the_one_that_is_stored(made: tuple[Path, Path]) -> None:
+    """Dataset and config, every field of every image; and the ranges."""
+    stored, simulated = spadmnist.open(made[1]), spadmnist.open(made[0])
+    assert stored.levels == simulated.levels and stored.lux == simulated.lux
+    assert stored.splits == simulated.splits == ("train", "test")
+    for level in stored.levels:
+        for split in stored.splits:
+            a, b = stored[level, split], simulated[level, split]
+            assert len(a) == len(b) == {"train": 40, "test": 12}[split]
+            for i in range(len(a)):
+                assert_same_images(a, b, i)
+            for piece in (slice(None), slice(3, 3), slice(-5, -2), slice(30, 99), slice(9, 4)):
+                assert_same_images(a, b, piece)
+            for method in METHODS:
+                one, other = a.reconstruction[method], b.reconstruction[method]
+                assert same(one.normalisation, other.normalisation)
+                assert same(one.normalised[2:5], other.normalised[2:5])
+                assert (one.normalisation is None) == method.startswith("qis")
+
+
+@pytest.mark.parametrize("frames", [3, 8, 100])
+def test_cuts_and_numbers_of_frames(frames: int, format: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dataset in many shards reads as one, whatever the number of frames."""
+    monkeypatch.setattr(dataset, "_IMAGES_PER_SHARD", 11)
+    file = write_config(tmp_path / "c.yaml", format, ("2560 mlux",), frames=frames)
+    outcome = make(file, tmp_path / "out")
+    assert outcome.made == 2 + 4 + 2
+    a = spadmnist.open(tmp_path / "out")["2560 mlux", "train"]
+    b = spadmnist.open(file)["2560 mlux", "train"]
+    for piece in (*range(40), slice(None), slice(5, 23), slice(11, 22), slice(-1, None)):
+        assert_same_images(a, b, piece)
+
+
+def test_a_part_of_the_levels_and_images_holds_the_same_values(made: tuple[Path, Path], tmp_path: Path) -> None:
+    make(made[0], tmp_path / "out", lux=("2560 mlux",), limit=7)
+    few, all_ = spadmnist.open(tmp_path / "out"), spadmnist.open(made[1])
+    assert few.levels == ("2560 mlux",)
+    for split in ("train", "test"):
+        assert len(few["2560 mlux", split]) == 7
+        assert_same_images(few["2560 mlux", split], all_["2560 mlux", split], slice(0, 7))
+    alone = spadmnist.open(tmp_path / "out" / "config.yaml")
+    assert_same_images(few["2560 mlux", "test"], alone["2560 mlux", "test"], slice(0, 7))
+
+
+def test_another_seed_draws_other_values(made: tuple[Path, Path], tmp_path: Path) -> None:
+    make(made[0], tmp_path / "out", seed=4, limit=12)
+    other, first = spadmnist.open(tmp_path / "out"), spadmnist.open(made[1])
+    a, b = other["2560 mlux", "test"], first["2560 mlux", "test"]
+    assert same(a.images[:], b.images[:]) and not same(a.tr[:], b.tr[:])
+
+
+# --- the same command again ---------------------------------------------------------------------------------------
+
+
+def test_a_finished_dataset_is_left_alone(made: tuple[Path, Path]) -> None:
+    file, root = made
+    before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in root.rglob("*")}
+    outcome = make(file, root)
+    assert (outcome.made, outcome.kept) == (0, 0)
+    assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in root.rglob("*")}
+
+
+class Stop(BaseException):
+    """Interrupts a run."""
+
+
+def interrupted(file: Path, root: Path, after: int) -> None:
+    """Make a dataset, and stop after some shards."""
+    count = iter(range(after))
+
+    def advance(work: float, note: str) -> None:
+        if next(count, None) is None:
+            raise Stop
+
+    with pytest.raises(Stop):
+        make(file, root, progress=Progress(advance=advance))
+
+
+def test_a_run_goes_on_where_it_stopped(made: tuple[Path, Path], tmp_path: Path) -> None:
+    interrupted(made[0], tmp_path / "out", 3)
+    with pytest.raises(SpadError, match="is not finished"):
+        spadmnist.open(tmp_path / "out")
+    outcome = make(made[0], tmp_path / "out")
+    assert (outcome.made, outcome.kept) == (4, 4)
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ({"seed": 9}, "seed"),
+        ({"limit": 9}, "limit"),
+        ({"lux": ("5 mlux",)}, "scene.lux"),
+    ],
+)
+@pytest.mark.parametrize("finished", [True, False])
+def test_another_config_is_refused(
+    change: dict[str, Any], difference: str, finished: bool, made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    root = tmp_path / "out"
+    if finished:
+        shutil.copytree(made[1], root)
+    else:
+        interrupted(made[0], root, 2)
+    before = tree(root)
+    with pytest.raises(SpadError, match=rf"holds another dataset: .*{difference}") as caught:
+        make(made[0], root, **change)
+    assert "\n" not in str(caught.value)
+    assert_same(root, before)
+
+
+def test_an_edited_config_is_refused_by_the_command(made: tuple[Path, Path], tmp_path: Path) -> None:
+    edited = tmp_path / "small.yaml"
+    edited.write_text(made[0].read_text().replace("rate: 100 Hz", "rate: 200 Hz"))
+    before = tree(made[1])
+    result = run("generate", edited, "-o", made[1])
+    assert_sentence(result, "dark_counts.rate", "100 Hz", "200 Hz", "-o")
+    assert len(result.stderr.splitlines()) == 1
+    assert_same(made[1], before)
+
+
+def test_other_versions_do_not_go_on(made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupted(made[0], tmp_path / "out", 2)
+    monkeypatch.setattr(factory, "versions", lambda: {"spadmnist": "9.9.9"})
+    with pytest.raises(SpadError, match="versions"):
+        make(made[0], tmp_path / "out")
+
+
+# --- killed at every step on the disk -----------------------------------------------------------------------------
+#
+# Not a matter of luck: a child process is killed just before its n-th step that changes the disk, for many n.
+# All of it in processes forked from one that has imported everything, so that a kill costs little.
+
+_STEPS = ("mkdir", "rename", "replace", "unlink", "rmdir", "fsync")
+
+
+def _forked(action: Callable[[], Any], die_at: int | None = None) -> int:
+    """Call `action` in a forked process that is killed before step `die_at`; the number of steps, -1 if killed."""
+    read, write = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            count = 0
+            for name in _STEPS:
+
+                def step(*a: Any, _real: Any = getattr(os, name), **k: Any) -> Any:
+                    nonlocal count
+                    count += 1
+                    if count == die_at:
+                        os.kill(os.getpid(), signal.SIGKILL)
+                    return _real(*a, **k)
+
+                setattr(os, name, step)
+            action()
+            os.write(write, str(count).encode())
+            status = 0
+        except BaseException as error:
+            print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
+        finally:
+            os._exit(status)
+    os.close(write)
+    with open(read) as pipe:
+        said = pipe.read()
+    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    if status == -signal.SIGKILL:
+        return -1
+    if status != 0:
+        raise AssertionError(f"the child ended with {status}")
+    return int(said)
+
+
+def hammer(verb: str, format: str, folder: str, kills: int, seed: int) -> None:
+    """Kill `verb` before `kills` of its steps (all of the last 40), do it again, and compare. In a process of its own."""
+    home = Path(folder)
+    file = write_config(home / "c.yaml", format, ("5 mlux", "2560 mlux"), train=12, test=4)
+    few = write_config(home / "few.yaml", format, ("5 mlux", "2560 mlux"), METHODS[:2], train=12, test=4)
+    make(file, home / "expected")
+    expected = tree(home / "expected")
+    make(few, home / "few")
+    root = home / "out"
+
+    def prepare() -> None:
+        shutil.rmtree(root, ignore_errors=True)
+        if verb == "reconstruct":
+            shutil.copytree(home / "few", root)
+        elif verb != "generate":
+            shutil.copytree(home / "expected", root)
+            for victim in random.Random(seed).sample(sorted(expected), 5):
+                (root / victim).write_bytes(b"damaged")
+            (root / "config.yaml").unlink()
+        if verb == "repair manifest":
+            shutil.copy(home / "expected" / "config.yaml", root)
+            (root / "manifest.json").unlink()
+
+    def act() -> None:
+        if verb == "generate":
+            make(file, root)
+        elif verb == "reconstruct":
+            factory.add_reconstructions(root, METHODS, 1)
+        else:
+            damage = verify.verify(root)
+            if damage:
+                verify.repair(root, damage, 1)
+
+    prepare()
+    steps = _forked(act)
+    assert_same(root, expected)
+    rng = random.Random(seed)
+    early = range(1, steps - 40)
+    points = sorted(rng.sample(early, min(kills, len(early)))) + list(range(max(1, steps - 40), steps + 1))
+    wrong = []
+    for at in points:
+        prepare()
+        assert _forked(act, at) == -1
+        try:
+            if verb == "generate":
+                assert_whole_shards(root, expected, format)
+            _forked(act)
+            assert_same(root, expected)
+        except AssertionError as error:
+            wrong.append(f"killed before step {at} of {steps}: {error}")
+    assert not wrong, "\n".join([f"{len(wrong)} of {len(points)}", *wrong[:5], *wrong[-5:]])
+
+
+def assert_whole_shards(root: Path, expected: dict[str, bytes | str], format: str) -> None:
+    """Every shard that is in its place is complete."""
+    base, depth = ("data.zarr", 4) if format == "zarr" else ("data", 4)
+    there = tree(root)
+    shards = {"/".join(n.split("/")[:depth]) for n in there if n.startswith(f"{base}/") and n.count("/") >= depth - 1}
+    for shard in shards:
+        if shard.endswith("zarr.json"):
+            continue
+        mine = {n: c for n, c in there.items() if n == shard or n.startswith(f"{shard}/")}
+        theirs = {n: c for n, c in expected.items() if n == shard or n.startswith(f"{shard}/")}
+        if "empty folder" in mine.values() and len(mine) == 1:
+            continue  # a folder above shards
+        assert mine == theirs, f"{shard} is not complete"
+
+
+def _hammered(verb: str, format: str, folder: Path, kills: int) -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_factory; "
+        f"test_factory.hammer({verb!r}, {format!r}, {str(folder)!r}, {kills}, seed=1)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert result.returncode == 0, result.stderr[-3000:]
+
+
+VERBS = ["generate", "reconstruct", "repair", "repair manifest"]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_killed_at_some_steps_on_the_disk(verb: str, tmp_path: Path) -> None:
+    _hammered(verb, "hdf5", tmp_path, 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", VERBS)
+def test_killed_at_many_steps_on_the_disk(verb: str, format: str, tmp_path: Path) -> None:
+    _hammered(verb, format, tmp_path, 120)
+
+
+# --- killed from outside ------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def running(*arguments: object, **options: Any) -> Iterator[psutil.Popen]:
+    """`spadmnist ARGUMENTS` in a process group of its own, which is killed at the end."""
+    process = psutil.Popen(
+        [COMMAND, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+
+
+def wait_for(condition: Callable[[], bool], seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.003)
+    return condition()
+
+
+def records(root: Path) -> int:
+    """How many shards an unfinished run has noted."""
+    return len(list((root / ".spadmnist" / "shards").rglob("*.json")))
+
+
+def descendants(process: psutil.Process) -> list[psutil.Process]:
+    try:
+        return process.children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def alive(processes: list[psutil.Process]) -> list[str]:
+    left = []
+    for process in processes:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                left.append(" ".join(process.cmdline())[:200])
+    return left
+
+
+def workers(process: psutil.Process) -> list[psutil.Process]:
+    found = []
+    for child in descendants(process):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if "popen_loky" in " ".join(child.cmdline()) and "tracker" not in " ".join(child.cmdline()):
+                found.append(child)
+    return found
+
+
+def strike(process: psutil.Popen, whom: str, number: int = signal.SIGKILL) -> list[psutil.Process]:
+    """Kill the driver, the whole tree or one worker; the descendants there were."""
+    family = descendants(process)
+    if whom == "worker":
+        for victim in workers(process)[:1]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                victim.send_signal(number)
+    elif whom == "tree":
+        os.killpg(process.pid, number)
+    else:
+        os.kill(process.pid, number)
+    return family
+
+
+def kill_and_resume(file: Path, root: Path, expected: dict[str, bytes | str], kills: int, rng: random.Random) -> None:
+    """Kill the same command again and again, from its first to its last moments; then let it end, and compare."""
+    done = 0
+    while done < kills:
+        with running("generate", file, "-o", root, "--jobs", 2) as process:
+            aim = records(root) + rng.choice([0, 1, 1, 2, 3])
+            reached = wait_for(
+                lambda root=root, aim=aim, process=process: records(root) >= aim or process.poll() is not None, 60
+            )
+            assert reached
+            time.sleep(rng.random() * 0.15)
+            if process.poll() is None:
+                done += 1
+                whom = ("driver", "tree", "worker")[done % 3]
+                family = strike(process, whom)
+                if whom != "worker":
+                    process.wait(10)
+                    assert wait_for(lambda family=family: not alive(family), 4), alive(family)
+                    if (root / "data.zarr").exists():
+                        assert_whole_shards(root, expected, "zarr")
+            if process.wait(60) == 0 and not (root / ".spadmnist").exists():
+                assert_same(root, expected)
+                shutil.rmtree(root)
+    result = run("generate", file, "-o", root, "--jobs", 2)
+    assert result.returncode == 0, result.stderr
+    assert_same(root, expected)
+
+
+def test_killed_and_resumed(many: tuple[Path, Path], tmp_path: Path) -> None:
+    kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 6, random.Random(1))
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_many_times(many: tuple[Path, Path], tmp_path: Path) -> None:
+    kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 42, random.Random(2))
+
+
+def test_a_killed_worker_is_replaced(many: tuple[Path, Path], tmp_path: Path) -> None:
+    with running("generate", many[0], "-o", tmp_path / "out", "--jobs", 2) as process:
+        assert wait_for(lambda: records(tmp_path / "out") >= 3, 60)
+        strike(process, "worker")
+        assert process.wait(60) == 0, process.stderr.read()
+    assert_same(tmp_path / "out", tree(many[1]))
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("whom", ["driver", "tree"])
+def test_interrupted_by_a_signal(number: int, status: int, whom: str, many: tuple[Path, Path], tmp_path: Path) -> None:
+    """Ctrl-C goes to the whole group, a batch system's signal to the driver."""
+    root = tmp_path / "out"
+    if whom == "tree" and number == signal.SIGTERM:
+        pytest.skip("workers end as well; the driver's way out is that of the other cases")
+    with running("generate", many[0], "-o", root, "--jobs", 2) as process:
+        assert wait_for(lambda: records(root) >= 2, 60)
+        family = strike(process, whom, number)
+        assert process.wait(15) == status
+        said = process.stderr.read()
+        assert wait_for(lambda: not alive(family), 4), alive(family)
+    assert "Traceback" not in said, said
+    if number == signal.SIGINT:
+        assert "the same command" in said
+    assert not (root / "manifest.json").exists()
+    assert_whole_shards(root, tree(many[1]), "zarr")
+    outcome = make(many[0], root)
+    assert outcome.kept >= 2
+    assert_same(root, tree(many[1]))
+
+
+POISON = '''
+"""An effect that kills the worker which simulates the second level's training images."""
+import os, signal
+from spadmnist import Effect
+
+DRIVER = os.environ.setdefault("TEST_DRIVER", str(os.getpid()))
+
+
+class Poison(Effect, stage="light"):
+    """Kills."""
+
+    def apply(self, rate, conditions):
+        if os.getpid() != int(DRIVER) and len(rate) == 40 and 10e3 < rate.max() < 20e3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return rate
+'''
+
+
+def test_a_task_that_kills_its_worker_is_named_and_the_others_finish(tmp_path: Path) -> None:
+    (tmp_path / "poison.py").write_text(POISON)
+    file = write_config(tmp_path / "c.yaml", more="    poison: {}\n")
+    result = run("generate", file, "-o", tmp_path / "out", "--jobs", 2, "--plugin", tmp_path / "poison.py")
+    assert_sentence(result, "160_mlux/train/00000", "worker")
+    missing = {
+        f"{level}/{split}"
+        for level in ("images", "5_mlux", "160_mlux", "2560_mlux")
+        for split in ("train", "test")
+        if not (tmp_path / "out" / "data.zarr" / level / split / "00000").exists()
+    }
+    assert missing == {"160_mlux/train"}, "the others were not finished"
+
+
+SLOW = '''
+"""An effect that takes its time."""
+import time
+from spadmnist import Effect
+
+
+class Slow(Effect, stage="light"):
+    """Waits."""
+
+    def apply(self, rate, conditions):
+        time.sleep(0.5)
+        return rate
+'''
+
+
+def test_two_writers(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text(SLOW)
+    file = write_config(tmp_path / "c.yaml", more="    slow: {}\n")
+    root = tmp_path / "out"
+    command = ("generate", file, "-o", root, "--jobs", 1, "--plugin", tmp_path / "slow.py")
+    experiment_free = write_config(tmp_path / "other.yaml")
+    with running(*command) as first:
+        assert wait_for(lambda: records(root) >= 1, 60)
+        started = time.monotonic()
+        second = run(*command)
+        took = time.monotonic() - started
+        other = run("generate", experiment_free, "-o", root)
+        assert first.poll() is None, "the first ended too early for this test"
+        assert first.wait(60) == 0
+    assert_sentence(second, "another run")
+    assert took < 4, "2 s on a machine that has nothing else to do"
+    assert_sentence(other, "another dataset")
+    assert not verify_with(root, tmp_path / "slow.py")
+
+
+def verify_with(root: Path, plugin: Path) -> verify.Damage:
+    plugins.load_file(plugin)
+    return verify.verify(root)
+
+
+def test_a_lock_file_that_nobody_holds_does_no_harm(made: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "out" / ".spadmnist").mkdir(parents=True)
+    (tmp_path / "out" / ".spadmnist" / "lock").touch()
+    make(made[0], tmp_path / "out")
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_a_run_that_waited_for_the_end_of_another_one_does_nothing(
+    made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looked before the other one had finished, and takes the lock after."""
+    root = tmp_path / "out"
+    check = factory._check_place
+
+    def meanwhile(*arguments: Any) -> None:
+        check(*arguments)
+        monkeypatch.setattr(factory, "_check_place", check)
+        make(made[0], root)
+
+    monkeypatch.setattr(factory, "_check_place", meanwhile)
+    outcome = make(made[0], root)
+    assert_same(root, tree(made[1]))
+    assert outcome.made == 0
+
+
+# --- bad places ---------------------------------------------------------------------------------------------------
+
+
+def test_what_was_refused_leaves_no_trace(made: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for root in (tmp_path / "foreign", tmp_path / "file"):
+        with pytest.raises(SpadError):
+            make(made[0], root)
+    assert tree(tmp_path) == {"foreign/thesis.tex": b"mine", "file": b"mine"}
+
+
+def test_a_damaged_plan_is_said(made: tuple[Path, Path], tmp_path: Path) -> None:
+    interrupted(made[0], tmp_path / "out", 2)
+    (tmp_path / "out" / ".spadmnist" / "plan.json").write_text("{")
+    with pytest.raises(SpadError, match="damaged"):
+        make(made[0], tmp_path / "out")
+
+
+def test_a_damaged_record_is_made_again(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """A loss of power can leave one that is empty."""
+    interrupted(made[0], tmp_path / "out", 3)
+    for path in (tmp_path / "out" / ".spadmnist" / "shards").rglob("*.json"):
+        path.write_bytes(b"")
+    make(made[0], tmp_path / "out")
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_an_effect_with_blocks_of_images(format: str, tmp_path: Path) -> None:
+    """A third party's generator draws for whole blocks: cutting, resuming and reading alone change nothing."""
+    plugin = tmp_path / "shaken.py"
+    plugin.write_text(
+        textwrap.dedent(
+            '''
+            """An effect that draws."""
+            import numpy as np
+            from spadmnist import Effect
+
+
+            class Shaken(Effect, stage="timing"):
+                """Shifts every stamp a little."""
+
+                def apply(self, events, rng):
+                    shifted = np.clip(events.times + rng.normal(0, 1e-9, len(events.times)), 0, 9.99e-4)
+                    return events.with_times(shifted) if hasattr(events, "with_times") else type(events)(
+                        shifted, events.offsets, events.pixels
+                    )
+            '''
+        )
+    )
+    plugins.load_file(plugin)
+    file = write_config(tmp_path / "c.yaml", format, ("160 mlux",), train=70, test=5, more="    shaken: {}\n")
+    make(file, tmp_path / "out")
+    interrupted(file, tmp_path / "resumed", 2)
+    make(file, tmp_path / "resumed", jobs=2)
+    assert_same(tmp_path / "resumed", tree(tmp_path / "out"))
+    make(file, tmp_path / "few", limit=40)
+    a, b = spadmnist.open(tmp_path / "out"), spadmnist.open(file)
+    few = spadmnist.open(tmp_path / "few")["160 mlux", "train"]
+    for i in (0, 31, 33, 69, slice(None), slice(20, 50)):
+        assert_same_images(a["160 mlux", "train"], b["160 mlux", "train"], i)
+    assert_same_images(few, a["160 mlux", "train"], slice(0, 40))
+    source = json.loads((tmp_path / "out" / "manifest.json").read_text())["plugins"]["shaken.py"]["source"]
+    assert source == plugin.read_text()

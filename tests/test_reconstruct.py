@@ -1,0 +1,321 @@
+"""The six reconstructions: by hand, against the literal ones, and every rule for what has no information."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import algorithm1
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from spadmnist import reconstruct
+from spadmnist.events import Events
+from spadmnist.readout import Recorded
+from spadmnist.reconstruct import Settings, median_of_nonzero
+
+METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
+PAPER = Settings(pdp=0.5, exposure=1e-3, dead_time=50e-9, tick=10e-12, frames=100, frame_time=10e-6)
+
+
+def recorded(
+    counts: Sequence[int] = (),
+    span: Sequence[float] = (),
+    ones: Sequence[int] = (),
+    waited: Sequence[float] = (),
+) -> Recorded:
+    return Recorded(
+        pixels=1,
+        counts=np.array(counts, np.int32),
+        span=np.array(span, float),
+        ones=np.array(ones, np.int32),
+        waited=np.array(waited, float),
+    )
+
+
+def image(name: str, settings_: Settings, data: Recorded) -> tuple[list[float], list[bool]]:
+    """What a dataset stores, and which pixels its manifest counts: each of them alone, and all together."""
+    method = reconstruct.find(name)
+    values, saturated = method.image(data, settings_)
+    assert values.dtype == np.float32
+    assert np.all(np.isfinite(values)) and np.all(values >= 0) and not np.any(np.signbit(values))
+    alone = [method.image(data.images(i, i + 1), settings_) for i in range(len(values))]
+    assert np.array_equal(values, [value for one, _ in alone for value in one])
+    assert sum(number for _, number in alone) == saturated
+    return values.tolist(), [number == 1 for _, number in alone]
+
+
+def close(values: Iterable[float]) -> list[object]:
+    return [pytest.approx(v, rel=1e-6) for v in values]
+
+
+# ---- what they are ----------------------------------------------------------------------------------------
+
+
+def test_the_six_methods() -> None:
+    assert set(METHODS) <= set(reconstruct.Method.registry)
+    units = {name: (reconstruct.find(name).unit, reconstruct.find(name).normalised) for name in METHODS}
+    assert units == {
+        "counts": ("1/s", True),
+        "passive_free_running": ("1/s", True),
+        "inter_photon": ("1/s", True),
+        "str_flux": ("1/s", True),
+        "qis_counts": ("1", False),
+        "qis_linear": ("1", False),
+    }
+    readouts = {name: reconstruct.find(name).readouts() for name in METHODS}
+    assert readouts["counts"] == readouts["passive_free_running"] == readouts["inter_photon"] == ("tr",)
+    assert readouts["str_flux"] == ("str",)
+    assert readouts["qis_counts"] == readouts["qis_linear"] == ("qis",)
+    with pytest.raises(KeyError, match="qis_linear"):
+        reconstruct.find("qis_liner")
+
+
+# ---- by hand ----------------------------------------------------------------------------------------------
+
+HAND = Settings(pdp=0.5, exposure=10.0, dead_time=0.5, tick=0.25, frames=4, frame_time=4.0)
+
+
+def test_counts() -> None:
+    """N / (q T); q = 0.5, T = 10."""
+    values, saturated = image("counts", HAND, recorded(counts=[0, 1, 7, 40]))
+    assert values == close([0, 0.2, 1.4, 8]) and not any(saturated)
+    values, _ = image("counts", PAPER, recorded(counts=[131]))
+    assert values == close([262_000])
+
+
+def test_passive_free_running() -> None:
+    """N / (q (T - N tau_d)): at 10: 10 / (0.5 * 5) = 4. N_max = 20: stored at 19.5: 19.5 / (0.5 * 0.25) = 156."""
+    values, saturated = image("passive_free_running", HAND, recorded(counts=[0, 1, 10, 19, 20, 21, 500]))
+    assert values == close([0, 1 / 4.75, 4, 76, 156, 156, 156])
+    assert saturated == [False, False, False, False, True, True, True]
+    method = reconstruct.find("passive_free_running")
+    function = method.estimate(HAND, np.array([19, 20, 21]))
+    assert function.tolist() == [76.0, math.inf, math.inf]
+    # N_max need not be whole: T / tau_d = 20.5, stored at 20: 20 / (0.5 * 0.25) = 160
+    other = Settings(0.5, 10.25, 0.5, 0.25, 4, 4.0)
+    assert image("passive_free_running", other, recorded(counts=[20, 21])) == (close([160, 160]), [False, True])
+    without = Settings(0.5, 10.0, 0.0, 0.25, 4, 4.0)  # no dead time: as `counts`
+    assert image("passive_free_running", without, recorded(counts=[0, 7, 10**6])) == (
+        close([0, 1.4, 2e5]),
+        [False] * 3,
+    )
+
+
+@pytest.mark.parametrize("exposure", [1e-3, 1e-4, 1e-5, 1e-2, 2e-3])
+@pytest.mark.parametrize("dead_time", [50e-9, 100e-9, 25e-9, 1e-6])
+def test_passive_free_running_where_a_whole_number_of_dead_times_fills_the_exposure(
+    exposure: float, dead_time: float
+) -> None:
+    """N = T / tau_d leaves no live time: saturated, although T - N tau_d may round to 1e-20 s."""
+    most = round(exposure / dead_time)
+    assert exposure / dead_time == pytest.approx(most, rel=1e-12)
+    one = Settings(0.5, exposure, dead_time, 1e-11, 100, exposure / 100)
+    values, saturated = image("passive_free_running", one, recorded(counts=[most - 1, most, most + 1]))
+    half = (most - 0.5) / (0.5 * 0.5 * dead_time)
+    assert saturated == [False, True, True]
+    assert values[1:] == [pytest.approx(half, rel=1e-4)] * 2
+    assert values[0] == pytest.approx((most - 1) / (0.5 * dead_time), rel=1e-4)
+
+
+@pytest.mark.parametrize("most", [0.4, 0.5, 0.75, 1.0])
+def test_a_dead_time_as_long_as_the_exposure_gives_no_negative_flux(most: float) -> None:
+    """One detection is all there can be: whatever stands for it is a positive, finite number."""
+    one = Settings(0.5, 1e-3, 1e-3 / most, 1e-11, 100, 1e-5)
+    values, saturated = image("passive_free_running", one, recorded(counts=[0, 1]))
+    assert values[0] == 0 and values[1] > 0
+    assert saturated == [False, True]
+
+
+def test_inter_photon() -> None:
+    """Stamps 1, 3, 7, tau_d = 0.5, q = 0.5: 2 / (0.5 (6 - 1)) = 0.8."""
+    values, saturated = image("inter_photon", HAND, recorded(counts=[0, 1, 3], span=[0, 0, 6]))
+    assert values == close([0, 0, 0.8]) and not any(saturated)
+    # one dead time apart: the bracket is 0, taken as dt / 2; below 0: (N - 1) dt / 2; above 0, below the bound
+    values, saturated = image("inter_photon", HAND, recorded(counts=[2, 3, 6, 2], span=[0.5, 0.75, 2.75, 0.625]))
+    assert values == close([1 / (0.5 * 0.125), 2 / (0.5 * 0.25), 5 / (0.5 * 0.625), 1 / (0.5 * 0.125)])
+    assert saturated == [True, True, True, False]  # the last one is at the bound, not below it
+    without = Settings(1.0, 10.0, 0.0, 0.25, 4, 4.0)
+    assert image("inter_photon", without, recorded(counts=[2, 2], span=[0.0, 2.0])) == (
+        close([8, 0.5]),
+        [True, False],
+    )
+
+
+def test_str_flux() -> None:
+    """Stamps 1, none (4), 3, none (4), q = 0.5: 2 / (0.5 * 12) = 1 / 3."""
+    values, saturated = image("str_flux", HAND, recorded(ones=[0, 2, 4], waited=[16.0, 12.0, 2.0]))
+    assert values == close([0, 1 / 3, 4]) and not any(saturated)
+    # every stamp 0: dt / 2 each, 4 / (0.5 * 4 * 0.125)
+    assert image("str_flux", HAND, recorded(ones=[4], waited=[0.0])) == (close([16]), [True])
+
+
+def test_qis_counts() -> None:
+    assert image("qis_counts", HAND, recorded(ones=[0, 3, 4])) == ([0, 3, 4], [False] * 3)
+
+
+def test_qis_linear() -> None:
+    """-M ln(1 - S / M); S = M is taken as M - 1/2."""
+    values, saturated = image("qis_linear", HAND, recorded(ones=[0, 2, 3, 4]))
+    assert values == close([0, 4 * math.log(2), 4 * math.log(4), 4 * math.log(8)])
+    assert saturated == [False, False, False, True]
+    one = Settings(0.5, 10.0, 0.5, 0.25, 1, 4.0)
+    assert image("qis_linear", one, recorded(ones=[0, 1])) == (close([0, math.log(2)]), [False, True])
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_no_pixels_and_no_detections(name: str) -> None:
+    assert image(name, PAPER, recorded()) == ([], [])
+    dark = recorded(counts=[0] * 5, span=[0.0] * 5, ones=[0] * 5, waited=[1e-3] * 5)
+    assert image(name, PAPER, dark) == ([0.0] * 5, [False] * 5)
+
+
+# ---- against the literal ones -----------------------------------------------------------------------------
+
+
+@st.composite
+def rows(draw: st.DrawFn) -> tuple[Settings, list[list[int]], list[list[int]]]:
+    """Settings, TR stamps and STR stamps (ticks, `none` for no detection) of some pixels."""
+    tick = draw(st.sampled_from([1e-11, 1e-9, 0.25]))
+    frames = draw(st.sampled_from([1, 3, 8, 100]))
+    none = draw(st.sampled_from([2, 7, 1000]))
+    frame_time = none * tick
+    exposure = frames * frame_time
+    dead_time = draw(st.sampled_from([0.0, 0.3, 2.0, 2.5, exposure / tick / 3])) * tick
+    pdp = draw(st.sampled_from([0.5, 1.0, 0.2]))
+    pixels = draw(st.integers(1, 5))
+    tr, stamps = [], []
+    for _ in range(pixels):
+        gaps = draw(st.lists(st.integers(0, 4 * none), max_size=12))
+        running = np.cumsum(gaps) + draw(st.integers(0, 5)) if gaps else np.zeros(0, int)
+        tr.append([int(t) for t in running if t <= frames * none])
+        waits = st.sampled_from([0, 0, 1, none - 1, none, none])
+        stamps.append(draw(st.one_of(st.just([0] * frames), st.lists(waits, min_size=frames, max_size=frames))))
+    return Settings(pdp, exposure, dead_time, tick, frames, frame_time), tr, stamps
+
+
+@settings(max_examples=400, deadline=None, derandomize=True)
+@given(rows())
+def test_the_literal_reconstructions(case: tuple[Settings, list[list[int]], list[list[int]]]) -> None:
+    one, tr, stamps = case
+    none = round(one.frame_time / one.tick)
+    offsets = np.concatenate([[0], np.cumsum([len(t) for t in tr])]).astype(np.int64)
+    ticks = np.array([t for row in tr for t in row], np.uint32)
+    events = Events(None, offsets, 1, ticks, one.tick)
+    bits = [[int(t < none) for t in row] for row in stamps]
+    ones = [sum(row) for row in bits]
+    waited = [sum(t for t in row if t < none) * one.tick + row.count(none) * one.frame_time for row in stamps]
+    span = [(row[-1] - row[0]) * one.tick if len(row) > 1 else 0.0 for row in tr]
+    data = recorded(events.counts.tolist(), span, ones, waited)
+    q, dead = one.pdp, one.dead_time
+    seconds = [[t * one.tick for t in row] for row in tr]
+    waits = [[t * one.tick if t < none else one.frame_time for t in row] for row in stamps]
+    numbers = [len(row) for row in tr]
+    full = [dead > 0 and n * dead > one.exposure * (1 - 1e-12) for n in numbers]
+    expected: dict[str, tuple[list[float], list[bool]]] = {
+        "counts": ([algorithm1.counts(n, q, one.exposure) for n in numbers], [False] * len(tr)),
+        "inter_photon": (
+            [algorithm1.inter_photon(row, q, dead, one.tick) for row in seconds],
+            [algorithm1.inter_photon_is_bounded(row, dead, one.tick) for row in seconds],
+        ),
+        "str_flux": (
+            [algorithm1.str_flux(row, q, one.frame_time, one.tick) for row in waits],
+            [sum(row) == 0 for row in waits],
+        ),
+        "qis_counts": ([float(algorithm1.qis_counts(row)) for row in bits], [False] * len(tr)),
+        "qis_linear": (
+            [algorithm1.qis_linear(row) for row in bits],
+            [sum(row) == one.frames for row in bits],
+        ),
+    }
+    if not any(abs(n * dead - one.exposure) < 1e-9 * one.exposure for n in numbers):  # see above
+        expected["passive_free_running"] = (
+            [algorithm1.stored_passive_free_running(n, q, one.exposure, dead) for n in numbers],
+            full,
+        )
+    for name, (values, saturated) in expected.items():
+        got, where = image(name, one, data)
+        assert got == close(values), name
+        if name != "inter_photon":
+            assert where == saturated, name
+        else:  # at the bound itself, rounding decides; the value is the same
+            for i, row in enumerate(seconds):
+                least = (len(row) - 1) * one.tick / 2
+                live = row[-1] - row[0] - (len(row) - 1) * dead if row else 0.0
+                assert where[i] == saturated[i] or math.isclose(live, least, rel_tol=1e-6), name
+
+
+def test_large_batches_are_worked_out_in_pieces() -> None:
+    """The same numbers whatever lies beside them."""
+    rng = np.random.default_rng(3)
+    n = 100_000
+    counts = rng.poisson(0.7, n)
+    span = np.where(counts > 1, rng.random(n) * 1e-3, 0.0)
+    ones = np.minimum(rng.poisson(3, n), 100)
+    waited = np.where(ones > 0, rng.random(n) * 1e-3, 1e-3)
+    big = recorded(counts.tolist(), span.tolist(), ones.tolist(), waited.tolist())
+    for name in METHODS:
+        whole, saturated = reconstruct.find(name).image(big, PAPER)
+        for a, b in ((0, 1), (32_767, 32_769), (99_990, n)):
+            part, _ = reconstruct.find(name).image(big.images(a, b), PAPER)
+            assert part.tobytes() == whole[a:b].tobytes()
+        pieces = [reconstruct.find(name).image(big.images(a, a + 10_000), PAPER) for a in range(0, n, 10_000)]
+        assert sum(number for _, number in pieces) == saturated
+
+
+# ---- the training median ----------------------------------------------------------------------------------
+
+
+def _cut(values: np.ndarray, cuts: Sequence[int]) -> list[np.ndarray]:
+    return np.split(values, sorted(c % (len(values) + 1) for c in cuts))
+
+
+def _expected_median(values: np.ndarray) -> float | None:
+    """numpy's, of the float32 values in double precision."""
+    kept = values[values != 0].astype(np.float64)
+    return float(np.median(kept)) if len(kept) else None
+
+
+floats = st.one_of(
+    st.just(0.0),
+    st.sampled_from([1.0, 2.0, 1.0 + 2.0**-23, 2.0**127, 2.0**-149, 2.0**-126 - 2.0**-149, 65536.0]),
+    st.floats(0, 2.0**127, width=32),
+)
+
+
+@settings(max_examples=400, deadline=None, derandomize=True)
+@given(
+    hnp.arrays(np.float32, st.integers(0, 40), elements=floats),
+    st.lists(st.integers(0, 1000), max_size=4),
+)
+def test_median_of_nonzero(values: np.ndarray, cuts: list[int]) -> None:
+    """Odd and even numbers, ties, denormals, nothing but zeros; in any chunks, of any shape."""
+    parts = [np.abs(p) for p in _cut(values, cuts)]
+    values = np.abs(values)
+    assert median_of_nonzero(lambda: iter(parts)) == _expected_median(values)
+    if len(values) % 2 == 0:
+        assert median_of_nonzero(lambda: [values.reshape(2, -1)]) == _expected_median(values)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 1000, 1001, 70_000])
+def test_median_of_nonzero_of_many(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for values in (
+        rng.lognormal(10, 2, n).astype(np.float32),
+        rng.poisson(1.5, n).astype(np.float32) / np.float32(0.0005),
+        (rng.random(n) < 0.3).astype(np.float32),
+        np.float32(1) + rng.random(n).astype(np.float32) * np.float32(2**-16),  # one upper half, many lower
+    ):
+        for chunk in (1 << 14, 777):
+            chunks = [values[i : i + chunk] for i in range(0, n, chunk)]
+            assert median_of_nonzero(lambda chunks=chunks: iter(chunks)) == _expected_median(values)  # type: ignore[misc]
+
+
+def test_median_of_nothing() -> None:
+    assert median_of_nonzero(lambda: []) is None
+    assert median_of_nonzero(lambda: [np.zeros(0, np.float32), np.zeros((3, 2), np.float32)]) is None
+    assert median_of_nonzero(lambda: [np.array([0, 5, 0], np.float32)]) == 5.0
+    assert median_of_nonzero(lambda: [np.array([0, 5], np.float32), np.array([[4]], np.float32)]) == 4.5
