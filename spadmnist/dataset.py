@@ -28,7 +28,7 @@ from .errors import InputError, SpadError
 from .events import Events
 from .images import Images
 from .readout import Frames, Recorded, summarised
-from .reconstruct import median_of_nonzero
+from .reconstruct import medians_of_nonzero
 from .store import Column, Files, ShardReader
 
 FORMAT = "spadmnist-dataset/1"
@@ -454,20 +454,23 @@ class Part:
 
     tr: `Events` of an image's pixels, row by row; qis: (frames, rows, columns) uint8; str: (frames, rows, columns)
     float64, s, the frame time where there is no detection; reconstruction: by method; images: the originals;
-    labels: (n,) uint8, or None where the source has none. Colour adds a leading channel axis.
+    labels: (n,) uint8, or None where the source has none; readouts: what was recorded; stored: read from a dataset,
+    or simulated when it is asked for. Colour adds a leading channel axis.
     """
 
     def __init__(
         self,
         length: int,
         backend: _Backend,
+        stored: bool,
         readouts: Sequence[str],
         methods: Sequence[str],
         shape: tuple[int, ...],
     ):
         self._length = length
         self._backend = backend
-        self._readouts = tuple(readouts)
+        self.stored = stored
+        self.readouts = tuple(readouts)
         self.shape = shape
         self.reconstruction: Mapping[str, Reconstruction] = {
             name: Reconstruction(length, backend, name) for name in methods
@@ -478,11 +481,18 @@ class Part:
         return self._length
 
     def __repr__(self) -> str:
-        return f"Part({self._length} images of {self.shape}, {', '.join(self._readouts)})"
+        return f"Part({self._length} images of {self.shape}, {', '.join(self.readouts)})"
 
     @cached_property
     def labels(self) -> np.ndarray | None:
         return self._backend.labels()
+
+    @property
+    def frames(self) -> Field[Frames]:
+        """QIS and STR as they are stored: bits packed, and the stamps of those that are set."""
+        what: Any = "str" if "str" in self.readouts else "qis"
+        self._recorded(what)
+        return Field(self._length, lambda a, b: self._backend.recorded(a, b, what), _same)
 
     @property
     def tr(self) -> Field[Events]:
@@ -507,8 +517,8 @@ class Part:
         return np.moveaxis(dense, 2, 1) if len(self.shape) == 3 else dense
 
     def _recorded(self, readout: Any) -> None:
-        if readout not in self._readouts:
-            raise SpadError(f"{readout} was not recorded here; there are {', '.join(self._readouts)}")
+        if readout not in self.readouts:
+            raise SpadError(f"{readout} was not recorded here; there are {', '.join(self.readouts)}")
 
 
 class Dataset:
@@ -659,18 +669,24 @@ class _Simulated:
         values, _ = reconstruct.find(method).image(self._make(start, stop), self._experiment.settings)
         return values.reshape(-1, *self._splits[self._split].pixels.shape[1:])
 
-    def normalisation(self, method: str) -> float | None:
+    @cached_property
+    def _normalisations(self) -> dict[str, float | None]:
+        """All methods in one go: the training split is simulated twice, whatever their number."""
         split = next(iter(self._splits))
         images = self._splits[split]
-        one = reconstruct.find(method)
+        methods = {name: reconstruct.find(name) for name in self._experiment.methods}
+        wanted = self._experiment.wanted(images)
 
-        def chunks() -> Iterator[np.ndarray]:
-            for start in range(0, self._experiment.wanted(images), 256):
-                stop = min(start + 256, self._experiment.wanted(images))
-                made = self._experiment.simulate(self._level, split, images, start, stop)
-                yield one.image(made, self._experiment.settings)[0]
+        def chunks() -> Iterator[dict[str, np.ndarray]]:
+            for start in range(0, wanted, 256):
+                made = self._experiment.simulate(self._level, split, images, start, min(start + 256, wanted))
+                settings = self._experiment.settings
+                yield {name: m.image(made, settings)[0] for name, m in methods.items() if m.normalised}
 
-        return median_of_nonzero(chunks)
+        return medians_of_nonzero(chunks)
+
+    def normalisation(self, method: str) -> float | None:
+        return self._normalisations[method]
 
     def originals(self, start: int, stop: int) -> np.ndarray:
         return self._splits[self._split].pixels[start:stop]
@@ -703,7 +719,7 @@ def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset
     def part(level: Level, split: str) -> Part:
         backend = _Simulated(experiment, level, split, splits)
         length = experiment.wanted(splits[split])
-        return Part(length, backend, experiment.readouts, experiment.methods, shape)
+        return Part(length, backend, False, experiment.readouts, experiment.methods, shape)
 
     sizes = {split: experiment.wanted(images) for split, images in splits.items()}
     return Dataset(experiment.levels, sizes, part, experiment.name)
@@ -730,9 +746,10 @@ def stored(root: Path) -> Dataset:
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
         backend = _Stored(root, manifest["config"]["output"]["format"], mine, originals, own)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
-        return Part(manifest["images"]["splits"][split]["images"], backend, readouts, methods, shape)
+        return Part(manifest["images"]["splits"][split]["images"], backend, True, readouts, methods, shape)
 
-    sizes = {split: facts["images"] for split, facts in manifest["images"]["splits"].items()}
+    order = dict.fromkeys(shard.split for shard in shards)
+    sizes = {split: manifest["images"]["splits"][split]["images"] for split in order}
     return Dataset(levels, sizes, part, str(root))
 
 

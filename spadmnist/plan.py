@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +14,7 @@ from .config import Experiment
 from .images import Images
 
 _PROBE = 64  # images a level
+_LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _BESIDES_ENCODING = 1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
 
 
@@ -55,8 +54,8 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
         "total": total,
         "jobs": jobs,
         "shards": len(dataset.shards_of(experiment, splits)),
-        # streams, scratch and what the interpreter and its libraries take
-        "memory_per_worker": int(3 * largest + _resident()),
+        # streams, scratch and encoded bytes of a shard; interpreter, libraries and compiled kernels
+        "memory_per_worker": int(4 * largest) + _LIBRARIES,
     }
 
 
@@ -102,11 +101,6 @@ def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tu
     columns |= dataset.reconstruction_columns(experiment, made, pixels.shape[1:])
     size = store.encoded_size(columns, experiment.format)
     return count, time.perf_counter() - started, size
-
-
-def _resident() -> int:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def text(estimated: Mapping[str, Any], root: Path) -> str:

@@ -6,7 +6,7 @@ Each method is one class; `spadmnist methods` lists them. A method sees only per
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -205,31 +205,46 @@ def find(name: str) -> Method:
 
 
 def median_of_nonzero(chunks: Callable[[], Iterable[np.ndarray]]) -> float | None:
-    """The exact median of all non-zero values (float32, not negative), in memory that does not grow with their number.
+    """The median of all non-zero values; see `medians_of_nonzero`."""
+    return medians_of_nonzero(lambda: ({"": chunk} for chunk in chunks()))[""]
 
-    chunks: gives the values anew at each call, in any order; it is called twice. Non-negative floats are ordered as
-    their bits are, so the upper and then the lower 16 bits of the two middle values are found by counting.
-    Returns None where every value is zero.
+
+def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]]) -> dict[str, float | None]:
+    """Exact medians of the non-zero values (float32, not negative), in memory that does not grow with their number.
+
+    chunks: gives the values anew at each call, in any order, as arrays by name; it is called twice. Non-negative
+    floats are ordered as their bits are, so the upper and then the lower 16 bits of the two middle values are found
+    by counting. None where every value is zero.
     """
-    upper = np.zeros(1 << 16, np.int64)
+    upper: dict[str, np.ndarray] = {}
     for chunk in chunks():
-        bits = np.ascontiguousarray(chunk, np.float32).view(np.uint32).ravel()
-        upper += np.bincount(bits[bits != 0] >> 16, minlength=1 << 16)
-    total = int(upper.sum())
-    if total == 0:
-        return None
-    ranks = sorted({(total - 1) // 2, total // 2})
-    running = np.cumsum(upper)
-    bins = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
-    lower = {b: np.zeros(1 << 16, np.int64) for b in bins}
+        for name, values in chunk.items():
+            counted = upper.setdefault(name, np.zeros(1 << 16, np.int64))
+            counted += np.bincount(_bits_of_nonzero(values) >> 16, minlength=1 << 16)
+    # for each name the ranks of the two middle values, as (bin of the upper bits, rank within it)
+    wanted: dict[str, list[tuple[int, int]]] = {}
+    for name, counted in upper.items():
+        running = np.cumsum(counted)
+        total = int(running[-1])
+        ranks = [(total - 1) // 2, total // 2] if total else []
+        bins = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
+        wanted[name] = [(b, rank - int(running[b] - counted[b])) for b, rank in zip(bins, ranks, strict=True)]
+    lower = {(name, b): np.zeros(1 << 16, np.int64) for name, pairs in wanted.items() for b, _ in pairs}
     for chunk in chunks():
-        bits = np.ascontiguousarray(chunk, np.float32).view(np.uint32).ravel()
-        bits = bits[bits != 0]
-        for b, counted in lower.items():
-            counted += np.bincount(bits[bits >> 16 == b] & 0xFFFF, minlength=1 << 16)
-    middle: list[Any] = []
-    for rank, b in zip(ranks, bins, strict=True):
-        inside = rank - (int(running[b - 1]) if b else 0)
-        low = int(np.searchsorted(np.cumsum(lower[b]), inside, side="right"))
-        middle.append(float(np.array([(b << 16) | low], np.uint32).view(np.float32)[0]))
-    return sum(middle) / len(middle)
+        for name, values in chunk.items():
+            bits = _bits_of_nonzero(values)
+            for b in {b for b, _ in wanted[name]}:
+                lower[name, b] += np.bincount(bits[bits >> 16 == b] & 0xFFFF, minlength=1 << 16)
+    medians: dict[str, float | None] = {}
+    for name, pairs in wanted.items():
+        middle = []
+        for b, rank in pairs:
+            low = int(np.searchsorted(np.cumsum(lower[name, b]), rank, side="right"))
+            middle.append(float(np.array([(b << 16) | low], np.uint32).view(np.float32)[0]))
+        medians[name] = sum(middle) / len(middle) if middle else None
+    return medians
+
+
+def _bits_of_nonzero(values: np.ndarray) -> np.ndarray:
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32).ravel()
+    return bits[bits != 0]

@@ -325,36 +325,22 @@ def _show(part: Part, indices: Sequence[int]) -> _Shown:
 
 def _show_one(part: Part, index: int, medians: Mapping[str, float | None]) -> _Shown:
     readouts: dict[str, Any] = {}
-    if _recorded(part, "tr"):
+    if "tr" in part.readouts:
         events = part.tr[index]
         readouts["counts"] = events.counts.reshape(part.shape)
         readouts["first"] = _first_times(events).reshape(part.shape)
-    if _recorded(part, "qis") or _recorded(part, "str"):
-        frames = _packed(part, index)
+    if "qis" in part.readouts or "str" in part.readouts:
+        frames = part.frames[index]  # packed: unpacked, those of a large sensor would fill the memory
         readouts["frame_time"] = frames.frame_time
-        if _recorded(part, "qis"):
+        if "qis" in part.readouts:
             readouts["bits"] = (frames.bits[:, 0] >> 7).reshape(part.shape)
             readouts["ones"] = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int64).reshape(part.shape)
-        if _recorded(part, "str"):
+        if "str" in part.readouts:
             readouts["waited"] = _mean_wait(frames).reshape(part.shape)
     fluxes = {}
     for method, median in medians.items():
         fluxes[method] = part.reconstruction[method][index] / np.float32(median or 1)
     return _Shown(part.images[index], fluxes, **readouts)
-
-
-def _recorded(part: Part, readout: str) -> bool:
-    try:
-        getattr(part, readout)
-    except SpadError:
-        return False
-    return True
-
-
-def _packed(part: Part, index: int) -> Frames:
-    """The frames of an image as bits: unpacked, those of a large sensor would fill the memory."""
-    frames: Frames = part._backend.recorded(index, index + 1, "str" if _recorded(part, "str") else "qis")
-    return frames
 
 
 def _first_times(events: Events) -> np.ndarray:
@@ -376,7 +362,7 @@ def _mean_wait(frames: Frames) -> np.ndarray:
 
 def _at_hand(part: Part) -> int:
     """How many training images a median rests on: all, unless all would have to be simulated for it."""
-    if not isinstance(part._backend, datasets._Simulated):
+    if part.stored:
         return len(part)
     return min(len(part), max(1, _PIXELS_AT_HAND // math.prod(part.shape)))
 

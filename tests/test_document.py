@@ -25,9 +25,7 @@ def problems(text: str) -> tuple[str, ...]:
     with pytest.raises(ConfigError) as caught:
         document.parse(text, "f.yaml")
     assert time.process_time() - started < 1
-    assert caught.value.problems and all(
-        p.startswith("f.yaml") and "\n" not in p for p in caught.value.problems
-    )
+    assert caught.value.problems and all(p.startswith("f.yaml") and "\n" not in p for p in caught.value.problems)
     return caught.value.problems
 
 
@@ -99,9 +97,7 @@ def test_a_directive_does_not_bring_version_1_1_back() -> None:
         ("- {x: 1}\n- {x: 1, y: 2,\n   x: 3}\n", 2, 3, "x"),
     ],
 )
-def test_a_key_that_stands_twice_is_refused_with_both_lines(
-    text: str, first: int, second: int, key: str
-) -> None:
+def test_a_key_that_stands_twice_is_refused_with_both_lines(text: str, first: int, second: int, key: str) -> None:
     (problem,) = problems(text)
     assert problem.startswith(f"f.yaml:{second}: ") and f"line {first}" in problem and f" {key} " in problem
 
@@ -221,9 +217,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     unreadable(tmp_path / ("x" * 300))
 
 
-@pytest.mark.parametrize(
-    "raw", [b"\x89PNG\r\n\x1a\n\x00\x00", b"\x00" * 1000, b"\xff\xfea\x00:\x00", b"a: \xe9\n"]
-)
+@pytest.mark.parametrize("raw", [b"\x89PNG\r\n\x1a\n\x00\x00", b"\x00" * 1000, b"\xff\xfea\x00:\x00", b"a: \xe9\n"])
 def test_a_binary_file_is_refused(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "c.yaml"
     path.write_bytes(raw)
@@ -379,9 +373,7 @@ def test_numbers_are_written_exactly(number: float) -> None:
     round_trip({"a": number, "b": [number]})
 
 
-@pytest.mark.parametrize(
-    "value", [{"a": {}}, {"a": []}, {"a": [[]]}, {"a": [{}]}, {"a": {"b": {}}}, {"a": {"b": []}}]
-)
+@pytest.mark.parametrize("value", [{"a": {}}, {"a": []}, {"a": [[]]}, {"a": [{}]}, {"a": {"b": {}}}, {"a": {"b": []}}])
 def test_empty_collections(value: dict[str, Any]) -> None:
     round_trip(value)
 

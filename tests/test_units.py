@@ -130,9 +130,7 @@ def test_spellings(text: str, value: float) -> None:
     assert units.parse(text, "s") == value
 
 
-@pytest.mark.parametrize(
-    ("value", "number"), [(0.5, 0.5), (1, 1.0), ("0.25", 0.25), ("50%", 0.5), ("50 %", 0.5)]
-)
+@pytest.mark.parametrize(("value", "number"), [(0.5, 0.5), (1, 1.0), ("0.25", 0.25), ("50%", 0.5), ("50 %", 0.5)])
 def test_what_has_no_dimension_is_bare_or_in_per_cent(value: object, number: float) -> None:
     assert units.parse(value, "") == number
 
