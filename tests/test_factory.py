@@ -141,7 +141,7 @@ def made(format: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, P
 def many(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """As `made`, with twelve shards, some of which take a tenth of a second."""
     home = tmp_path_factory.mktemp("many")
-    file = write_config(home / "many.yaml", levels=LEVELS, train=1500, test=300)
+    file = write_config(home / "many.yaml", levels=LEVELS, train=800, test=200)
     make(file, home / "out")
     return file, home / "out"
 
@@ -401,7 +401,7 @@ def _forked(action: Callable[[], Any], die_at: int | None = None) -> int:
 
 
 def hammer(verb: str, format: str, folder: str, kills: int, seed: int) -> None:
-    """Kill `verb` before `kills` of its steps and all of the last 30, do it again, and compare."""
+    """Kill `verb` before `kills` of its steps and the last ones, do it again, and compare."""
     home = Path(folder)
     file = write_config(home / "c.yaml", format, ("5 mlux", "2560 mlux"), train=12, test=4)
     few = write_config(home / "few.yaml", format, ("5 mlux", "2560 mlux"), METHODS[:2], train=12, test=4)
@@ -438,7 +438,9 @@ def hammer(verb: str, format: str, folder: str, kills: int, seed: int) -> None:
     assert_same(root, expected)
     rng = random.Random(seed)
     early = range(1, steps - 30)
-    points = sorted(rng.sample(early, min(kills, len(early)))) + list(range(max(1, steps - 30), steps + 1))
+    points = sorted(rng.sample(early, min(kills, len(early))))
+    late = range(max(1, steps - 30), steps + 1)
+    points += sorted(rng.sample(late, 10)) if kills < 20 else late
     wrong = []
     for at in points:
         prepare()
@@ -482,7 +484,7 @@ VERBS = ["generate", "reconstruct", "repair", "repair manifest"]
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_killed_at_some_steps_on_the_disk(verb: str, tmp_path: Path) -> None:
-    _hammered(verb, "hdf5", tmp_path, 10)
+    _hammered(verb, "hdf5", tmp_path, 8)
 
 
 @pytest.mark.slow
@@ -678,7 +680,7 @@ class Slow(Effect, stage="light"):
     """Waits."""
 
     def apply(self, rate, conditions):
-        time.sleep(0.5)
+        time.sleep(0.3)
         return rate
 '''
 
@@ -706,6 +708,30 @@ def test_two_writers(tmp_path: Path) -> None:
 def verify_with(root: Path, plugin: Path) -> verify.Damage:
     plugins.load_file(plugin)
     return verify.verify(root)
+
+
+@pytest.mark.parametrize("left", ["all", "records"])
+def test_what_a_kill_left_beside_a_finished_dataset_does_no_harm(left: str, tmp_path: Path) -> None:
+    """Killed between the manifest and the removal of the state, or in the middle of that removal."""
+    few = write_config(tmp_path / "few.yaml", methods=METHODS[:2])
+    make(few, tmp_path / "out")
+    rmtree, state = shutil.rmtree, tmp_path / "out" / ".spadmnist"
+
+    def stopped(path: Any, *arguments: Any, **options: Any) -> None:
+        if Path(path) == state:
+            if left == "records":
+                (state / "plan.json").unlink()
+            raise Stop
+        rmtree(path, *arguments, **options)
+
+    rmtree(tmp_path / "out")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(shutil, "rmtree", stopped)
+        make(few, tmp_path / "out")
+    assert (tmp_path / "out" / "manifest.json").exists()
+    factory.add_reconstructions(tmp_path / "out", METHODS[2:], 1)
+    make(write_config(tmp_path / "all.yaml"), tmp_path / "expected")
+    assert_same(tmp_path / "out", tree(tmp_path / "expected"))
 
 
 def test_a_lock_file_that_nobody_holds_does_no_harm(made: tuple[Path, Path], tmp_path: Path) -> None:
@@ -769,18 +795,14 @@ def test_an_effect_with_blocks_of_images(format: str, tmp_path: Path) -> None:
         textwrap.dedent(
             '''
             """An effect that draws."""
-            import numpy as np
             from spadmnist import Effect
 
 
             class Shaken(Effect, stage="timing"):
-                """Shifts every stamp a little."""
+                """Lets the clock run at a speed of its own."""
 
                 def apply(self, events, rng):
-                    shifted = np.clip(events.times + rng.normal(0, 1e-9, len(events.times)), 0, 9.99e-4)
-                    return events.with_times(shifted) if hasattr(events, "with_times") else type(events)(
-                        shifted, events.offsets, events.pixels
-                    )
+                    return type(events)(events.times * rng.uniform(0.5, 1), events.offsets, events.pixels)
             '''
         )
     )

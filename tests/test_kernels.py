@@ -77,7 +77,7 @@ def test_philox_known_answers(counter: list[int], key: list[int], answer: str) -
 word32 = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.tuples(word32, word32, word32, word32), st.tuples(word32, word32))
 def test_philox_is_the_plain_one(counter: tuple[int, ...], key: tuple[int, ...]) -> None:
     assert kernel_philox(counter, key) == philox(counter, key)
@@ -240,7 +240,7 @@ def rows_of(times: np.ndarray, offsets: np.ndarray) -> list[list]:
     return [times[a:b].tolist() for a, b in itertools.pairwise(offsets)]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=120, deadline=None, derandomize=True)
 @given(ragged(), st.data())
 def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None:
     times, offsets = data
@@ -256,7 +256,7 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
     assert np.array_equal(np.concatenate([times, extra])[origin], merged)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=120, deadline=None, derandomize=True)
 @given(ragged(), st.lists(st.sampled_from([0.0, 0.03125, 0.1, 0.25, 3.0]), min_size=8, max_size=8))
 def test_non_paralyzable_and_take(data: tuple[np.ndarray, np.ndarray], dead: list[float]) -> None:
     """Against the loop of the oracle's kind; `pixels` rows share the dead times, image after image."""
@@ -276,7 +276,7 @@ def test_non_paralyzable_and_take(data: tuple[np.ndarray, np.ndarray], dead: lis
     assert rows_of(times[kept], kernels.take(offsets, kept)) == expected
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=120, deadline=None, derandomize=True)
 @given(ragged(), st.sampled_from([np.uint32, np.uint64, np.uint16]))
 def test_row_differences_and_back(data: tuple[np.ndarray, np.ndarray], kind: type) -> None:
     times, offsets = data
@@ -309,7 +309,7 @@ def test_spans(data: tuple[np.ndarray, np.ndarray]) -> None:
     assert span.tolist() == [row[-1] - row[0] if len(row) > 1 else 0.0 for row in plain]
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=250, deadline=None, derandomize=True)
 @given(ragged(most_events=20), st.sampled_from([1, 2, 7, 8, 9, 63, 64, 65, 130]), st.sampled_from([1.0, 0.5]))
 def test_frame_readout(data: tuple[np.ndarray, np.ndarray], frames: int, live: float) -> None:
     """Frames [f P, f P + T_f): bits, and the first moment of each; between frames there is nothing."""
@@ -348,7 +348,7 @@ def test_no_moment_falls_between_two_frames_without_a_gap() -> None:
             assert np.all(np.unpackbits(bits, axis=1).sum(axis=1) <= 1)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=120, deadline=None, derandomize=True)
 @given(hnp.arrays(np.float64, st.integers(0, 30), elements=st.floats(0, 2.0**51)))
 def test_nearest_ticks(x: np.ndarray) -> None:
     out = np.empty(len(x), np.uint64)
@@ -356,7 +356,7 @@ def test_nearest_ticks(x: np.ndarray) -> None:
     assert out.tolist() == [round(value) for value in x.tolist()]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=120, deadline=None, derandomize=True)
 @given(st.data())
 def test_avalanches_against_a_plain_loop(draw: st.DataObject) -> None:
     """Rules of a device: a chain of causes in time order, blindness, frames."""

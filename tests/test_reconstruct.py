@@ -197,7 +197,7 @@ def rows(draw: st.DrawFn) -> tuple[Settings, list[list[int]], list[list[int]]]:
     return Settings(pdp, exposure, dead_time, tick, frames, frame_time), tr, stamps
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=250, deadline=None, derandomize=True)
 @given(rows())
 def test_the_literal_reconstructions(case: tuple[Settings, list[list[int]], list[list[int]]]) -> None:
     one, tr, stamps = case
@@ -286,7 +286,7 @@ floats = st.one_of(
 )
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=250, deadline=None, derandomize=True)
 @given(
     hnp.arrays(np.float32, st.integers(0, 40), elements=floats),
     st.lists(st.integers(0, 1000), max_size=4),
