@@ -224,9 +224,12 @@ class Experiment:
 
     def simulate_block(self, level: Level, split: str, pixels: np.ndarray, white: float, first: int) -> Recorded:
         """As `simulate`, for the images `pixels` whose first has the index `first` (a multiple of the block)."""
-        numbers = np.arange(first, first + len(pixels), dtype=np.uint64)
-        streams = self.streams(level, split, numbers)
-        return self.sensor.expose(self.photons(level, pixels, white), self.conditions, streams, self.readouts)
+        channels = pixels[0].size // self.sensor.layout.pixels
+        # each channel is an image of its own to the sensor
+        numbers = np.arange(first * channels, (first + len(pixels)) * channels, dtype=np.uint64)
+        photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
+        made = self.sensor.expose(photons, self.conditions, self.streams(level, split, numbers), self.readouts)
+        return made.grouped(channels)
 
     @cached_property
     def settings(self) -> Settings:
@@ -256,7 +259,7 @@ class Experiment:
         """Raise InputError where one image holds more than can be simulated. mean_grey: from 0 to 1."""
         brightest = max(self.levels, key=self.white)
         pixels = self.sensor.layout.pixels * channels
-        photons = np.full((1, pixels), self.white(brightest) * mean_grey)
+        photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
         candidates, _ = self.sensor.expected(photons, self.conditions)
         events = float(candidates.sum())
         most = _MOST_EVENTS if self.sensor.is_paper_line else _MOST_STAGED_EVENTS

@@ -110,6 +110,10 @@ class Events:
         times = None if self._times is None else self._times[part]
         return Events(times, offsets - offsets[0], self.pixels, ticks, self.tick)
 
+    def regrouped(self, pixels: int) -> Events:
+        """The same rows with another number of them to an image."""
+        return Events(self._times, self.offsets, pixels, self.ticks, self.tick)
+
     @staticmethod
     def join(parts: list[Events]) -> Events:
         """Several batches, one after the other."""

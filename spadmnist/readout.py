@@ -109,6 +109,18 @@ class Recorded:
             cut(self.waited),
         )
 
+    def grouped(self, planes: int) -> Recorded:
+        """The same rows with `planes` images taken as one: the channels of a colour image."""
+        if planes == 1:
+            return self
+        pixels = self.pixels * planes
+        tr = None if self.tr is None else self.tr.regrouped(pixels)
+        frames = self.frames
+        if frames is not None:
+            first = None if frames.first is None else frames.first.regrouped(pixels)
+            frames = Frames(frames.bits, first, frames.frames, frames.frame_time, pixels)
+        return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited)
+
     @staticmethod
     def join(parts: list[Recorded]) -> Recorded:
         """Several batches, one after the other."""

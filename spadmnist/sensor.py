@@ -137,7 +137,8 @@ class Sensor:
     ) -> Recorded:
         """Simulate images.
 
-        photons: (images, pixels) photons/s on each pixel's active area; streams: of the same images; readouts: of
+        photons: (images, pixels of the layout) photons/s on each pixel's active area (a colour image is one image a
+        channel); streams: of the same images; readouts: of
         `tr`, `str`, `qis`. Where `block` is more than 1 the images are whole blocks. staged: take the staged line
         even where the fused one would serve.
 
@@ -179,10 +180,10 @@ class Sensor:
             conditions.exposure,
             streams.images,
             streams.key("photons and dark counts"),
-            self._hazards(pixels),
+            trap.hazards(pixels) if isinstance(trap, Afterpulsing) else np.zeros(pixels),
             trap.lifetime if isinstance(trap, Afterpulsing) else 0.0,
             streams.key("afterpulsing"),
-            self._per_row(self.dead_times, pixels),
+            self.dead_times,
             tick,
             conditions.frames,
             conditions.frame_time,
@@ -203,16 +204,6 @@ class Sensor:
             recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited)
         return recorded
 
-    def _hazards(self, pixels: int) -> np.ndarray:
-        trap = self.effect("afterpulsing")
-        if not isinstance(trap, Afterpulsing):
-            return np.zeros(pixels)
-        return self._per_row(trap.hazards(self.layout.pixels), pixels)
-
-    def _per_row(self, values: np.ndarray, pixels: int) -> np.ndarray:
-        """A map of the array repeated for the channels of a colour image."""
-        return values if len(values) == pixels else np.tile(values, pixels // len(values))
-
     def _staged(
         self, photons: np.ndarray, conditions: Conditions, streams: Streams, readouts: Collection[str]
     ) -> Recorded:
@@ -220,7 +211,7 @@ class Sensor:
         pixels = photons.shape[1]
         events = self._arrivals(rate, light, conditions, streams)
         events = self._gate(events, conditions)
-        dead_times = np.tile(self._per_row(self.dead_times, pixels), len(photons))
+        dead_times = np.tile(self.dead_times, len(photons))
         framed = "str" in readouts or "qis" in readouts
         if self.rules == "paper":
             candidates = self._with_children(events, conditions, streams, dead_times)

@@ -343,7 +343,7 @@ def test_all_mistakes_are_told_at_once() -> None:
         "sensor.layout.pixel_area", "sensor.effects.dead_tme", "sensor.effects.dark_counts.rte",
         "sensor.effects.afterpulsing.lifetime", "output.format",
     ):  # fmt: skip
-        assert len([p for p in found if re.match(rf"lab\.yaml:\d+: {re.escape(path)}\b", p)]) == 1
+        assert len([p for p in found if re.match(rf"lab\.yaml:\d+: {re.escape(path)}(?![\w.])", p)]) == 1
 
 
 CROSS = [
@@ -608,7 +608,7 @@ def test_sensor_files_that_cannot_be_used(tmp_path: Path) -> None:
     assert "sensors/lab.yaml:7: rows" in problem
     sensor_file(tmp_path, SENSOR + "seed: 1")
     (problem,) = mistakes(text, tmp_path)
-    assert "seed" in problem and "sensors/lab.yaml:15" in problem
+    assert "seed" in problem and "sensors/lab.yaml:16" in problem
     (tmp_path / "sensors" / "lab.yaml").write_text("5\n")
     (problem,) = mistakes(text, tmp_path)
     assert "sensors/lab.yaml" in problem

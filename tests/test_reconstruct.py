@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from spadmnist import reconstruct
 from spadmnist.events import Events
 from spadmnist.readout import Recorded
-from spadmnist.reconstruct import Settings, median_of_nonzero
+from spadmnist.reconstruct import Settings, median_of_nonzero, medians_of_nonzero
 
 METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
 PAPER = Settings(pdp=0.5, exposure=1e-3, dead_time=50e-9, tick=10e-12, frames=100, frame_time=10e-6)
@@ -312,6 +312,18 @@ def test_median_of_nonzero_of_many(n: int) -> None:
         for chunk in (1 << 14, 777):
             chunks = [values[i : i + chunk] for i in range(0, n, chunk)]
             assert median_of_nonzero(lambda chunks=chunks: iter(chunks)) == _expected_median(values)  # type: ignore[misc]
+
+
+def test_medians_of_several_images_at_once() -> None:
+    """Each name on its own, also where one has nothing but zeros."""
+    rng = np.random.default_rng(4)
+    values = {
+        "bright": rng.lognormal(10, 2, 3001).astype(np.float32),
+        "sparse": (rng.random(3001) < 0.01).astype(np.float32) * np.float32(7.5),
+        "dark": np.zeros(3001, np.float32),
+    }
+    chunks = [{name: v[i : i + 500] for name, v in values.items()} for i in range(0, 3001, 500)]
+    assert medians_of_nonzero(lambda: iter(chunks)) == {n: _expected_median(v) for n, v in values.items()}
 
 
 def test_median_of_nothing() -> None:

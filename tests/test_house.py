@@ -1,0 +1,217 @@
+"""The rules of the house: imports go downward only, effects are known by their files, one module talks, one draws."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import spadmnist
+from spadmnist.effects import STAGES, Effect
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "spadmnist"
+MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))}
+
+# a module imports from layers below its own, and within its own only along an arrow
+LAYERS = [
+    {"errors", "units", "streams", "light"},
+    {"document", "plugins", "events", "kernels", "images", "store"},
+    {"effects", "readout"},
+    {"reconstruct", "sensor"},
+    {"config"},
+    {"dataset"},
+    {"factory", "reference"},
+    {"plan", "verify", "report"},
+    {"cli"},
+]
+LEVEL = {name: level for level, layer in enumerate(LAYERS) for name in layer}
+# the line of the paper has a kernel of its own, so the sensor knows the effects that it is made of
+FUSED = {"afterpulsing", "dead_time", "tdc"}
+
+
+def layer_of(file: str) -> str:
+    return Path(file).parts[0].removesuffix(".py")
+
+
+def imports(file: str, with_types: bool = False) -> Iterator[tuple[int, str]]:
+    """(line, dotted name) of all imports of a module, those within functions too, relative ones made absolute."""
+    tree = ast.parse(MODULES[file].read_text())
+    skipped = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and not with_types:
+            skipped |= {id(inner) for inner in ast.walk(node)}
+    package = ["spadmnist", *Path(file).parts[:-1]]
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{stem}.{name.name}") for name in node.names)
+
+
+def ours(name: str) -> str | None:
+    """The layer's member that a dotted name lies in, or None where it is not ours."""
+    parts = name.split(".")
+    return parts[1] if parts[0] == "spadmnist" and len(parts) > 1 and parts[1] in LEVEL else None
+
+
+def test_every_module_has_its_layer() -> None:
+    assert {layer_of(f) for f in MODULES} - {"__init__"} == set(LEVEL)
+
+
+@pytest.mark.parametrize("file", [f for f in MODULES if f != "__init__.py"])
+def test_imports_go_downward(file: str) -> None:
+    level = LEVEL[layer_of(file)]
+    for line, name in imports(file):
+        target = ours(name)
+        if target is not None and target != layer_of(file):
+            assert LEVEL[target] < level, f"{file}:{line} imports {name}, which is not below it"
+
+
+def test_the_package_itself_imports_nothing_of_ours() -> None:
+    assert [name for _, name in imports("__init__.py") if name.startswith("spadmnist")] == []
+
+
+@pytest.mark.parametrize("file", [f for f in MODULES if re.fullmatch(r"effects/(?!__init__).*", f)])
+def test_an_effect_can_be_read_alone(file: str) -> None:
+    allowed = {"events", "plugins", "kernels", "units", "streams", "effects"}
+    for line, name in imports(file, with_types=True):
+        if name.startswith("spadmnist"):
+            assert ours(name) in allowed, f"{file}:{line} imports {name}"
+        else:
+            assert name.split(".")[0] in {"__future__", "numpy", "math", "numba"}, f"{file}:{line} imports {name}"
+    names = {n.removeprefix("spadmnist.effects.").split(".")[0] for _, n in imports(file) if ".effects." in n}
+    assert all(name[:1].isupper() or name == "parameter" for name in names), "an effect imports no other effect"
+
+
+@pytest.mark.parametrize(
+    ("package", "owners"),
+    [
+        ("matplotlib", {"report.py"}),
+        ("click", {"cli.py"}),
+        ("tqdm", {"cli.py"}),
+        ("yaml", {"document.py"}),
+        ("joblib", {"factory.py"}),
+        ("h5py", {"store.py"}),
+        ("pooch", {"images.py"}),
+        ("pydantic", {"config.py", "images.py"}),
+    ],
+)
+def test_a_library_has_its_place(package: str, owners: set[str]) -> None:
+    users = {f for f in MODULES for _, name in imports(f, with_types=True) if name.split(".")[0] == package}
+    assert users <= owners
+
+
+def calls(file: str) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(ast.parse(MODULES[file].read_text())):
+        if isinstance(node, ast.Call):
+            yield node.lineno, ast.unparse(node.func)
+        elif isinstance(node, ast.Raise) and node.exc is not None:
+            yield node.lineno, ast.unparse(node.exc).partition("(")[0]
+
+
+@pytest.mark.parametrize("file", [f for f in MODULES if f != "cli.py"])
+def test_only_the_command_line_prints_or_exits(file: str) -> None:
+    talk = {"print", "input", "exit", "quit", "breakpoint", "sys.exit", "SystemExit", "warnings.warn"}
+    for line, name in calls(file):
+        assert name not in talk, f"{file}:{line} calls {name}"
+        assert not name.startswith(("sys.stdout.write", "sys.stderr.write")), f"{file}:{line} calls {name}"
+
+
+@pytest.mark.parametrize("file", list(MODULES))
+def test_nothing_is_evaluated_and_no_global_random_state_is_used(file: str) -> None:
+    for line, name in calls(file):
+        assert name not in {"eval", "exec", "np.random.seed", "np.random.default_rng", "random.random"}, (
+            f"{file}:{line}"
+        )
+        assert not re.fullmatch(r"np\.random\.[a-z_]+", name), f"{file}:{line} calls {name}"
+
+
+def own_effects() -> set[str]:
+    return {n for n in Effect.registry if Effect.registry.find(n).__module__.startswith("spadmnist.")}
+
+
+@pytest.mark.parametrize("file", list(MODULES))
+def test_there_is_no_list_of_effects(file: str) -> None:
+    """No module but its own names an effect, as text or as a class. A stage may have the name of an effect."""
+    exempt = {Path(file).stem} | (FUSED if file == "sensor.py" else set())
+    words = own_effects() - set(STAGES) - exempt
+    for node in ast.walk(ast.parse(MODULES[file].read_text())):
+        if isinstance(node, ast.Constant):
+            assert node.value not in words, f"{file}:{node.lineno} says {node.value!r}"
+    for line, name in imports(file):
+        found = re.match(r"spadmnist\.effects\.([a-z_]+)\.", name + ".")
+        assert not (found and found.group(1) in own_effects() - exempt - {"parameter"}), f"{file}:{line} imports {name}"
+
+
+@pytest.mark.parametrize("file", list(MODULES))
+def test_no_collection_holds_several_effects(file: str) -> None:
+    """Also where they have the names of stages."""
+    for node in ast.walk(ast.parse(MODULES[file].read_text())):
+        if isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
+            items = node.keys if isinstance(node, ast.Dict) else node.elts
+            named = {i.value for i in items if isinstance(i, ast.Constant)} & own_effects()
+            stages = {i.value for i in items if isinstance(i, ast.Constant)} & set(STAGES)
+            assert len(named - stages) == 0 or file == "sensor.py", f"{file}:{node.lineno} lists {sorted(named)}"
+
+
+@pytest.mark.parametrize("name", spadmnist.__all__)
+def test_public_names_are_there_and_explained(name: str) -> None:
+    assert name in dir(spadmnist)
+    found = getattr(spadmnist, name)
+    assert (found.__doc__ or "").strip() and found.__doc__.strip()[0].isupper()
+
+
+def test_a_name_that_is_not_there() -> None:
+    with pytest.raises(AttributeError, match="no_such_name"):
+        spadmnist.no_such_name  # noqa: B018
+
+
+def public(file: str) -> Iterator[ast.FunctionDef | ast.ClassDef]:
+    for node in ast.parse(MODULES[file].read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node
+
+
+@pytest.mark.parametrize("file", list(MODULES))
+def test_what_is_public_is_explained(file: str) -> None:
+    tree = ast.parse(MODULES[file].read_text())
+    assert ast.get_docstring(tree), f"{file} has no docstring"
+    for node in public(file):
+        assert ast.get_docstring(node), f"{file}:{node.lineno} {node.name} has no docstring"
+
+
+def project_files() -> list[Path]:
+    """Every file that belongs to the project: what git tracks, and what it does not ignore."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    try:
+        listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [ROOT / name for name in listed if (ROOT / name).is_file()]
+
+
+# with a letter in brackets, so that this file does not find itself
+PATHS = r"/[w]ork\b|/[r]oot\b|/[h]ome/[a-z]|/[U]sers/[A-Za-z]"
+HOSTS = r"[p]ypi\.|python[h]osted|[a]naconda\.|index-[u]rl|npm[j]s"
+
+
+def test_no_file_names_a_machine_or_a_registry() -> None:
+    found = []
+    for path in project_files():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue
+        for number, line in enumerate(text.splitlines(), 1):
+            if re.search(rf"(?<![\w.~}}])(?:{PATHS})|{HOSTS}", line):
+                found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()[:100]}")
+    assert not found, "\n".join(found)

@@ -1,0 +1,345 @@
+"""Plug-ins: a class in a file is known by its name as soon as the file is loaded; what is wrong with it is told."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spadmnist import plugins
+from spadmnist.effects import STAGES, Effect
+from spadmnist.errors import EffectError, InputError
+from spadmnist.plugins import ByWavelength, Distribution, MapFile, Parameter
+from spadmnist.reconstruct import Method
+
+HEAD = "from spadmnist import Effect, parameter\n\n\n"
+HALF = (
+    HEAD
+    + '''class HalfLight(Effect, stage="light"):
+    """Half of the light is lost on the way."""
+
+    share = parameter(0.5, "", "share that passes", bounds=(0, 1), off=1.0, per_pixel=True)
+
+    def apply(self, rate, conditions):
+        return rate * self.share
+
+    expected_rate = apply
+'''
+)
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> Iterator[None]:
+    """What a test loads is gone after it."""
+    plugins.discover()
+    effects, methods = dict(Effect.registry.classes), dict(Method.registry.classes)
+    loaded, modules = dict(plugins._loaded), set(sys.modules)
+    yield
+    Effect.registry.classes.clear()
+    Effect.registry.classes.update(effects)
+    Method.registry.classes.clear()
+    Method.registry.classes.update(methods)
+    plugins._loaded.clear()
+    plugins._loaded.update(loaded)
+    for name in set(sys.modules) - modules:
+        if name.startswith("spadmnist_plugin_"):
+            del sys.modules[name]
+
+
+def written(folder: Path, text: str, name: str = "mine.py") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refused(path: Path) -> str:
+    """The one line with which a plug-in file is refused; nothing of it stays."""
+    before = dict(Effect.registry.classes)
+    modules = set(sys.modules)
+    with pytest.raises(EffectError) as caught:
+        plugins.load_file(path)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message
+    assert Effect.registry.classes == before
+    assert path.resolve() not in plugins.loaded_files()
+    assert not [m for m in set(sys.modules) - modules if m.startswith("spadmnist_plugin_")]
+    return message
+
+
+# --- what the package brings ---------------------------------------------------------------------------------------
+
+
+def test_every_file_of_the_folder_is_an_effect() -> None:
+    folder = Path(plugins.__file__).parent / "effects"
+    files = {p.stem for p in folder.glob("*.py")} - {"__init__"}
+    assert files == {n for n in Effect.registry if Effect.registry.find(n).__module__.startswith("spadmnist.")}
+    assert len(files) >= 5
+
+
+@pytest.mark.parametrize("name", list(Effect.registry))
+def test_every_effect_says_what_it_is(name: str) -> None:
+    cls: Any = Effect.registry.find(name)
+    assert cls.name == name and cls.stage in STAGES
+    assert len(cls.summary()) > 20 and "Source:" in cls.__doc__
+    for key, declared in cls.parameters.items():
+        assert declared.name == key and declared.about
+        for value in (declared.default, declared.off, *(declared.search or ())):
+            if value is not None and not isinstance(value, bool):
+                declared.check(value)
+
+
+@pytest.mark.parametrize("name", list(Method.registry))
+def test_every_method_says_what_it_is(name: str) -> None:
+    cls: Any = Method.registry.find(name)
+    assert cls.name == name and "Source:" in cls.__doc__ and cls.columns and cls.unit in ("1/s", "1")
+    assert set(cls.readouts()) <= {"tr", "str", "qis"}
+
+
+def test_the_registry_is_in_order_and_suggests() -> None:
+    assert list(Effect.registry) == sorted(Effect.registry)
+    with pytest.raises(
+        KeyError, match=r"dead_tme is not an effect\. Did you mean dead_time\? \(spadmnist effects lists all\)"
+    ):
+        Effect.registry.find("dead_tme")
+    with pytest.raises(KeyError, match=r"count is not a method\. Did you mean counts\?"):
+        Method.registry.find("count")
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_class_in_a_file_is_an_effect(tmp_path: Path) -> None:
+    path = written(tmp_path, HALF)
+    plugins.load_file(path)
+    assert "half_light" in list(Effect.registry)
+    cls: Any = Effect.registry.find("half_light")
+    assert plugins.source_file(cls) == str(path) and cls.summary() == "Half of the light is lost on the way."
+    assert cls.parameters["share"] == Parameter(
+        0.5, "", "share that passes", bounds=(0, 1), off=1.0, per_pixel=True, name="share"
+    )
+    assert cls().share == 0.5 and cls(share=0.25).apply(np.array([4.0]), None) == [1.0]
+    with pytest.raises(TypeError, match=r"half_light has no parameter shar\. Did you mean share\?"):
+        cls(shar=1)
+    assert plugins.loaded_files()[path] == HALF
+
+
+def test_a_file_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, HALF + "\nopen(__file__ + '.ran', 'a').write('x')\n")
+    plugins.load_file(path)
+    monkeypatch.chdir(tmp_path)
+    plugins.load_file("mine.py")
+    plugins.load_file(tmp_path / "." / "mine.py")
+    assert (tmp_path / "mine.py.ran").read_text() == "x"
+
+
+def test_a_file_may_hold_several(tmp_path: Path) -> None:
+    more = HALF.replace("HalfLight", "Shade2D").removeprefix(HEAD)
+    plugins.load_file(written(tmp_path, HALF + "\n\n" + more))
+    assert {"half_light", "shade2_d"} <= set(Effect.registry) or {"half_light", "shade2d"} <= set(Effect.registry)
+
+
+def test_two_files_of_one_name_are_two_files(tmp_path: Path) -> None:
+    for folder, name in (("a", "HalfLight"), ("b", "ThirdLight")):
+        (tmp_path / folder).mkdir()
+        plugins.load_file(written(tmp_path / folder, HALF.replace("HalfLight", name)))
+    assert {"half_light", "third_light"} <= set(Effect.registry)
+
+
+def test_the_same_name_in_two_files_is_refused_with_both(tmp_path: Path) -> None:
+    first = written(tmp_path, HALF, "first.py")
+    plugins.load_file(first)
+    message = refused(written(tmp_path, HALF + "# another\n", "second.py"))
+    assert str(first) in message and "half_light" in message and "another name" in message
+
+
+def test_a_copy_of_a_file_is_another_file(tmp_path: Path) -> None:
+    """The same text in two places: which of them is meant is not for us to say."""
+    first = written(tmp_path, HALF, "first.py")
+    plugins.load_file(first)
+    assert str(first) in refused(written(tmp_path, HALF, "second.py"))
+
+
+@pytest.mark.parametrize("name", ["DeadTime", "Detection"])
+def test_a_name_of_ours_is_refused(name: str, tmp_path: Path) -> None:
+    message = refused(written(tmp_path, HALF.replace("HalfLight", name)))
+    assert "already there" in message and "effects" in message
+
+
+def test_what_a_file_defined_before_it_failed_is_forgotten(tmp_path: Path) -> None:
+    path = written(tmp_path, HALF + "\n1 / 0\n")
+    assert "half_light" not in refused(path)
+    path.write_text(HALF)
+    plugins.load_file(path)
+    assert "half_light" in set(Effect.registry)
+
+
+LINES = [
+    ("syntax", HEAD + "class A(Effect, stage='light'\n    pass\n", 4, "SyntaxError"),
+    ("indentation", HEAD + "class A(Effect, stage='light'):\npass\n", 5, "IndentationError"),
+    ("raises", HEAD + "x = 1\nraise ValueError('no good')\n", 5, "ValueError: no good"),
+    ("division", HEAD + "def f():\n    return 1 / 0\n\n\nf()\n", 5, "ZeroDivisionError"),
+    ("import", "import spadmnist\nimport no_such_module_at_all\n", 2, "no_such_module_at_all"),
+    ("exits", "import sys\nsys.exit(3)\n", 2, "SystemExit"),
+    ("stage", HALF.replace('"light"', '"lihgt"'), 4, "'lihgt'"),
+    ("no stage", HALF.replace(', stage="light"', ""), 4, "stage"),
+    ("hook", HEAD + "class A(Effect, stage='light'):\n    pass\n", 4, "apply"),
+    ("two hooks", HEAD + "class A(Effect, stage='arrival'):\n    pass\n", 4, "factor and maximum"),
+    ("no function", HEAD + "class A(Effect, stage='gate'):\n    open = 5\n", 4, "open"),
+    ("unit", HALF.replace('0.5, ""', '0.5, "furlong"'), 7, "furlong"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "line", "says"), [x[1:] for x in LINES], ids=[x[0] for x in LINES])
+def test_a_file_that_fails_is_told_with_its_line(text: str, line: int, says: str, tmp_path: Path) -> None:
+    path = written(tmp_path, text)
+    message = refused(path)
+    assert message.startswith(f"{path}:{line}: ") and says in message
+
+
+def test_all_stages_are_told_where_one_is_unknown(tmp_path: Path) -> None:
+    message = refused(written(tmp_path, HALF.replace('stage="light"', 'stage="lite"')))
+    assert all(stage in message for stage in STAGES)
+
+
+def test_an_interrupt_is_no_mistake_of_the_file(tmp_path: Path) -> None:
+    """Ctrl-C while a plug-in is loaded ends the program; it is not the plug-in that is wrong."""
+    with pytest.raises(KeyboardInterrupt):
+        plugins.load_file(written(tmp_path, "raise KeyboardInterrupt\n"))
+
+
+@pytest.mark.parametrize("name", ["missing.py", "folder", "words.txt", "binary.py"])
+def test_a_file_that_is_none(name: str, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "words.txt").write_text("x = 1\n")
+    (tmp_path / "binary.py").write_bytes(b"\xff\xfe\x00x")
+    refused(tmp_path / name)
+
+
+# --- parameters ----------------------------------------------------------------------------------------------------
+
+
+def read(declared: Parameter, raw: Any, base: Path = Path()) -> Any:
+    found: list[tuple[tuple[Any, ...], str]] = []
+    value = plugins.read_value(declared, raw, base, lambda path, sentence: found.append((path, sentence)))
+    return found if found else value
+
+
+BOUNDED = Parameter(1e-9, "s", "", bounds=(0, 1e-6), name="width", per_pixel=True)
+OPEN = Parameter(1e-9, "s", "", bounds=(0, None), open_bounds=True, name="width")
+CAPPED = Parameter(0.0, "", "", bounds=(None, 3.0), name="width")
+
+
+@pytest.mark.parametrize(
+    ("declared", "raw", "value"),
+    [
+        (BOUNDED, "0 s", 0.0),
+        (BOUNDED, "1 us", 1e-6),
+        (OPEN, "1 ps", 1e-12),
+        (CAPPED, 3, 3.0),
+        (CAPPED, -1e9, -1e9),
+        (Parameter(False, "bool", "", name="on"), True, True),
+        (BOUNDED, {"file": "a.npy"}, MapFile(Path("a.npy").resolve())),
+        (BOUNDED, {"normal": {"mean": "5 ns", "sigma": "1 ns"}}, Distribution("normal", (5e-9, 1e-9))),
+        (BOUNDED, {"lognormal": {"median": "5 ns", "sigma": 2}}, Distribution("lognormal", (5e-9, 2.0))),
+        (Parameter(0.5, "", "", by_wavelength=True, name="pdp"), {"700 nm": 0.1, "500 nm": "40 %"},
+         ByWavelength((500e-9, 700e-9), (0.4, 0.1))),
+    ],
+)  # fmt: skip
+def test_a_value_is_read(declared: Parameter, raw: Any, value: Any) -> None:
+    assert read(declared, raw) == value
+
+
+@pytest.mark.parametrize(
+    ("declared", "raw", "says"),
+    [
+        (BOUNDED, "-1 ns", "width is between 0 s and 1 us"),
+        (BOUNDED, "2 us", "width is between 0 s and 1 us"),
+        (OPEN, "0 s", "width is more than 0 s"),
+        (CAPPED, 3.5, "width is at most 3"),
+        (CAPPED, {"500 nm": 1}, "forms"),
+        (OPEN, {"file": "a.npy"}, "one number"),
+        (OPEN, {"normal": {"mean": "1 s", "sigma": "1 s"}}, "one number"),
+        (Parameter(False, "bool", "", name="on"), "yes", "true or false"),
+        (Parameter(False, "bool", "", name="on"), 1, "true or false"),
+    ],
+)
+def test_a_value_out_of_bounds_is_told_what_is_allowed(declared: Parameter, raw: Any, says: str) -> None:
+    ((_, sentence),) = read(declared, raw)
+    assert says in sentence
+
+
+def test_a_table_ends_at_its_ends() -> None:
+    table = ByWavelength((500e-9, 700e-9), (0.4, 0.2))
+    assert table.at(500e-9) == 0.4 and table.at(700e-9) == 0.2 and table.at(600e-9) == pytest.approx(0.3)
+    for outside in (499e-9, 701e-9):
+        with pytest.raises(InputError, match="500 nm to 700 nm"):
+            table.at(outside)
+
+
+def test_a_distribution_is_drawn_by_its_law() -> None:
+    """Means and spreads of 100,000 draws, 5 standard errors wide (false-alarm rate 1e-6)."""
+    n = 100_000
+    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), n, "k")
+    assert abs(normal.mean() - 5e-7) < 5 * 1e-8 / np.sqrt(n) and abs(normal.std() / 1e-8 - 1) < 5 / np.sqrt(2 * n)
+    wide = Parameter(1.0, "Hz", "", bounds=(0, None), per_pixel=True)
+    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), n, "k") / 20.0)
+    assert abs(logs.mean()) < 5 * 2.27 / np.sqrt(n) and abs(logs.std() / 2.27 - 1) < 5 / np.sqrt(2 * n)
+    few = Distribution(
+        "mixture", (), ((0.97, Distribution("normal", (1.0, 0.0))), (0.03, Distribution("normal", (9.0, 0.0))))
+    )
+    mixed = plugins.settle(wide, few, n, "k")
+    assert set(np.unique(mixed)) == {1.0, 9.0}
+    assert abs((mixed == 9).mean() - 0.03) < 5 * np.sqrt(0.03 * 0.97 / n)
+    assert not np.array_equal(plugins.settle(wide, few, n, "other"), mixed)
+
+
+# --- entry points --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[importlib.metadata.EntryPoint]]:
+    """Entry points as if packages were installed; discovery has yet to run."""
+    points: list[importlib.metadata.EntryPoint] = []
+
+    def entry_points(**chosen: str) -> list[importlib.metadata.EntryPoint]:
+        assert chosen == {"group": "spadmnist.plugins"}
+        return points
+
+    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
+    monkeypatch.setattr(plugins, "_discovered", False)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield points
+    for name in ("shop_effects", "broken_effects"):
+        sys.modules.pop(name, None)
+
+
+def entry(value: str) -> importlib.metadata.EntryPoint:
+    return importlib.metadata.EntryPoint("shop", value, "spadmnist.plugins")
+
+
+def test_an_installed_package_is_found(tmp_path: Path, installed: list[importlib.metadata.EntryPoint]) -> None:
+    written(tmp_path, HALF, "shop_effects.py")
+    installed.append(entry("shop_effects"))
+    assert "half_light" in list(Effect.registry)
+    assert plugins.source_file(Effect.registry.find("half_light")) == str(tmp_path / "shop_effects.py")
+
+
+def test_an_installed_package_that_fails_is_told(
+    tmp_path: Path, installed: list[importlib.metadata.EntryPoint]
+) -> None:
+    written(tmp_path, "1 / 0\n", "broken_effects.py")
+    installed.append(entry("broken_effects"))
+    for _ in range(2):  # and again, where it is asked a second time
+        with pytest.raises(EffectError, match=r"shop .*broken_effects.* ZeroDivisionError.*uninstall"):
+            Effect.registry.find("detection")
+
+
+def test_an_installed_package_that_is_not_there_is_told(installed: list[importlib.metadata.EntryPoint]) -> None:
+    installed.append(entry("no_such_module_at_all"))
+    with pytest.raises(EffectError, match="no_such_module_at_all"):
+        list(Effect.registry)
