@@ -43,9 +43,10 @@ class Events:
     ticks: (events,) unsigned, whole ticks of the converter; tick: their length, s. Both None without a converter;
         otherwise `times` is `ticks * tick`.
     pixels: rows per image.
+    row_pixel: (rows,) the pixel of each row where a row is no whole pixel (STR: a row holds one frame's stamp).
     """
 
-    __slots__ = ("_times", "offsets", "pixels", "tick", "ticks")
+    __slots__ = ("_times", "offsets", "pixels", "row_pixel", "tick", "ticks")
 
     def __init__(
         self,
@@ -54,8 +55,10 @@ class Events:
         pixels: int,
         ticks: np.ndarray | None = None,
         tick: float | None = None,
+        row_pixel: np.ndarray | None = None,
     ):
         self._times = times
+        self.row_pixel = row_pixel
         self.offsets = offsets
         self.pixels = pixels
         self.ticks = ticks
@@ -89,7 +92,7 @@ class Events:
     @property
     def pixel(self) -> np.ndarray:
         """(events,) the pixel, within its image, of each event."""
-        return self.rows % self.pixels
+        return self.rows % self.pixels if self.row_pixel is None else self.row_pixel[self.rows]
 
     def row(self, index: int) -> np.ndarray:
         """The times of one row, s."""

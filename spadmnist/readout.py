@@ -16,9 +16,9 @@ READOUTS = ("tr", "str", "qis")
 
 def unsigned_for(largest: float, what: str) -> type[np.unsignedinteger]:
     """The unsigned type (32 or 64 bits) that holds integers up to `largest`. Raises SpadError where none does."""
-    if largest < 2**32:
+    if round(largest) < 2**32:
         return np.uint32
-    if largest < 2**52:
+    if round(largest) < 2**52:
         return np.uint64
     raise SpadError(
         f"{what} would reach {largest:.3g} ticks, beyond what a time stamp can hold; "

@@ -109,17 +109,23 @@ class PassiveFreeRunning(Method):
     columns = ("counts",)
 
     def estimate(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+        live = self._live(settings, counts)
+        return np.where(live > 0, counts / (settings.pdp * np.where(live > 0, live, 1.0)), np.inf)
+
+    def _live(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
         live = settings.exposure - counts * settings.dead_time
-        with np.errstate(divide="ignore"):
-            return np.where(live > 0, counts / (settings.pdp * np.where(live > 0, live, 1.0)), np.inf)
+        # where the exposure is a whole number of dead times, a rounding error is no live time
+        return np.where(live > 1e-12 * settings.exposure, live, 0.0)
 
     def saturated(self, settings: Settings, counts: np.ndarray) -> int:
-        return int(np.count_nonzero(settings.exposure - counts * settings.dead_time <= 0))
+        return int(np.count_nonzero(self._live(settings, counts) <= 0))
 
     def stored_when_saturated(self, settings: Settings) -> float:
         if settings.dead_time <= 0:
             return np.inf
-        return float(self.estimate(settings, np.asarray(settings.exposure / settings.dead_time - 0.5)))
+        most = settings.exposure / settings.dead_time
+        # a dead time longer than the exposure leaves less than one detection, and still no negative flux
+        return float(self.estimate(settings, np.asarray(max(most - 0.5, most / 2))))
 
 
 class InterPhoton(Method):
@@ -206,7 +212,7 @@ def find(name: str) -> Method:
 
 def median_of_nonzero(chunks: Callable[[], Iterable[np.ndarray]]) -> float | None:
     """The median of all non-zero values; see `medians_of_nonzero`."""
-    return medians_of_nonzero(lambda: ({"": chunk} for chunk in chunks()))[""]
+    return medians_of_nonzero(lambda: ({"": chunk} for chunk in chunks())).get("")
 
 
 def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]]) -> dict[str, float | None]:

@@ -75,7 +75,10 @@ class Sensor:
         """(pixels,) s during which a pixel is blind after a detection; 0 without a dead time."""
         longest = np.zeros(self.layout.pixels)
         for effect in self.at("dead_time"):
-            longest = np.maximum(longest, effect.blind_time())  # type: ignore[attr-defined]
+            blind = np.asarray(self._call(effect, "blind_time"))
+            if blind.shape not in ((), longest.shape) or blind.dtype.kind not in "fiu" or not np.all(blind >= 0):
+                raise _wrong(effect, f"blind_time must return seconds, one value or {len(longest)}, not negative")
+            longest = np.maximum(longest, blind)
         return longest
 
     @cached_property
@@ -104,14 +107,20 @@ class Sensor:
         rate = photons
         for stage in ("light", "detection"):
             for effect in self.at(stage):
-                rate = self._call(effect, "apply", rate, conditions)
+                rate = self._rate(effect, rate, conditions)
         light = rate
         for effect in self.at("dark"):
-            rate = self._call(effect, "apply", rate, conditions)
-        if rate.size and not 0 <= rate.min() <= rate.max() < np.inf:
-            culprit = (self.at("dark") or self.at("detection") or self.at("light"))[-1]
-            raise EffectError(f"{source_file(type(culprit))}: a rate is negative or not finite after {culprit.name}")
+            rate = self._rate(effect, rate, conditions)
         return rate, light
+
+    def _rate(self, effect: Effect, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        after = self._call(effect, "apply", rate, conditions)
+        if not isinstance(after, np.ndarray) or after.shape != rate.shape or after.dtype != np.float64:
+            what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
+            raise _wrong(effect, f"apply must return float64 rates of shape {rate.shape}, not {what}")
+        if after.size and not 0 <= after.min() <= after.max() < np.inf:
+            raise _wrong(effect, "apply returns a rate that is negative or not finite")
+        return after
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
@@ -146,6 +155,10 @@ class Sensor:
         """
         if not self._settled:
             return self.settled().expose(photons, conditions, streams, readouts, staged)
+        if photons.ndim != 2 or photons.shape[1] != self.layout.pixels or len(photons) != len(streams.images):
+            raise ValueError(
+                f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
+            )
         if self.is_paper_line and not staged and (self.tick > 0 or set(readouts) == {"qis"}):
             return self._fused(photons, conditions, streams, readouts)
         step = self.block
@@ -201,7 +214,8 @@ class Sensor:
         if framed:
             stamps = Events(None, first_offsets, pixels, first, tick) if "str" in readouts else None
             frames = Frames(bits, stamps, conditions.frames, conditions.frame_time, pixels)
-            recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited)
+            waits = waited if "str" in readouts else None
+            recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waits)
         return recorded
 
     def _staged(
@@ -242,9 +256,14 @@ class Sensor:
             times, offsets = kernels.arrivals(np.ascontiguousarray(rate), conditions.exposure, streams.images, key)
             return Events(times, offsets, pixels)
         parts = {"light": light, "dark": rate - light}
+        largest: dict[str, float] = {}
         most = dict(parts)
         for effect in varying:
-            most[effect.acts_on] = most[effect.acts_on] * self._call(effect, "maximum", conditions)
+            top = self._call(effect, "maximum", conditions)
+            if not isinstance(top, (int, float, np.floating)) or not 0 <= top < np.inf:
+                raise _wrong(effect, f"maximum must return one finite number, not negative; it returns {top!r}")
+            largest[effect.name] = float(top)
+            most[effect.acts_on] = most[effect.acts_on] * float(top)
         drawn = most["light"] + most["dark"]
         key = streams.key("photons and dark counts")
         times, offsets = kernels.arrivals(np.ascontiguousarray(drawn), conditions.exposure, streams.images, key)
@@ -252,23 +271,29 @@ class Sensor:
         rows = events.rows
         now = {kind: part.ravel()[rows] for kind, part in parts.items()}
         for effect in varying:
-            now[effect.acts_on] = now[effect.acts_on] * self._call(effect, "factor", times, conditions)
+            factor = np.asarray(self._call(effect, "factor", times, conditions))
+            if factor.shape not in ((), times.shape) or factor.dtype.kind not in "fiu":
+                raise _wrong(effect, f"factor must return one number per time, {times.shape}, not {factor.shape}")
+            top = largest[effect.name]
+            if not np.all((factor >= 0) & (factor <= top * (1 + 1e-9))):
+                raise _wrong(effect, f"factor must lie between 0 and the maximum it states, {top:g}")
+            now[effect.acts_on] = now[effect.acts_on] * factor
         share = (now["light"] + now["dark"]) / drawn.ravel()[rows]
-        if np.any(share < 0) or np.any(share > 1 + 1e-9):
-            names = ", ".join(e.name for e in varying)
-            raise EffectError(
-                f"the factor of {names} leaves the range from 0 to its maximum; mend `maximum` or `factor`"
-            )
         chance = kernels.uniforms(offsets, pixels, streams.images, streams.key("thinning"))
         return events.keep(chance < share)
 
     def _gate(self, events: Events, conditions: Conditions) -> Events:
+        return events.keep(self._open(events.times, conditions)) if self.at("gate") else events
+
+    def _open(self, times: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """(events,) bool: can a pixel fire at these times?"""
+        mask = np.ones(times.shape, bool)
         for effect in self.at("gate"):
-            mask = np.asarray(self._call(effect, "open", events.times, conditions))
-            if mask.dtype != bool or mask.shape != events.times.shape:
-                raise EffectError(f"{source_file(type(effect))}: {effect.name}.open must return one bool per time")
-            events = events.keep(mask)
-        return events
+            one = np.asarray(self._call(effect, "open", times, conditions))
+            if one.dtype != bool or one.shape != times.shape:
+                raise _wrong(effect, f"open must return one bool per time, {times.shape}, not {one.dtype} {one.shape}")
+            mask &= one
+        return mask
 
     def _spawn(
         self, effect: Effect, events: Events, streams: Streams, dead_times: np.ndarray, suffix: str = ""
@@ -276,20 +301,25 @@ class Sensor:
         """(times, rows, parents) of an effect's children; in the parent's own pixel the dead time comes first."""
         children = self._call(effect, "spawn", events, self._rng(effect, streams, suffix))
         if not isinstance(children, Children):
-            raise EffectError(f"{source_file(type(effect))}: {effect.name}.spawn must return Children")
-        parent = np.asarray(children.parent)
-        delay = np.asarray(children.delay, np.float64)
-        if (
-            parent.dtype.kind not in "iu"
-            or parent.shape != delay.shape
-            or (len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0)))
-        ):
-            raise EffectError(
-                f"{source_file(type(effect))}: the children of {effect.name} need a parent among the {len(events)} "
-                "events and a delay that is not negative"
+            raise _wrong(effect, f"spawn must return Children, not {type(children).__name__}")
+        parent, delay = np.asarray(children.parent), np.asarray(children.delay, np.float64)
+        good = parent.ndim == 1 and parent.shape == delay.shape and (parent.dtype.kind in "iu" or not len(parent))
+        if not good or (len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0))):
+            raise _wrong(
+                effect, f"children need a parent among the {len(events)} events and a delay that is not negative"
             )
+        parent = parent.astype(np.int64)
         home = np.searchsorted(events.offsets, parent, side="right") - 1
-        rows = home if children.row is None else np.asarray(children.row)
+        rows = home
+        if children.row is not None:
+            rows = np.asarray(children.row)
+            if (
+                rows.shape != home.shape
+                or rows.dtype.kind not in "iu"
+                or np.any(rows // events.pixels != home // events.pixels)
+            ):
+                raise _wrong(effect, "the row of a child must be a whole number, and a pixel of its parent's own image")
+            rows = rows.astype(np.int64)
         times = events.times[parent] + (np.where(rows == home, dead_times[home], 0.0) + delay)
         return times, rows, parent
 
@@ -324,9 +354,7 @@ class Sensor:
             if not found:
                 break
             t, r, p = (np.concatenate(column) for column in zip(*found, strict=True))
-            inside = t < conditions.exposure
-            for effect in self.at("gate"):
-                inside &= self._call(effect, "open", t, conditions)
+            inside = (t < conditions.exposure) & self._open(t, conditions)
             t, r, p = t[inside], r[inside], p[inside]
             if not len(t):
                 break
@@ -359,14 +387,20 @@ class Sensor:
         )
         first = None
         if stamped:
-            first = Events(out[: offsets[-1]], offsets, pixels)
+            stamps = out[: offsets[-1]]
+            # a row for each frame: its one stamp stays its own, whatever a timing effect does with it
+            pixel = Events(stamps, offsets, pixels).pixel
+            first = Events(stamps, np.arange(len(stamps) + 1), pixels, row_pixel=pixel)
             for effect in self.at("timing"):
-                first = self._apply(effect, first, streams)
-            if first.ticks is not None and first.tick is not None:
-                none = no_detection(conditions.frame_time, first.tick)
+                first = self._apply(effect, first, streams, "/frames")
+            if len(first) != len(stamps):
+                raise _wrong(self.at("timing")[-1], "apply must not add or remove stamps")
+            ticks, tick = first.ticks, first.tick
+            if ticks is not None and tick is not None:
                 # what rounds to the end of the frame would mean 'none'
-                first = Events(None, offsets, pixels, np.minimum(first.ticks, np.uint64(none - 1)), first.tick)
-                first = self._narrow(first, conditions.frame_time, "STR stamps")
+                ticks = np.minimum(ticks, np.uint64(no_detection(conditions.frame_time, tick) - 1))
+            first = Events(None if ticks is not None else first.times, offsets, pixels, ticks, tick)
+            first = self._narrow(first, conditions.frame_time, "STR stamps")
         return Frames(bits, first, conditions.frames, conditions.frame_time, pixels)
 
     def _narrow(self, events: Events, end: float, what: str) -> Events:
@@ -392,13 +426,15 @@ class Sensor:
         except Exception as error:
             raise blame(effect, error) from error
 
-    def _apply(self, effect: Effect, events: Events, streams: Streams) -> Events:
+    def _apply(self, effect: Effect, events: Events, streams: Streams, suffix: str = "") -> Events:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""
-        after = self._call(effect, "apply", events, self._rng(effect, streams))
+        after = self._call(effect, "apply", events, self._rng(effect, streams, suffix))
         if not effect.counted:
             wrong = after.problem() if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
+            if not wrong and len(after.offsets) != len(events.offsets):
+                wrong = f"it has {len(after.offsets) - 1} rows, not {len(events.offsets) - 1}"
             if wrong:
-                raise EffectError(f"{source_file(type(effect))}: what {effect.name}.apply returns is wrong: {wrong}")
+                raise _wrong(effect, f"what apply returns cannot be used: {wrong}")
         return after
 
 
@@ -424,6 +460,10 @@ class _Latent:
         sort = np.lexsort((times, rows))
         offsets = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=self.n_rows))]).astype(np.int64)
         return Events(times[sort], offsets, self.pixels)
+
+
+def _wrong(effect: Effect, what: str) -> EffectError:
+    return EffectError(f"{source_file(type(effect))}: the effect {effect.name}: {what}")
 
 
 def _draws(effect: Effect) -> bool:

@@ -91,11 +91,19 @@ def test_the_base_is_right() -> None:
     assert [level.text for level in experiment.levels] == ["5 mlux", "2560 mlux"]
     assert experiment.levels[0].value == 0.005
     assert experiment.readouts == ("tr", "str", "qis") and experiment.methods == ("counts", "qis_linear")
-    assert [e.name for e in experiment.sensor.effects] == "detection dark_counts afterpulsing dead_time tdc".split()
+    assert [e.name for e in experiment.sensor.effects] == [
+        "detection",
+        "dark_counts",
+        "afterpulsing",
+        "dead_time",
+        "tdc",
+    ]
 
 
 # --- one mistake: (what stands there, what is written instead, path, what the line says) -----------------------------
 
+NORMAL = "normal: {mean: 9 Hz, sigma: 1 Hz}"
+SHORT = {"DC.": "sensor.effects.dark_counts.", "SE.": "sensor.effects.", "SL.": "sensor.layout."}
 MISTAKES = [
     ("seed: 1", "seed: -1", "seed", "-1|0"),
     ("seed: 1", "seed: 1.5", "seed", "1.5|integer"),
@@ -105,7 +113,8 @@ MISTAKES = [
     ("seed: 1", f"seed: {2**63}", "seed", f"{2**63}"),
     ("seed: 1", f"seed: 1{'0' * 400}", "seed", "less than"),
     ("seed: 1", "limit: 0\nseed: 1", "limit", "0|1"),
-    ("digits, train", "digit, train", "scene.images.source", "'digit'|mnist, idx, folder, array, digits, uniform|mean digits?"),
+    ("digits, train", "digit, train", "scene.images.source",
+     "'digit'|mnist, idx, folder, array, digits, uniform|mean digits?"),
     ("source: digits, train: 4", "train: 4", "scene.images", "source|mnist, idx, folder, array, digits, uniform"),
     ("train: 4", "train: -4", "scene.images.train", "-4|1"),
     ("train: 4", "train: 4.5", "scene.images.train", "4.5|integer"),
@@ -125,7 +134,8 @@ MISTAKES = [
     ("2560 mlux]", "0.005 lux]", "scene.lux[1]", "0.005 lux|5 mlux again|once"),
     ("2560 mlux]", "5.0 mlux]", "scene.lux[1]", "5.0 mlux|5 mlux again|once"),
     ("2560 mlux]", "5e3 ulux]", "scene.lux[1]", "5e3 ulux|5 mlux again|once"),
-    ("lux: [5 mlux, 2560 mlux]", "irradiance: [10 uW/cm^2, 0.1 W/m^2]", "scene.irradiance[1]", "10 uW/cm^2 again"),
+    ("lux: [5 mlux, 2560 mlux]", "irradiance: [10 uW/cm^2, 0.1 W/m^2]", "scene.irradiance[1]",
+     "10 uW/cm^2 again"),
     ("lux: [5 mlux, 2560 mlux]", "irradiance: [5 mlux]", "scene.irradiance[0]", "'5 mlux'|irradiance|nW/cm^2"),
     ("exposure: 1 ms", "exposure: 2 ms", "recording.exposure", "2 ms|frames x frame_period|100 x 10 us = 1 ms"),
     ("exposure: 1 ms", "exposure: 1", "recording.exposure", "1 has no unit|time|ms"),
@@ -141,69 +151,69 @@ MISTAKES = [
     ("rules: paper", "rules: papers", "sensor.rules", "'papers'|paper, device|mean paper?"),
     ("rules: paper", "rules: true", "sensor.rules", "True|paper, device"),
     ("chip_seed: 1", "chip_seed: x", "sensor.chip_seed", "'x'|integer"),
-    ("rows: 28", "rows: 0", "sensor.layout.rows", "0|1"),
-    ("rows: 28", "rows: 28 px", "sensor.layout.rows", "'28 px'|integer"),
-    ("25 um^2", "25", "sensor.layout.pixel_area", "25 has no unit|area|25 um^2"),
-    ("25 um^2", "25 um", "sensor.layout.pixel_area", "'25 um'|area|um^2"),
-    ("25 um^2", "0 um^2", "sensor.layout.pixel_area", "0 um^2|more than 0"),
-    ("fill_factor: 1.0", "fill_factor: 1.5", "sensor.layout.fill_factor", "1.5|at most 1"),
-    ("fill_factor: 1.0", "fill_factor: 0", "sensor.layout.fill_factor", "0|more than 0"),
-    ("fill_factor: 1.0", "fill_factor: .nan", "sensor.layout.fill_factor", "nan|number"),
-    ("fill_factor: 1.0", "fill_factor: true", "sensor.layout.fill_factor", "True|number"),
-    ("dead_time: {", "dead_tme: {", "sensor.effects.dead_tme", "not an effect|mean dead_time?|spadmnist effects"),
-    ("dead_time: {duration: 50 ns}", "dead_time: 50 ns", "sensor.effects.dead_time", "'50 ns'|parameters"),
-    ("duration: 50", "duraton: 50", "sensor.effects.dead_time.duraton", "not a parameter of dead_time|mean duration?"),
-    ("duration: 50 ns", "duration: 50", "sensor.effects.dead_time.duration", "50 has no unit|time|ns|50 ns"),
-    ("duration: 50 ns", "duration: 50 nS", "sensor.effects.dead_time.duration", "'50 nS'|time|ns"),
-    ("duration: 50 ns", "duration: 50 parsecs", "sensor.effects.dead_time.duration", "'50 parsecs'|time|ns"),
-    ("duration: 50 ns", "duration: -50 ns", "sensor.effects.dead_time.duration", "-50 ns|at least 0 s"),
-    ("duration: 50 ns", "duration: null", "sensor.effects.dead_time.duration", "None|time|ns"),
-    ("duration: 50 ns", "duration: true", "sensor.effects.dead_time.duration", "True|time|ns"),
-    ("duration: 50 ns", "duration: 9**9**9", "sensor.effects.dead_time.duration", "'9**9**9'|time|ns"),
-    ("duration: 50 ns", "duration: 1e999 s", "sensor.effects.dead_time.duration", "'1e999 s'|too large"),
-    ("lifetime: 25 ns", "lifetime: 0 ns", "sensor.effects.afterpulsing.lifetime", "more than 0 s"),
-    ("lifetime: 25 ns", "lifetime: {file: a.npy}", "sensor.effects.afterpulsing.lifetime", "one number"),
-    ("lifetime: 25 ns", "lifetime: {normal: {mean: 1 ns, sigma: 1 ns}}", "sensor.effects.afterpulsing.lifetime", "one number"),
-    ("0.5 %", "50 Hz", "sensor.effects.afterpulsing.probability", "'50 Hz'|number|0.5 %"),
-    ("0.5 %", "150 %", "sensor.effects.afterpulsing.probability", "150 %|between 0 and 1"),
-    ("0.5 %", ".nan", "sensor.effects.afterpulsing.probability", "nan|number"),
-    ("pdp: 0.5", "pdp: 1.5", "sensor.effects.detection.pdp", "1.5|between 0 and 1"),
-    ("pdp: 0.5", "pdp: 0", "sensor.effects.detection.pdp", "0|more than 0"),
-    ("pdp: 0.5", "pdp: {}", "sensor.effects.detection.pdp", "empty|500 nm: 0.42"),
-    ("pdp: 0.5", "pdp: {400 nm: 0.1, 500 nm: 0.5}", "sensor.effects.detection.pdp", "555 nm|outside|400 nm to 500 nm|add"),
-    ("pdp: 0.5", "pdp: {500 nm: 0.1, 0.5 um: 0.5, 600 nm: 0.2}", "sensor.effects.detection.pdp", "twice"),
-    ("pdp: 0.5", "pdp: {500: 0.1, 600 nm: 0.2}", "sensor.effects.detection.pdp", "500 has no unit|wavelength|555 nm"),
-    ("pdp: 0.5", "pdp: {500 nm: 0.1, 600 nm: 2}", "sensor.effects.detection.pdp.600 nm", "2|between 0 and 1"),
-    ("pdp: 0.5", "pdp: {500 nm: .nan, 600 nm: 0.2}", "sensor.effects.detection.pdp.500 nm", "nan|number"),
-    ("10 ps", "20 us", "sensor.effects.tdc.resolution", "20 us|10 us|STR"),
-    ("10 ps", "1e-30 s", "sensor.effects.tdc.resolution", "ticks|coarser"),
-    (RATE, "rate: {}", "sensor.effects.dark_counts.rate", "forms|{file: map.npy}|normal|lognormal|mixture"),
-    (RATE, "rate: {fil: a.npy}", "sensor.effects.dark_counts.rate", "fil|forms|{file: map.npy}"),
-    (RATE, "rate: {file: 5}", "sensor.effects.dark_counts.rate.file", "5|file name"),
-    (RATE, "rate: {normal: {mean: 100 Hz}}", "sensor.effects.dark_counts.rate.normal", "mean and sigma"),
-    (RATE, "rate: {normal: 5}", "sensor.effects.dark_counts.rate.normal", "5|mean and sigma"),
-    (RATE, "rate: {normal: {mean: 9 Hz, sigma: 1}}", "sensor.effects.dark_counts.rate.normal.sigma", "1 has no unit|Hz"),
-    (RATE, "rate: {normal: {mean: 9 Hz, sigma: -1 Hz}}", "sensor.effects.dark_counts.rate.normal.sigma", "-1 Hz|at least 0"),
-    (RATE, "rate: {normal: {mean: -9 Hz, sigma: 1 Hz}}", "sensor.effects.dark_counts.rate.normal.mean", "-9 Hz|at least 0"),
-    (RATE, "rate: {lognormal: {median: 9 Hz, sigma: -1}}", "sensor.effects.dark_counts.rate.lognormal.sigma", "-1|at least 0"),
-    (RATE, "rate: {lognormal: {median: 9 Hz, sigma: 1 Hz}}", "sensor.effects.dark_counts.rate.lognormal.sigma", "'1 Hz'|number"),
-    (RATE, "rate: {lognormal: {mean: 9 Hz, sigma: 1}}", "sensor.effects.dark_counts.rate.lognormal", "median and sigma"),
-    (RATE, "rate: {mixture: []}", "sensor.effects.dark_counts.rate.mixture", "list|share"),
-    (RATE, "rate: {mixture: [{normal: {mean: 9 Hz, sigma: 1 Hz}}]}", "sensor.effects.dark_counts.rate.mixture[0]", "share"),
-    (RATE, "rate: {mixture: [{share: 0.9, normal: {mean: 9 Hz, sigma: 1 Hz}}]}", "sensor.effects.dark_counts.rate.mixture",
-     "0.9|not to 1"),
-    (RATE, "rate: {mixture: [{share: 2, normal: {mean: 9 Hz, sigma: 1 Hz}}, {share: -1, normal: {mean: 9 Hz, sigma: 1 Hz}}]}",
-     "sensor.effects.dark_counts.rate.mixture[0].share", "2|between 0 and 1"),
-    (RATE, "rate: {normal: {mean: 9 Hz, sigma: 1 Hz}, lognormal: {median: 9 Hz, sigma: 1}}", "sensor.effects.dark_counts.rate",
+    ("rows: 28", "rows: 0", "SL.rows", "0|1"),
+    ("rows: 28", "rows: 28 px", "SL.rows", "'28 px'|integer"),
+    ("25 um^2", "25", "SL.pixel_area", "25 has no unit|area|25 um^2"),
+    ("25 um^2", "25 um", "SL.pixel_area", "'25 um'|area|um^2"),
+    ("25 um^2", "0 um^2", "SL.pixel_area", "0 um^2|more than 0"),
+    ("fill_factor: 1.0", "fill_factor: 1.5", "SL.fill_factor", "1.5|at most 1"),
+    ("fill_factor: 1.0", "fill_factor: 0", "SL.fill_factor", "0|more than 0"),
+    ("fill_factor: 1.0", "fill_factor: .nan", "SL.fill_factor", "nan|number"),
+    ("fill_factor: 1.0", "fill_factor: true", "SL.fill_factor", "True|number"),
+    ("dead_time: {", "dead_tme: {", "SE.dead_tme", "not an effect|mean dead_time?|spadmnist effects"),
+    ("dead_time: {duration: 50 ns}", "dead_time: 50 ns", "SE.dead_time", "'50 ns'|parameters"),
+    ("duration: 50", "duraton: 50", "SE.dead_time.duraton", "not a parameter of dead_time|mean duration?"),
+    ("duration: 50 ns", "duration: 50", "SE.dead_time.duration", "50 has no unit|time|ns|50 ns"),
+    ("duration: 50 ns", "duration: 50 nS", "SE.dead_time.duration", "'50 nS'|time|ns"),
+    ("duration: 50 ns", "duration: 50 parsecs", "SE.dead_time.duration", "'50 parsecs'|time|ns"),
+    ("duration: 50 ns", "duration: -50 ns", "SE.dead_time.duration", "-50 ns|at least 0 s"),
+    ("duration: 50 ns", "duration: null", "SE.dead_time.duration", "None|time|ns"),
+    ("duration: 50 ns", "duration: true", "SE.dead_time.duration", "True|time|ns"),
+    ("duration: 50 ns", "duration: 9**9**9", "SE.dead_time.duration", "'9**9**9'|time|ns"),
+    ("duration: 50 ns", "duration: 1e999 s", "SE.dead_time.duration", "'1e999 s'|too large"),
+    ("lifetime: 25 ns", "lifetime: 0 ns", "SE.afterpulsing.lifetime", "more than 0 s"),
+    ("lifetime: 25 ns", "lifetime: {file: a.npy}", "SE.afterpulsing.lifetime", "one number"),
+    ("lifetime: 25 ns", "lifetime: {normal: {mean: 1 ns, sigma: 1 ns}}", "SE.afterpulsing.lifetime", "one number"),
+    ("0.5 %", "50 Hz", "SE.afterpulsing.probability", "'50 Hz'|number|0.5 %"),
+    ("0.5 %", "150 %", "SE.afterpulsing.probability", "150 %|between 0 and 1"),
+    ("0.5 %", ".nan", "SE.afterpulsing.probability", "nan|number"),
+    ("pdp: 0.5", "pdp: 1.5", "SE.detection.pdp", "1.5|between 0 and 1"),
+    ("pdp: 0.5", "pdp: 0", "SE.detection.pdp", "0|more than 0"),
+    ("pdp: 0.5", "pdp: {}", "SE.detection.pdp", "empty|500 nm: 0.42"),
+    ("pdp: 0.5", "pdp: {400 nm: 0.1, 500 nm: 0.5}", "SE.detection.pdp", "555 nm|outside|400 nm to 500 nm|add"),
+    ("pdp: 0.5", "pdp: {500 nm: 0.1, 0.5 um: 0.5, 600 nm: 0.2}", "SE.detection.pdp", "twice"),
+    ("pdp: 0.5", "pdp: {500: 0.1, 600 nm: 0.2}", "SE.detection.pdp", "500 has no unit|wavelength|555 nm"),
+    ("pdp: 0.5", "pdp: {500 nm: 0.1, 600 nm: 2}", "SE.detection.pdp.600 nm", "2|between 0 and 1"),
+    ("pdp: 0.5", "pdp: {500 nm: .nan, 600 nm: 0.2}", "SE.detection.pdp.500 nm", "nan|number"),
+    ("10 ps", "20 us", "SE.tdc.resolution", "20 us|10 us|STR"),
+    ("10 ps", "1e-30 s", "SE.tdc.resolution", "ticks|coarser"),
+    (RATE, "rate: {}", "DC.rate", "forms|{file: map.npy}|normal|lognormal|mixture"),
+    (RATE, "rate: {fil: a.npy}", "DC.rate", "fil|forms|{file: map.npy}"),
+    (RATE, "rate: {file: 5}", "DC.rate.file", "5|file name"),
+    (RATE, "rate: {normal: {mean: 100 Hz}}", "DC.rate.normal", "mean and sigma"),
+    (RATE, "rate: {normal: 5}", "DC.rate.normal", "5|mean and sigma"),
+    (RATE, "rate: {normal: {mean: 9 Hz, sigma: 1}}", "DC.rate.normal.sigma", "1 has no unit|Hz"),
+    (RATE, "rate: {normal: {mean: 9 Hz, sigma: -1 Hz}}", "DC.rate.normal.sigma", "-1 Hz|at least 0"),
+    (RATE, "rate: {normal: {mean: -9 Hz, sigma: 1 Hz}}", "DC.rate.normal.mean", "-9 Hz|at least 0"),
+    (RATE, "rate: {lognormal: {median: 9 Hz, sigma: -1}}", "DC.rate.lognormal.sigma", "-1|at least 0"),
+    (RATE, "rate: {lognormal: {median: 9 Hz, sigma: 1 Hz}}", "DC.rate.lognormal.sigma", "'1 Hz'|number"),
+    (RATE, "rate: {lognormal: {mean: 9 Hz, sigma: 1}}", "DC.rate.lognormal", "median and sigma"),
+    (RATE, "rate: {mixture: []}", "DC.rate.mixture", "list|share"),
+    (RATE, "rate: {mixture: [{normal: {mean: 9 Hz, sigma: 1 Hz}}]}", "DC.rate.mixture[0]", "share"),
+    (RATE, f"rate: {{mixture: [{{share: 0.9, {NORMAL}}}]}}", "DC.rate.mixture", "0.9|not to 1"),
+    (RATE, f"rate: {{mixture: [{{share: 2, {NORMAL}}}, {{share: -1, {NORMAL}}}]}}", "DC.rate.mixture[0].share",
+     "2|between 0 and 1"),
+    (RATE, "rate: {normal: {mean: 9 Hz, sigma: 1 Hz}, lognormal: {median: 9 Hz, sigma: 1}}", "DC.rate",
      "one of normal, lognormal, mixture"),
     ("format: zarr", "format: zar", "output.format", "'zar'|zarr, hdf5|mean zarr?"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("old", "new", "path", "says"), MISTAKES, ids=[f"{m[2]}: {m[1]}"[:70] for m in MISTAKES])
+@pytest.mark.parametrize(("old", "new", "path", "says"), MISTAKES, ids=[f"{m[2]}: {m[1]}"[:60] for m in MISTAKES])
 def test_a_mistake_is_one_line_with_its_place(old: str, new: str, path: str, says: str) -> None:
     text, line = changed(old, new)
     (problem,) = mistakes(text)
+    path = SHORT.get(path[:3], path[:3]) + path[3:]
     assert problem.startswith(f"lab.yaml:{line}: {path}")
     for part in says.split("|"):
         assert part in problem
@@ -456,7 +466,8 @@ def test_several_bad_maps_are_told_at_once(maps: Path) -> None:
     [
         "{normal: {mean: 100 Hz, sigma: 0 Hz}}",
         "{lognormal: {median: 0.1 kHz, sigma: 0}}",
-        "{mixture: [{share: 97 %, normal: {mean: 100 Hz, sigma: 0 Hz}}, {share: 3 %, lognormal: {median: 100 Hz, sigma: 0}}]}",
+        "{mixture: [{share: 97 %, normal: {mean: 100 Hz, sigma: 0 Hz}}, "
+        "{share: 3 %, lognormal: {median: 100 Hz, sigma: 0}}]}",
     ],
 )
 def test_a_distribution_without_a_width_is_its_centre(form: str) -> None:
@@ -661,7 +672,7 @@ def test_what_the_command_line_changes_is_resolved(format_: str) -> None:
     assert experiment.resolved["seed"] == 9 and experiment.resolved["limit"] == 3
     assert experiment.resolved["output"]["format"] == format_
     assert experiment.resolved["scene"]["lux"] == ["5 mlux", "2560 mlux"]
-    with pytest.raises(ConfigError, match="--lux: '7 mlux' .* 5 mlux, 20 mlux, 160 mlux, 2560 mlux"):
+    with pytest.raises(ConfigError, match=r"--lux: '7 mlux' .* 5 mlux, 20 mlux, 160 mlux, 2560 mlux"):
         config.read(ROOT / "configs" / "quick.yaml", lux=("7 mlux",))
 
 

@@ -9,11 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import laws
 import numpy as np
 import pytest
 
-import laws
 import spadmnist
+from spadmnist import config, factory, plugins
+from spadmnist.effects import Effect
+from spadmnist.reconstruct import Method
 
 ROOT = Path(__file__).parents[1]
 CONFIG = """\
@@ -91,6 +94,20 @@ EFFECTS = {
         0.75,
     ),
 }
+CONVERTER = '''import numpy as np
+
+from spadmnist import Effect, Events, parameter
+
+
+class FloorConverter(Effect, stage="timing"):
+    """Stamps are whole nanoseconds, rounded down."""
+
+    resolution = parameter(1e-9, "s", "length of a tick", bounds=(0, None), open_bounds=True)
+
+    def apply(self, events, rng):
+        ticks = np.floor(events.times / self.resolution).astype(np.uint64)
+        return Events(None, events.offsets, events.pixels, ticks, self.resolution)
+'''
 METHOD = '''import numpy as np
 
 from spadmnist.reconstruct import Method
@@ -146,10 +163,6 @@ def simulated(folder: Path, effects: dict[str, str]) -> Any:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A temporary folder; what is loaded in this process is forgotten afterwards."""
-    from spadmnist import plugins
-    from spadmnist.effects import Effect
-    from spadmnist.reconstruct import Method
-
     plugins.discover()
     for registry in (Effect.registry, Method.registry):
         monkeypatch.setattr(registry, "classes", dict(registry.classes))
@@ -160,21 +173,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_mean_rate_changes_as_the_effect_says(name: str, folder: Path) -> None:
     """40 images of 256 pixels, about 262,000 detections without the effect; false-alarm rate 1e-6."""
-    from spadmnist import plugins
-
     _, values, factor = EFFECTS[name]
     (folder / "mine.py").write_text(text_of(name))
     plugins.load_file(folder / "mine.py")
     plain, _ = simulated(folder, {})
     counts, part = simulated(folder, {name: values})
-    rate = 0.5 * spadmnist.dataset.config.read(folder / "plain.yaml").white(
-        spadmnist.dataset.config.read(folder / "plain.yaml").levels[0]
-    )
+    base = config.read(folder / "plain.yaml")
+    rate = 0.5 * base.white(base.levels[0])
     expected = rate * 1e-3 * 256 * 40
     laws.poisson_mean(int(plain.sum()), expected, what="detections without the effect")
     laws.poisson_mean(int(counts.sum()), factor * expected, what=f"detections with {name}")
     assert counts.sum() < 0.9 * plain.sum()  # it could not have been the other one
-    experiment = spadmnist.dataset.config.read(folder / f"{name}.yaml")
+    experiment = config.read(folder / f"{name}.yaml")
     photons = np.full((1, 256), experiment.white(experiment.levels[0]))
     _, told = experiment.sensor.expected(photons, experiment.conditions)
     assert told.sum() * 40 == pytest.approx(factor * expected, rel=1e-12)
@@ -207,8 +217,6 @@ def test_a_new_effect_from_listing_to_dataset(folder: Path) -> None:
     assert str(folder) not in (folder / "out" / "manifest.json").read_text()
     assert "all " in command("verify", "out", "--plugin", file, cwd=folder)
     stored = spadmnist.open(folder / "out")["500 mlux", "train"]
-    from spadmnist import plugins
-
     plugins.load_file(file)
     counts, _ = simulated(folder, {name: EFFECTS[name][1]})
     assert np.array_equal([len(stored.tr[i]) for i in range(40)], counts)  # bit for bit the same, in other processes
@@ -233,9 +241,6 @@ def test_a_new_method_from_listing_to_dataset(folder: Path) -> None:
     for i in (0, 39):
         expected = np.sqrt(part.tr[i].counts.reshape(16, 16)).astype(np.float32)
         assert np.array_equal(part.reconstruction["root_counts"][i], expected)
-    assert part.reconstruction["root_counts"].normalisation == pytest.approx(
-        np.median(np.sqrt(np.concatenate([part.tr[i].counts for i in range(40)]))), rel=1e-6
-    )
     # added later, it is the same dataset
     command("generate", "plain.yaml", "-o", "later", "--jobs", 1, cwd=folder)
     command("reconstruct", "later", "--method", "root_counts", "--plugin", file, cwd=folder)
@@ -245,6 +250,10 @@ def test_a_new_method_from_listing_to_dataset(folder: Path) -> None:
     )
     assert set(one) == set(other) and [n for n in one if one[n] != other[n]] == []
     assert listing(ROOT) == before
+    # the number stands in the manifest: reading it takes no plug-in, as reading the images does not
+    assert part.reconstruction["root_counts"].normalisation == pytest.approx(
+        np.median(np.sqrt(np.concatenate([part.tr[i].counts for i in range(40)]))), rel=1e-6
+    )
 
 
 def test_the_plug_in_is_asked_for_where_it_is_missing(folder: Path) -> None:
@@ -255,6 +264,33 @@ def test_the_plug_in_is_asked_for_where_it_is_missing(folder: Path) -> None:
     assert len(spadmnist.open(folder / "out")["500 mlux", "train"].tr[0]) > 0  # reading the data needs no plug-in
     with pytest.raises(spadmnist.SpadError, match="half_light is not an effect"):
         spadmnist.open(folder / "c.yaml")
+
+
+def test_a_converter_of_another_kind(folder: Path) -> None:
+    """Ticks do not come from one effect alone: a dataset whose stamps a user's converter makes can be read."""
+    (folder / "mine.py").write_text(CONVERTER)
+    (folder / "c.yaml").write_text(
+        CONFIG.replace("tdc: {resolution: 100 ps}", "floor_converter:").replace("[tr, qis]", "[tr, str, qis]")
+    )
+    command("generate", "c.yaml", "-o", "out", "--jobs", 1, "--plugin", "mine.py", cwd=folder)
+    plugins.load_file(folder / "mine.py")
+    stored, live = (spadmnist.open(folder / name)["500 mlux", "train"] for name in ("out", "c.yaml"))
+    for part in (stored, live):
+        assert part.tr[3].tick == 1e-9 and np.array_equal(part.tr[3].times, part.tr[3].ticks * 1e-9)
+        assert ((part.str[3] < 100e-6) == part.qis[3]).all()
+    assert np.array_equal(stored.tr[3].ticks, live.tr[3].ticks)
+    assert config.read(folder / "c.yaml").settings.tick == 1e-9
+
+
+def test_two_files_of_one_name_both_travel(folder: Path) -> None:
+    for where, name in (("a", "half_light"), ("b", "lossy_bus")):
+        (folder / where).mkdir()
+        (folder / where / "mine.py").write_text(text_of(name))
+        plugins.load_file(folder / where / "mine.py")
+    (folder / "c.yaml").write_text(CONFIG + "    half_light: {share: 0.5}\n    lossy_bus:\n")
+    experiment = config.read(folder / "c.yaml")
+    held = _texts(factory.identity(experiment, experiment.load_images())["plugins"])
+    assert text_of("half_light") in held and text_of("lossy_bus") in held
 
 
 def _texts(plugins: Any) -> list[str]:

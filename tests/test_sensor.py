@@ -117,13 +117,12 @@ def assert_sound(recorded: Recorded, conditions: Conditions, tick: float) -> Non
 def paper_sensors(draw: st.DrawFn) -> tuple[Sensor, Conditions, np.ndarray, tuple[str, ...]]:
     """A sensor of the paper's line, how it records, photons/s of some images, and readouts."""
     pixels = draw(st.integers(1, 7))
-    channels = draw(st.sampled_from([1, 1, 3]))
     frames = draw(st.sampled_from([1, 3, 8, 13, 100]))
     exposure = draw(st.sampled_from([1e-3, 2e-5]))
     period = exposure / frames
     live = draw(st.sampled_from([1.0, 0.5, 0.1])) * period
     conditions = Conditions(exposure, frames, live, period, 555e-9)
-    maps = channels == 1  # one for each channel of a colour image is tried further down
+    maps = True
 
     def value(options: list[float]) -> Any:
         if maps and draw(st.booleans()):
@@ -150,7 +149,7 @@ def paper_sensors(draw: st.DrawFn) -> tuple[Sensor, Conditions, np.ndarray, tupl
         effects.append(Tdc(resolution=tick))
     n = draw(st.integers(1, 3))
     bright = draw(st.lists(st.sampled_from([0.0, 0.3, 20.0, 600.0]), min_size=1, max_size=6))
-    photons = np.resize(np.array(bright), (n, channels * pixels)) / exposure
+    photons = np.resize(np.array(bright), (n, pixels)) / exposure
     return sensor(pixels, *effects), conditions, photons, readouts
 
 
@@ -196,21 +195,27 @@ MAPS = [
 @pytest.mark.parametrize("mapped", MAPS, ids=lambda e: f"{e.name}-{len(e.__dict__)}")
 @pytest.mark.parametrize("rules", ["paper", "device"])
 def test_maps_repeat_for_every_channel(mapped: Effect, rules: str) -> None:
-    """A colour image is several planes on one array: each plane meets the same map."""
+    """A channel of a colour image is an image of its own to the sensor: each one meets the same map."""
     others = [e for e in paper_effects() if e.name != mapped.name]
     chip = sensor(4, *others, mapped, rules=rules)
-    plane = np.full((2, 4), 2e6)
-    keys = streams([0, 1])
-    colour = chip.expose(np.tile(plane, 3), PAPER, keys, ALL)
+    plane = np.full((6, 4), 2e6)
+    keys = streams(np.arange(6))
+    colour = chip.expose(plane, PAPER, keys, ALL)
     assert colour.counts is not None and len(colour.counts) == 2 * 12
-    assert_same(colour, chip.expose(np.tile(plane, 3), PAPER, keys, ALL, staged=True))
-    by_plane = colour.counts.reshape(2, 3, 4)
-    single = chip.expose(plane, PAPER, keys, ALL)
-    assert single.counts is not None
-    assert np.array_equal(by_plane[:1, 0], single.counts.reshape(2, 4)[:1])  # the first plane, draw by draw
+    assert_same(colour, chip.expose(plane, PAPER, keys, ALL, staged=True))
+    assert_same(colour.images(3, 4), chip.expose(plane[3:4], PAPER, streams([3]), ALL))
+    grouped = colour.grouped(3)
+    assert grouped.tr is not None and grouped.tr.pixels == 12
+    assert_same(grouped.images(1, 2), colour.images(3, 6).grouped(3))
     if mapped.name in ("detection", "dark_counts"):
         expected, _ = chip.rates(plane, PAPER)
-        assert np.all((by_plane > 0) == (expected[:, None] > 0))
+        # 2e6 photons/s for 1 ms: a live pixel has hundreds of detections, a blind one a dark count at most
+        assert np.array_equal(colour.counts.reshape(6, 4) > 20, expected > 1e5)
+
+
+def test_photons_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match="4 pixels"):
+        sensor(4, *paper_effects()).expose(np.ones((1, 12)), PAPER, streams([0]), ALL)
 
 
 # ---- draws belong to an image -----------------------------------------------------------------------------

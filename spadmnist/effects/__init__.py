@@ -16,6 +16,7 @@ fixes the order and what its hook receives:
 | readout | apply(events, rng) | Events -> Events |
 
 An arrival effect acts on the light, or with `acts_on = "dark"` on the dark rate; `maximum` is the largest factor.
+A timing effect sees TR streams, and the frames' first stamps (STR) with one frame a row, s since its start.
 `rng` is a `numpy.random.Generator` of the effect's own for each fixed block of images, or, with `counted = True` on
 the class, a `spadmnist.streams.Draws` for the counter-based kernels.
 """
@@ -70,6 +71,7 @@ class Effect(Plugin, abstract=True):
     registry: ClassVar[Registry] = Registry("effect")
     stage: ClassVar[str]
     after: ClassVar[str | None] = None  # the effect of the same stage that comes before this one
+    last: ClassVar[bool] = False  # it comes behind all others of its stage
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
     acts_on: ClassVar[str] = "light"  # arrival stage: "light" or "dark"
 
@@ -90,13 +92,13 @@ class Effect(Plugin, abstract=True):
 
 
 def in_order(effects: list[Effect]) -> list[Effect]:
-    """By stage; within a stage by name, and each behind the one it names in `after`."""
+    """By stage; within a stage by name, each behind the one it names in `after`, and at the end what is `last`."""
     stages = list(STAGES)
-    waiting = sorted(effects, key=lambda e: (stages.index(e.stage), e.name))
+    waiting = sorted(effects, key=lambda e: (stages.index(e.stage), e.last, e.name))
     ordered: list[Effect] = []
     while waiting:
         names = {e.name for e in waiting}
         ready = [e for e in waiting if e.after not in names - {e.name}] or waiting
         ordered.append(ready[0])
         waiting.remove(ready[0])
-    return sorted(ordered, key=lambda e: stages.index(e.stage))
+    return sorted(ordered, key=lambda e: (stages.index(e.stage), e.last))

@@ -16,6 +16,7 @@ class Tdc(Effect, stage="timing"):
     """
 
     counted = True
+    last = True  # whatever else happens to a time stamp happens before it becomes a number
 
     resolution = parameter(
         10e-12,
