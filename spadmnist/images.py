@@ -8,31 +8,24 @@ nothing is executed or unpickled, and nothing is read beyond what the file itsel
 from __future__ import annotations
 
 import contextlib
-import functools
-import gzip
 import hashlib
-import math
 import os
 import sys
 import tempfile
-import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import IO, Annotated, Any, Literal, cast
+from typing import IO, Annotated, Any, Literal
 
 import numpy as np
-from numpy.lib import format as npy
 from pydantic import BaseModel, ConfigDict, Field
 
+from . import image_files
+from .digits import draw_digit
 from .errors import InputError
-
-MAX_BYTES = 8 * 2**30  # the images of one source; beyond it a header is taken for damaged or hostile
-_MAX_DEFLATE = 1032  # deflate, the packing of gzip and zip, gains at most this factor
+from .image_files import idx_sha256, looks_like, read_idx, read_image, read_member, read_npy, reason
 
 # SHA-256 of the unpacked files: packed copies differ from mirror to mirror
 MNIST_SHA256 = {
@@ -47,8 +40,6 @@ MNIST_MIRRORS = (
 )
 _MNIST_MAX_BYTES = 64 * 2**20  # no mirror may send more than this for one file
 
-# Pillow's other formats stay shut: some of them start programs (EPS calls Ghostscript)
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "GIF", "WEBP")
 _SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"),
     *(".pgm", ".ppm", ".pnm", ".pbm", ".gif", ".webp"),
@@ -183,7 +174,7 @@ class _Source(BaseModel):
         except OSError as error:
             place = error.filename or self.describe()
             raise InputError(
-                f"{place}: cannot be opened ({error.strerror or _reason(error)}); check the path and its permissions"
+                f"{place}: cannot be opened ({error.strerror or reason(error)}); check the path and its permissions"
             ) from error
         except MemoryError as error:
             raise InputError(
@@ -205,12 +196,6 @@ class _Source(BaseModel):
     def describe(self) -> str:
         """The source in a few words, without reading anything."""
         raise NotImplementedError
-
-
-def _reason(error: Exception) -> str:
-    """What another library says is wrong: one line, or only the kind of error where it says too much."""
-    text = " ".join(str(error).split())
-    return text if 0 < len(text) <= 150 else type(error).__name__
 
 
 def _data_dir() -> Path | None:
@@ -238,87 +223,6 @@ def _find(path: str, folders: Sequence[Path | None], exists: Callable[[Path], bo
 
 
 # --- IDX files -------------------------------------------------------------------------------------------
-
-
-def read_idx(path: Path, ndim: int) -> np.ndarray:
-    """The uint8 array of `ndim` dimensions in an IDX file, packed by gzip or not (its content decides).
-
-    Raises InputError for anything but a whole, undamaged file; never reads more than the header declares.
-    """
-    try:
-        with open(path, "rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-            file.seek(0)
-            stream = gzip.GzipFile(fileobj=file) if packed else file
-            file_bytes = os.fstat(file.fileno()).st_size
-            most = file_bytes * _MAX_DEFLATE if packed else file_bytes
-            return _read_idx(cast(IO[bytes], stream), ndim, path, most)
-    except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-        raise InputError(f"{path}: its gzip data are damaged ({_reason(error)}); download or copy it again") from error
-
-
-def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int) -> np.ndarray:
-    """The array in an unpacked stream that cannot hold more than `most` bytes."""
-    magic = bytes([0, 0, 8, ndim])
-    head = stream.read(4 + 4 * ndim)
-    if not head:
-        raise InputError(f"{path}: the file is empty; download or copy it again")
-    if head[:4] != magic:
-        raise InputError(
-            f"{path}: this is {_looks_like(head)}, not an IDX file of unsigned bytes in {ndim} "
-            f"dimension{'s' * (ndim > 1)} (it would begin with {magic.hex(' ')}); name the right file"
-        )
-    if len(head) < 4 + 4 * ndim:
-        raise InputError(f"{path}: the file ends inside its header; download or copy it again")
-    shape = tuple(int.from_bytes(head[i : i + 4], "big") for i in range(4, len(head), 4))
-    declared = f"its header declares {' x '.join(str(n) for n in shape)} bytes"
-    size = math.prod(shape)
-    if size == 0:
-        raise InputError(f"{path}: {declared}, that is nothing; give a file with at least one image")
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: {declared}, more than the {MAX_BYTES} allowed; the file is damaged")
-    if size > most - len(head):
-        raise InputError(f"{path}: {declared}, more than the file can hold; download or copy it again")
-    data = np.empty(size, np.uint8)
-    view, filled = data.data, 0
-    while filled < size:
-        got = stream.readinto(view[filled:])  # type: ignore[attr-defined]
-        if not got:
-            raise InputError(f"{path}: {declared}, but only {filled} follow; download or copy it again")
-        filled += got
-    # reading past the end also makes gzip check its checksum
-    if stream.read(1):
-        raise InputError(f"{path}: {declared}, but more follow; the file is damaged or not what it says")
-    return data.reshape(shape)
-
-
-def _looks_like(head: bytes) -> str:
-    """What a file that begins with `head` seems to be."""
-    known = {
-        b"PK": "a zip archive",
-        b"\x1f\x8b": "a file that gzip packed twice",
-        b"\x89PNG": "a PNG image",
-        b"\xff\xd8": "a JPEG image",
-        b"\x93NUMPY": "a NumPy array",
-        b"\x89HDF": "an HDF5 file",
-        b"%PDF": "a PDF document",
-    }
-    for prefix, name in known.items():
-        if head.startswith(prefix):
-            return name
-    if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
-        return "an HTML page, perhaps a server's error page"
-    if len(head) >= 4 and head[:2] == b"\0\0" and head[2] in (8, 9, 11, 12, 13, 14):
-        return f"an IDX file of another kind (type {head[2]:#04x}, {head[3]} dimensions)"
-    return f"a file that begins with {head[:4].hex(' ')}"
-
-
-def _idx_sha256(array: np.ndarray) -> str:
-    """SHA-256 of the unpacked IDX file that holds the uint8 array: the format leaves no freedom."""
-    header = bytes([0, 0, 8, array.ndim]) + b"".join(n.to_bytes(4, "big") for n in array.shape)
-    digest = hashlib.sha256(header)
-    digest.update(array.data)
-    return digest.hexdigest()
 
 
 def _labelled(images: np.ndarray, labels: np.ndarray | None, white: float, files: tuple[object, object]) -> Images:
@@ -417,7 +321,7 @@ def _find_mnist(name: str, folder: Path) -> Path | None:
 
 def _checked_mnist(path: Path, name: str) -> np.ndarray:
     array = read_idx(path, 3 if "images" in name else 1)
-    digest = _idx_sha256(array)
+    digest = idx_sha256(array)
     if digest != MNIST_SHA256[name]:
         raise InputError(
             f"{path}: this is not MNIST's {name}: its unpacked SHA-256 is {digest}, MNIST's is "
@@ -458,7 +362,7 @@ def _download_mnist(name: str, path: Path) -> np.ndarray:
             failures.append(f"{mirror}: it sends another file")
         # the errors of requests are OSErrors, and long where they come from the network
         except (OSError, ValueError) as error:
-            failures.append(f"{mirror}: {_reason(error)}")
+            failures.append(f"{mirror}: {reason(error)}")
         finally:
             part.unlink(missing_ok=True)
     raise InputError(
@@ -598,16 +502,16 @@ def _classes(root: Path, prefix: str, names: list[str]) -> list[str] | None:
 
 def _read_folder(root: Path, names: list[str], white: float | None) -> np.ndarray:
     """All images, (n, rows, columns) or (n, 3, rows, columns), after checking that they are alike."""
-    first = _decode(root / names[0])
-    if first.nbytes * len(names) > MAX_BYTES:
+    first = read_image(root / names[0])
+    if first.nbytes * len(names) > image_files.MAX_BYTES:
         raise InputError(
-            f"{root}: {len(names)} images like {names[0]} take more than the {MAX_BYTES} bytes allowed; "
+            f"{root}: {len(names)} images like {names[0]} take more than the {image_files.MAX_BYTES} bytes allowed; "
             "give fewer (--limit) or smaller ones"
         )
     pixels = np.empty((len(names), *first.shape), first.dtype)
     top = _white(white, first.dtype)
     for i, name in enumerate(names):
-        image = _decode(root / name) if i else first
+        image = read_image(root / name) if i else first
         if (image.shape, image.dtype) != (first.shape, first.dtype):
             raise InputError(
                 f"{root / name}: it is {_kind(image)}, but {names[0]} is {_kind(first)}; "
@@ -626,58 +530,6 @@ def _kind(image: np.ndarray) -> str:
     rows, columns = image.shape[-2:]
     kind = "colour" if image.ndim == 3 else "grey"
     return f"{rows} x {columns} pixels (rows x columns), {8 * image.itemsize}-bit {kind}"
-
-
-def _decode(path: Path) -> np.ndarray:
-    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour."""
-    from PIL import Image, UnidentifiedImageError
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-        try:
-            with Image.open(path, formats=_FORMATS) as image:
-                image.verify()  # PNG's checksums, which decoding leaves out
-            with Image.open(path, formats=_FORMATS) as image:
-                return _to_pixels(image, path)
-        except InputError:
-            raise
-        except UnidentifiedImageError as error:
-            raise InputError(f"{path}: its content is none of {', '.join(_FORMATS)}; replace or remove it") from error
-        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-            raise InputError(
-                f"{path}: it declares more than the {Image.MAX_IMAGE_PIXELS} pixels allowed; "
-                "make it smaller or remove it"
-            ) from error
-        # damaged files make decoders raise nearly anything: OSError, SyntaxError, struct.error, ...
-        except Exception as error:
-            raise InputError(
-                f"{path}: it cannot be read as an image ({_reason(error)}); replace or remove it"
-            ) from error
-
-
-def _to_pixels(image: Any, path: Path) -> np.ndarray:
-    """The pixels of an open Pillow image, or InputError where they would not be what the file says."""
-    # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
-    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
-        raise InputError(f"{path}: it holds {image.n_frames} images; store each in a file of its own")
-    mode = image.mode
-    # Pillow would quietly drop the lower eight bits
-    deep = not mode.startswith("I") and any(";16" in str(tile) for tile in image.tile)
-    if deep or mode not in ("1", "L", "LA", "I", "I;16", "I;16B", "I;16L", "P", "PA", "RGB", "RGBA"):
-        kind = "more than 8 bits per channel" if deep else f"pixels of the kind {mode}"
-        raise InputError(
-            f"{path}: it has {kind}; convert it to 8-bit RGB or to 8-bit or 16-bit grey, or use source array"
-        )
-    if image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255):
-        raise InputError(f"{path}: parts of it are transparent; put it on a background and store it without")
-    if mode.startswith("I"):
-        pixels = np.asarray(image)
-        if pixels.min() < 0 or pixels.max() > 65535:
-            raise InputError(f"{path}: its grey levels do not fit into 16 bits; scale them to 0 to 65535")
-        return pixels.astype(np.uint16)
-    if mode in ("1", "L", "LA"):
-        return np.asarray(image.convert("L"))
-    return np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
 
 
 # --- arrays ----------------------------------------------------------------------------------------------
@@ -717,18 +569,18 @@ class Array(_Source):
             head = file.read(6)
             file.seek(0)
             if head == b"\x93NUMPY":
-                images = _read_npy(file, path.stat().st_size, str(path))
+                images = read_npy(file, path.stat().st_size, str(path))
                 return {"train": self._split(images, None, limit, (str(path), None))}
             if head[:2] == b"PK":
                 return self._read_npz(file, path, limit)
-        seems = _looks_like(head) if head else "an empty file"
+        seems = looks_like(head) if head else "an empty file"
         raise InputError(f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez")
 
     def _read_npz(self, file: IO[bytes], path: Path, limit: int | None) -> dict[str, Images]:
         try:
             archive = zipfile.ZipFile(file)
         except Exception as error:  # damaged directories make zipfile raise nearly anything
-            raise InputError(f"{path}: the archive is damaged ({_reason(error)}); copy or store it again") from error
+            raise InputError(f"{path}: the archive is damaged ({reason(error)}); copy or store it again") from error
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         names = next((pairs for pairs in _NPZ_NAMES if pairs[0][0] in members), None)
         if names is None:
@@ -736,17 +588,19 @@ class Array(_Source):
             held = ", ".join(sorted(members)[:10]) or "nothing"
             raise InputError(f"{path}: it holds {held}, but no {allowed}; rename the arrays")
         wanted = [members[name] for pair in names for name in pair if name in members]
-        if sum(info.file_size for info in wanted) > MAX_BYTES:
-            raise InputError(f"{path}: its arrays declare more than the {MAX_BYTES} bytes allowed; store fewer images")
+        if sum(info.file_size for info in wanted) > image_files.MAX_BYTES:
+            raise InputError(
+                f"{path}: its arrays declare more than the {image_files.MAX_BYTES} bytes allowed; store fewer images"
+            )
         splits, file_bytes = {}, path.stat().st_size
         for split, (images_name, labels_name) in zip(("train", "test"), names, strict=False):
             if images_name not in members:
                 continue
             places = (f"{path}: {images_name}", f"{path}: {labels_name}")
-            images = _read_member(archive, members[images_name], file_bytes, places[0])
+            images = read_member(archive, members[images_name], file_bytes, places[0])
             labels = None
             if labels_name in members:
-                labels = _read_member(archive, members[labels_name], file_bytes, places[1])
+                labels = read_member(archive, members[labels_name], file_bytes, places[1])
             splits[split] = self._split(images, labels, limit, places)
         return splits
 
@@ -761,47 +615,6 @@ class Array(_Source):
             labels = _to_labels(labels, str(places[1]))
         pixels, white = _to_images(images, self.white, places[0])
         return _labelled(pixels, labels, white, places).head(limit)
-
-
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:
-    if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise InputError(
-            f"{place} is encrypted or packed in an unusual way; store it by np.savez or np.savez_compressed"
-        )
-    if info.file_size > file_bytes * _MAX_DEFLATE:
-        raise InputError(f"{place} declares {info.file_size} bytes, more than the file can hold; store it again")
-    try:
-        with archive.open(info) as stream:
-            return _read_npy(stream, info.file_size, place)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # as above
-        raise InputError(f"{place} is damaged ({_reason(error)}); copy or store the file again") from error
-
-
-def _read_npy(stream: IO[bytes], size: int, place: str) -> np.ndarray:
-    """The array in a `.npy` stream of `size` bytes; its header is checked against that before it is read."""
-    try:
-        version = npy.read_magic(stream)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"format version {version[0]}.{version[1]}, which plain numbers never need")
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
-    # the header is a Python literal, and NumPy's reader of it raises nearly anything when it is damaged
-    except Exception as error:
-        raise InputError(f"{place}: its header is damaged ({_reason(error)}); store it again by np.save") from error
-    if dtype.kind not in "biuf":
-        raise InputError(f"{place}: it holds {dtype}, not plain numbers; store uint8, uint16 or float32")
-    declared, held = math.prod(shape) * dtype.itemsize, size - stream.tell()
-    if declared > MAX_BYTES:
-        raise InputError(f"{place}: it declares {declared} bytes, {MAX_BYTES} are allowed; store fewer images")
-    if declared != held or min(shape, default=0) < 0:
-        raise InputError(f"{place}: it declares {shape} {dtype}, {declared} bytes, but {held} follow; store it again")
-    stream.seek(0)
-    try:
-        return npy.read_array(stream, allow_pickle=False)
-    except ValueError as error:
-        raise InputError(f"{place}: it ends too early ({_reason(error)}); store it again by np.save") from error
 
 
 def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.ndarray, float]:
@@ -877,92 +690,16 @@ class Digits(_Source):
             number = min(number, limit or number)
             if not number:
                 continue
-            if number * self.rows * self.columns > MAX_BYTES:
+            if number * self.rows * self.columns > image_files.MAX_BYTES:
                 raise InputError(
                     f"scene.images: {number} digits of {self.rows} x {self.columns} pixels take more than "
-                    f"the {MAX_BYTES} bytes allowed; ask for fewer or smaller ones"
+                    f"the {image_files.MAX_BYTES} bytes allowed; ask for fewer or smaller ones"
                 )
             pixels = np.empty((number, self.rows, self.columns), np.uint8)
             for i in range(number):
                 pixels[i] = draw_digit(i % 10, (self.seed, stream, i), self.rows, self.columns)
             splits[split] = Images(pixels, (np.arange(number) % 10).astype(np.uint8), 255.0)
         return splits
-
-
-def _arc(x: float, y: float, rx: float, ry: float, start: float, stop: float) -> list[tuple[float, float]]:
-    """Points on an ellipse; angles in degrees, clockwise from the right (y points down)."""
-    steps = math.ceil(abs(stop - start) / 22)
-    angles = [math.radians(start + (stop - start) * i / steps) for i in range(steps + 1)]
-    return [(x + rx * math.cos(a), y + ry * math.sin(a)) for a in angles]
-
-
-@functools.cache
-def _glyphs() -> tuple[tuple[np.ndarray, ...], ...]:
-    """For each digit the ways to write it, each (segments, 2 ends, x and y) in a box of about 1 x 1."""
-    ways: list[list[list[list[tuple[float, float]]]]] = [
-        [[_arc(0.5, 0.5, 0.36, 0.5, -100, 260)]],
-        [
-            [[(0.5, 0.0), (0.5, 1.0)]],
-            [[(0.27, 0.24), (0.5, 0.0), (0.5, 1.0)]],
-        ],
-        [[[*_arc(0.5, 0.28, 0.34, 0.28, 195, 395), (0.5, 0.7), (0.13, 1.0), (0.9, 1.0)]]],
-        [[[*_arc(0.46, 0.25, 0.32, 0.25, 205, 445), *_arc(0.46, 0.74, 0.37, 0.26, -85, 150)]]],
-        [
-            [[(0.66, 1.0), (0.66, 0.0), (0.1, 0.66), (0.92, 0.66)]],
-            [[(0.2, 0.03), (0.13, 0.52), (0.8, 0.5)], [(0.8, 0.0), (0.72, 1.0)]],
-        ],
-        [[[(0.84, 0.0), (0.3, 0.0), (0.22, 0.44), *_arc(0.46, 0.68, 0.36, 0.32, -125, 145)]]],
-        [[[(0.68, 0.0), (0.42, 0.2), (0.24, 0.45), *_arc(0.48, 0.71, 0.31, 0.29, 180, 535)]]],
-        [
-            [[(0.12, 0.02), (0.86, 0.0), (0.6, 0.45), (0.42, 1.0)]],
-            [[(0.12, 0.02), (0.86, 0.0), (0.6, 0.45), (0.42, 1.0)], [(0.34, 0.52), (0.82, 0.5)]],
-        ],
-        [[_arc(0.5, 0.25, 0.29, 0.25, 90, 450), _arc(0.5, 0.75, 0.34, 0.25, -90, 270)]],
-        [[[*_arc(0.48, 0.29, 0.31, 0.29, 0, -360), (0.76, 0.6), (0.66, 1.0)]]],
-    ]
-    return tuple(
-        tuple(np.array([ends for stroke in strokes for ends in pairwise(stroke)]) for strokes in digit)
-        for digit in ways
-    )
-
-
-def draw_digit(digit: int, key: Sequence[int], rows: int, columns: int) -> np.ndarray:
-    """One digit in a hand that `key` decides: (rows, columns) uint8, white (255) on black.
-
-    As in MNIST it is fitted into a centred box of 20/28 of the image.
-    """
-    # raw bits: their stream never changes with NumPy's version, that of its distributions may
-    raw = np.random.Philox(np.random.SeedSequence(tuple(key))).random_raw(16)
-    u = iter((raw / 2.0**63 - 1.0).tolist())  # from -1 to 1
-    ways = _glyphs()[digit]
-    segments = ways[int((next(u) + 1) / 2 * len(ways)) % len(ways)]
-    x, y = segments[..., 0] - 0.5, segments[..., 1] - 0.5
-
-    # an unsteady hand: a slow wave along each axis; then width, slant and turn
-    x, y = (
-        x + 0.05 * next(u) * np.sin(5 * y + 3 * next(u)) + 0.04 * next(u) * np.sin(4 * x + 3 * next(u)),
-        y + 0.05 * next(u) * np.sin(5 * x + 3 * next(u)) + 0.03 * next(u) * np.sin(4 * y + 3 * next(u)),
-    )
-    x = x * (0.86 + 0.16 * next(u)) - y * (0.12 + 0.22 * next(u))
-    turn = 0.14 * next(u)
-    x, y = x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)
-
-    unit = min(rows, columns) / 28
-    radius = unit * (1.15 + 0.4 * next(u))
-    box = 20 * unit - 2 * radius
-    scale = box / max(np.ptp(x), np.ptp(y))
-    x = (x - (x.min() + x.max()) / 2) * scale + (columns - 1) / 2 + 0.8 * unit * next(u)
-    y = (y - (y.min() + y.max()) / 2) * scale + (rows - 1) / 2 + 0.8 * unit * next(u)
-
-    column, row = np.arange(columns), np.arange(rows)[:, None]
-    nearest = np.full((rows, columns), np.inf)
-    for (x0, x1), (y0, y1) in zip(x.tolist(), y.tolist(), strict=True):
-        dx, dy = x1 - x0, y1 - y0
-        along = ((column - x0) * dx + (row - y0) * dy) / (dx * dx + dy * dy)
-        along = np.minimum(np.maximum(along, 0.0), 1.0)
-        nearest = np.minimum(nearest, (column - x0 - along * dx) ** 2 + (row - y0 - along * dy) ** 2)
-    ink = (radius - np.sqrt(nearest)) / unit / 1.3 + 0.5  # an edge as soft as MNIST's
-    return np.rint(255 * np.clip(ink, 0.0, 1.0)).astype(np.uint8)
 
 
 # --- uniform light ---------------------------------------------------------------------------------------

@@ -23,8 +23,10 @@ from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 from pydantic import TypeAdapter, ValidationError
 
+from spadmnist import image_files
 from spadmnist import images as module
 from spadmnist.errors import InputError
+from spadmnist.image_files import read_idx
 from spadmnist.images import (
     Array,
     Digits,
@@ -35,7 +37,6 @@ from spadmnist.images import (
     Mnist,
     Uniform,
     check_size,
-    read_idx,
 )
 
 SHAPE = (28, 28)
@@ -668,7 +669,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
     refused(lambda: load_folder(root), "loop", "link", "remove")
     (root / "train" / "loop").unlink()
     save(root / "test" / "a.png", GREY)
-    monkeypatch.setattr(module, "MAX_BYTES", 5)
+    monkeypatch.setattr(image_files, "MAX_BYTES", 5)
     refused(lambda: load_folder(root), root, "5 bytes allowed", "--limit")
 
 
@@ -861,7 +862,7 @@ def test_damaged_array_file(tmp_path: Path, data: bytes, parts: list[str]) -> No
 
 def test_zip_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.savez_compressed(tmp_path / "x.npz", images=PIXELS, labels=LABELS)
-    monkeypatch.setattr(module, "MAX_BYTES", 300)
+    monkeypatch.setattr(image_files, "MAX_BYTES", 300)
     refused(lambda: load_array(tmp_path / "x.npz"), tmp_path / "x.npz", "300 bytes allowed", "fewer")
 
 
