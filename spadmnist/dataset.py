@@ -24,12 +24,13 @@ import numpy as np
 
 from . import config, kernels, plugins, reconstruct, store, units
 from .config import Experiment, Level
+from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
-from .store import Column, Files, ShardReader
+from .store import Column, ShardReader
 
 FORMAT = "spadmnist-dataset/1"
 MANIFEST = "manifest.json"

@@ -29,14 +29,15 @@ from typing import Any
 
 import numpy as np
 
-from . import __version__, config, dataset, document, plugins, reconstruct, store
+from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
 from .config import Experiment
 from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Shard
+from .disk import Files
 from .errors import InputError, SpadError
 from .images import Images
 from .plugins import Distribution, MapFile
 from .reconstruct import median_of_nonzero
-from .store import Files, ShardReader
+from .store import ShardReader
 
 _ROUNDS = 3
 _VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
@@ -122,7 +123,7 @@ def _record_path(root: Path, shard: Shard) -> Path:
 
 def note(root: Path, shard: Shard, files: Files) -> None:
     """Remember the digests of a shard's files until the manifest lists them."""
-    store.commit_file(_record_path(root, shard), dataset.canonical(files), store.temporary(root))
+    disk.commit_file(_record_path(root, shard), dataset.canonical(files), disk.temporary(root))
 
 
 def _start_worker(parent: int) -> None:
@@ -394,8 +395,8 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> None:
 def begin(root: Path, wanted: dict[str, Any]) -> None:
     """Note what is being made, so that the same command can go on with it and no other can."""
     with _writable(root):
-        store.sweep(store.temporary(root))
-        store.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), store.temporary(root))
+        disk.sweep(disk.temporary(root))
+        disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
 def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images]) -> None:
@@ -618,7 +619,7 @@ def finish(
         run_tasks(_normalise, tasks, keys, jobs, done)
     progress.stop()
 
-    temporary = store.temporary(root)
+    temporary = disk.temporary(root)
     files: Files = {}
     for shard in shards:
         files |= json.loads(_record_path(root, shard).read_bytes())
@@ -626,7 +627,7 @@ def finish(
     files |= store.write_groups(root, groups, experiment.format)
     for name, data in small.items():
         if name not in files:
-            files[name] = store.commit_file(root / name, data, temporary)
+            files[name] = disk.commit_file(root / name, data, temporary)
     settings = asdict(experiment.settings)
     manifest = {
         **wanted,
@@ -639,7 +640,7 @@ def finish(
         "files": files,
     }
     sealed = dataset.seal(manifest)
-    store.commit_file(root / MANIFEST, sealed, temporary)
+    disk.commit_file(root / MANIFEST, sealed, temporary)
     shutil.rmtree(root / STATE)
     return json.loads(sealed)
 

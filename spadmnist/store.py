@@ -20,15 +20,11 @@ to read one image's part. The reader accepts exactly the layout that the writer 
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import hashlib
 import json
 import math
 import os
 import re
-import secrets
-import shutil
 import stat
 import struct
 import zlib
@@ -43,7 +39,8 @@ import numcodecs.zstd
 import numpy as np
 from numcodecs.fletcher32 import Fletcher32
 
-from spadmnist.errors import InputError, SpadError
+from .disk import Files, commit_file, inside, install, put_tree, temporary, workspace, writing
+from .errors import InputError
 
 # One task is one core; with threads of its own Blosc would use more of them without need.
 numcodecs.blosc.use_threads = False
@@ -53,7 +50,6 @@ ROWS_OF_TICKS = 1 << 16  # per chunk of a flat axis: 256 KiB of uint32, 0.1 ms t
 
 _LARGEST_CHUNK = 1 << 28  # bytes; what one chunk may take in memory, when written and when read
 _LARGEST_JSON = 1 << 20  # bytes
-_LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 _TYPES = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+ -]*(?<![. ])")
 
@@ -87,9 +83,6 @@ class Column:
     attributes: Mapping[str, Any] = field(default_factory=dict)  # text, numbers, lists of them
 
 
-Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
-
-
 # --- where things are -----------------------------------------------------------------------------
 def location(path: str, format: str) -> str:
     """Where a shard lies, relative to the root."""
@@ -97,11 +90,6 @@ def location(path: str, format: str) -> str:
     for part in path.split("/"):
         _check_name(part, path)
     return f"data.zarr/{path}" if format == "zarr" else f"data/{path}.h5"
-
-
-def temporary(root: str | os.PathLike[str]) -> Path:
-    """The folder for what is not complete yet. Its content may be swept when nobody writes."""
-    return Path(root) / ".spadmnist" / "tmp"
 
 
 def exists(root: str | os.PathLike[str], path: str, format: str) -> bool:
@@ -127,162 +115,6 @@ def _check_name(name: str, where: str) -> None:
 
 
 # --- writing: the disk ----------------------------------------------------------------------------
-def commit_file(path: str | os.PathLike[str], data: bytes, tmp: str | os.PathLike[str]) -> dict[str, Any]:
-    """Write one file so that it is there as a whole or not at all; an older one is replaced.
-
-    `tmp` must be on the same file system. Returns {"bytes": ..., "sha256": ...}.
-    """
-    path = Path(path)
-    with _writing(path, len(data)), _workspace(Path(tmp)) as work:
-        _make_folder(path.parent)
-        record = _put(work / "file", [data])
-        _sync(work / "file")
-        os.rename(work / "file", path)
-        _sync(path.parent)
-    return record
-
-
-def sweep(tmp: str | os.PathLike[str]) -> int:
-    """Remove what interrupted runs left in a temporary folder; how many things that were.
-
-    Only for who holds the lock of the run: another writer's files would go as well.
-    """
-    count = 0
-    if Path(tmp).is_symlink() or Path(tmp).parent.is_symlink():
-        raise SpadError(f"{tmp}: there is a symbolic link on the way, and what it leads to is not removed; remove it")
-    try:
-        entries = list(os.scandir(tmp))
-    except FileNotFoundError:
-        return 0
-    for entry in entries:
-        count += 1
-        if entry.is_dir(follow_symlinks=False):
-            shutil.rmtree(entry.path)
-        else:
-            os.unlink(entry.path)
-    return count
-
-
-@contextlib.contextmanager
-def _writing(place: Path, size: int) -> Iterator[None]:
-    """Turn what the system says about a failed write into a sentence that helps."""
-    try:
-        yield
-    except OSError as error:
-        again = "type the same command again; what is complete is kept"
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            advice = f"free some space (or choose another place with -o) and {again}"
-        elif error.errno == errno.EFBIG:
-            advice = f"raise the limit of a file's size (ulimit -f) and {again}"
-        elif error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            advice = f"allow writing there (or choose another place with -o) and {again}"
-        elif error.errno == errno.ENAMETOOLONG:
-            advice = f"choose a place with a shorter name with -o and {again}"
-        else:
-            advice = f"see to that (or choose another place with -o) and {again}"
-        reason = error.strerror or str(error)
-        raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
-
-
-def _amount(size: int) -> str:
-    return f"{size} bytes" if size < 10_000 else f"{size / 1e6:.3g} MB"
-
-
-@contextlib.contextmanager
-def _workspace(tmp: Path) -> Iterator[Path]:
-    """A new folder of one's own, which is gone afterwards, whatever happens."""
-    _make_folder(tmp)
-    work = tmp / f"{os.getpid()}-{secrets.token_hex(8)}"
-    os.mkdir(work)  # fails where the name exists
-    try:
-        yield work
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-
-
-def _make_folder(folder: Path) -> None:
-    """Make a folder and what is missing above it, so that it outlives a loss of power."""
-    if folder.is_dir():
-        return
-    _make_folder(folder.parent)
-    with contextlib.suppress(FileExistsError):  # another worker was faster
-        os.mkdir(folder)
-    _sync(folder.parent)
-
-
-def _inside(root: Path, relative: str) -> Path:
-    """`root / relative`, with the folders above it made, none of which may be a link to somewhere else."""
-    folder = root
-    for part in relative.split("/")[:-1]:
-        folder = folder / part
-        _make_folder(folder)
-        if folder.is_symlink():
-            raise SpadError(f"{folder}: this is a symbolic link; inside a dataset only real folders are written to")
-    return root / relative
-
-
-def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
-    """Write a new file (not yet synchronised); its size and SHA-256, taken from memory.
-
-    The pieces come from a generator that compresses them, so that only one at a time is in memory: fresh
-    memory for all of them would cost more time than the compression.
-    """
-    digest, size = hashlib.sha256(), 0
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb") as file:
-        for piece in pieces:
-            digest.update(piece)
-            size += len(piece)
-            file.write(piece)
-    return {"bytes": size, "sha256": digest.hexdigest()}
-
-
-def _put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
-    """Write new files below a folder that is made here, and synchronise all of it.
-
-    First all are written, then all are synchronised: the system then writes them in one go.
-    """
-    folders = {folder}
-    os.mkdir(folder)
-    records = {}
-    for name, pieces in sorted(files.items()):
-        path = folder / name
-        missing = [parent for parent in path.parents if folder in parent.parents and parent not in folders]
-        for parent in reversed(missing):
-            os.mkdir(parent)
-            folders.add(parent)
-        records[name] = _put(path, pieces)
-    for name in files:
-        _sync(folder / name)
-    for parent in folders:
-        _sync(parent)
-    return records
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-        if hasattr(os, "posix_fadvise") and os.fstat(handle).st_size >= _LARGE_FILE:
-            # what is safe on disk need not push others' data out of memory; its pages serve the next shard
-            os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
-    finally:
-        os.close(handle)
-
-
-def _install(new: Path, final: Path, aside: Path) -> None:
-    """Rename a folder or file into its place; what stood there goes."""
-    try:
-        os.rename(new, final)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-            raise
-        os.rename(final, aside)  # no full folder is replaced at once; for a moment none is there
-        try:
-            os.rename(new, final)
-        except OSError:
-            os.rename(aside, final)
-            raise
-    _sync(final.parent)
 
 
 # --- writing: shards ------------------------------------------------------------------------------
@@ -306,12 +138,12 @@ def write_shard(
     else:
         files = {"shard": [_hdf5_image(checked, own)]}
     with (
-        _writing(root / relative, sum(column.data.nbytes for column in checked.values())),
-        _workspace(_inside(root, ".spadmnist/tmp/x").parent) as work,
+        writing(root / relative, sum(column.data.nbytes for column in checked.values())),
+        workspace(inside(root, ".spadmnist/tmp/x").parent) as work,
     ):
-        final = _inside(root, relative)
-        records = _put_tree(work / "new", files)
-        _install(work / "new" / "shard", final, work / "old")
+        final = inside(root, relative)
+        records = put_tree(work / "new", files)
+        install(work / "new" / "shard", final, work / "old")
     return {relative + name.removeprefix("shard"): record for name, record in records.items()}
 
 
@@ -338,7 +170,7 @@ def append_columns(root: str | os.PathLike[str], path: str, columns: Mapping[str
     kept = {name: (reader.dims(name), reader.shape(name)) for name in reader.names if name not in checked}
     _check_tree({name: (column.dims, column.data.shape) for name, column in checked.items()} | kept, path)
     files = _zarr_files(checked)
-    shard = _inside(root, f"{relative}/zarr.json").parent
+    shard = inside(root, f"{relative}/zarr.json").parent
     # What is renamed: the array, or the highest group above it that is not there yet.
     units: dict[str, str] = {}
     for name in checked:
@@ -348,15 +180,15 @@ def append_columns(root: str | os.PathLike[str], path: str, columns: Mapping[str
     pending = sorted(set(units.values()))
     records: Files = {}
     with (
-        _writing(root / relative, sum(column.data.nbytes for column in checked.values())),
-        _workspace(_inside(root, ".spadmnist/tmp/x").parent) as work,
+        writing(root / relative, sum(column.data.nbytes for column in checked.values())),
+        workspace(inside(root, ".spadmnist/tmp/x").parent) as work,
     ):
         for i, unit in enumerate(pending):
             mine = {f"unit{file.removeprefix(unit)}": files[file] for file in files if file.startswith(f"{unit}/")}
-            written = _put_tree(work / f"new{i}", mine)
+            written = put_tree(work / f"new{i}", mine)
             records |= {f"{relative}/{unit}{name.removeprefix('unit')}": r for name, r in written.items()}
         for i, unit in enumerate(pending):
-            _install(work / f"new{i}" / "unit", _inside(root, f"{relative}/{unit}"), work / f"old{i}")
+            install(work / f"new{i}" / "unit", inside(root, f"{relative}/{unit}"), work / f"old{i}")
     return records
 
 
@@ -367,8 +199,8 @@ def write_groups(root: str | os.PathLike[str], groups: Mapping[str, Mapping[str,
     """
     records: Files = {}
     for relative, data in group_files(groups, format).items():
-        with _writing(Path(root) / relative, len(data)):
-            final = _inside(Path(root), relative)
+        with writing(Path(root) / relative, len(data)):
+            final = inside(Path(root), relative)
         records[relative] = commit_file(final, data, temporary(root))
     return records
 

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, factory, store
+from . import config, dataset, disk, factory, store
 from .config import Experiment
 from .dataset import CONFIG, MANIFEST, STATE, Shard
+from .disk import Files
 from .errors import InputError, SpadError
 from .factory import Progress
 from .images import Images
@@ -145,7 +146,7 @@ def repair(
             small, _ = factory.small_files(experiment, shards, manifest["normalisation"])
             for name, data in small.items():
                 if name in bad:
-                    store.commit_file(root / name, data, store.temporary(root))
+                    disk.commit_file(root / name, data, disk.temporary(root))
                     did.append(f"made again: {name}")
             shutil.rmtree(root / STATE)
     return did
@@ -208,7 +209,7 @@ def _remake(
     def tasks(paths: Sequence[str]) -> Iterator[Any]:
         return (factory.task_of(experiment, job, apart, by_path[p], splits[by_path[p].split]) for p in paths)
 
-    def done(path: str, result: tuple[str, store.Files]) -> None:
+    def done(path: str, result: tuple[str, Files]) -> None:
         progress.advance(1, path)
         for name, facts in result[1].items():
             if manifest is not None and manifest["files"].get(name) != facts:

@@ -104,7 +104,7 @@ def tree(root: Path) -> dict[str, bytes | str]:
                 found[str(path.relative_to(root))] = f"link to {os.readlink(path)}"
             elif name in files:
                 found[str(path.relative_to(root))] = path.read_bytes()
-        if not folders and not files:
+        if not folders and not files and Path(folder) != root:
             found[str(Path(folder).relative_to(root))] = "empty folder"
     return found
 

@@ -29,7 +29,7 @@ import zarr
 from zarr.core.group import GroupMetadata
 from zarr.core.metadata.v3 import ArrayV3Metadata
 
-from spadmnist import store
+from spadmnist import disk, store
 from spadmnist.errors import InputError, SpadError
 from spadmnist.store import Column, ShardReader, append_columns, exists, write_groups, write_shard
 
@@ -107,7 +107,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, format: str) -> None:
     files = write_shard(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES, format)
     assert exists(tmp_path, "5mlux/train/0000", format)
     assert files == digests(tmp_path)
-    assert list(store.temporary(tmp_path).iterdir()) == []
+    assert list(disk.temporary(tmp_path).iterdir()) == []
     reader = ShardReader(tmp_path, "5mlux/train/0000", format)
     check(reader, columns)
     assert reader.attributes == ATTRIBUTES
@@ -264,7 +264,7 @@ def test_appending_is_writing_all_at_once(tmp_path: Path, format: str) -> None:
     assert files == digests(tmp_path / "twice")
     append_columns(tmp_path / "twice", "s", more, format)  # again: the same is replaced by the same
     assert tree(tmp_path / "twice") == tree(tmp_path / "once")
-    assert list(store.temporary(tmp_path / "twice").iterdir()) == []
+    assert list(disk.temporary(tmp_path / "twice").iterdir()) == []
     with pytest.raises(ValueError, match=r"dimension 'image' has size 7 in .* and 9 in"):
         append_columns(tmp_path / "twice", "s", {"frames/other": more_columns(9)["frames/sum"]}, format)
 
@@ -398,10 +398,10 @@ def test_links_are_refused(tmp_path: Path, format: str) -> None:
     ShardReader(tmp_path / "out", "a/s", format).read("tr/ticks")
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious/file").touch()
-    shutil.rmtree(store.temporary(tmp_path / "out"))
-    store.temporary(tmp_path / "out").symlink_to(tmp_path / "precious")
+    shutil.rmtree(disk.temporary(tmp_path / "out"))
+    disk.temporary(tmp_path / "out").symlink_to(tmp_path / "precious")
     with pytest.raises(SpadError, match="symbolic link"):
-        store.sweep(store.temporary(tmp_path / "out"))
+        disk.sweep(disk.temporary(tmp_path / "out"))
     assert (tmp_path / "precious/file").exists()
 
 
@@ -548,15 +548,15 @@ def test_hostile_hdf5_is_refused(tmp_path: Path) -> None:
 # --- the disk ----------------------------------------------------------------------------------------------
 def test_a_file_is_committed_whole(tmp_path: Path) -> None:
     path, tmp = tmp_path / "out/manifest.json", tmp_path / "out/.spadmnist/tmp"
-    assert store.commit_file(path, b"one", tmp) == {
+    assert disk.commit_file(path, b"one", tmp) == {
         "bytes": 3, "sha256": hashlib.sha256(b"one").hexdigest()
     }  # fmt: skip
-    store.commit_file(path, b"two", tmp)
+    disk.commit_file(path, b"two", tmp)
     assert path.read_bytes() == b"two" and list(tmp.iterdir()) == []
     (tmp / "left/over").mkdir(parents=True)
     (tmp / "file").touch()
-    assert store.sweep(tmp) == 2 and list(tmp.iterdir()) == []
-    assert store.sweep(tmp_path / "nowhere") == 0
+    assert disk.sweep(tmp) == 2 and list(tmp.iterdir()) == []
+    assert disk.sweep(tmp_path / "nowhere") == 0
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -594,7 +594,7 @@ def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
                 assert set(columns) <= set(present)
                 check(reader, present)
     assert whole
-    store.sweep(store.temporary(tmp_path))
+    disk.sweep(disk.temporary(tmp_path))
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {".spadmnist", "data.zarr" if format == "zarr" else "data"}
 
@@ -625,8 +625,8 @@ def test_a_full_disk(tmp_path: Path, format: str) -> None:
         with pytest.raises(SpadError, match="free some space"):
             append_columns(disk, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format)
         with pytest.raises(SpadError, match="free some space"):
-            store.commit_file(disk / "manifest.json", os.urandom(2_000_000), store.temporary(disk))
-        assert tree(disk) == before and list(store.temporary(disk).iterdir()) == []
+            disk.commit_file(disk / "manifest.json", os.urandom(2_000_000), disk.temporary(disk))
+        assert tree(disk) == before and list(disk.temporary(disk).iterdir()) == []
         assert not exists(disk, "second", format)
     finally:
         subprocess.run(["umount", disk], check=True)

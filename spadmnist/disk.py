@@ -1,0 +1,186 @@
+"""Files that are there as a whole or not at all: temporary name, synchronise, one rename, synchronise the folder.
+
+Whoever is killed, and whenever, leaves a whole file or folder in its place, or none. A full disk, a lost permission
+and the like become one sentence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .errors import SpadError
+
+_LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
+
+Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
+
+
+def temporary(root: str | os.PathLike[str]) -> Path:
+    """The folder for what is not complete yet. Its content may be swept when nobody writes."""
+    return Path(root) / ".spadmnist" / "tmp"
+
+
+def commit_file(path: str | os.PathLike[str], data: bytes, tmp: str | os.PathLike[str]) -> dict[str, Any]:
+    """Write one file so that it is there as a whole or not at all; an older one is replaced.
+
+    `tmp` must be on the same file system. Returns {"bytes": ..., "sha256": ...}.
+    """
+    path = Path(path)
+    with writing(path, len(data)), workspace(Path(tmp)) as work:
+        _make_folder(path.parent)
+        record = _put(work / "file", [data])
+        _sync(work / "file")
+        os.rename(work / "file", path)
+        _sync(path.parent)
+    return record
+
+
+def sweep(tmp: str | os.PathLike[str]) -> int:
+    """Remove what interrupted runs left in a temporary folder; how many things that were.
+
+    Only for who holds the lock of the run: another writer's files would go as well.
+    """
+    count = 0
+    if Path(tmp).is_symlink() or Path(tmp).parent.is_symlink():
+        raise SpadError(f"{tmp}: there is a symbolic link on the way, and what it leads to is not removed; remove it")
+    try:
+        entries = list(os.scandir(tmp))
+    except FileNotFoundError:
+        return 0
+    for entry in entries:
+        count += 1
+        if entry.is_dir(follow_symlinks=False):
+            shutil.rmtree(entry.path)
+        else:
+            os.unlink(entry.path)
+    return count
+
+
+@contextlib.contextmanager
+def writing(place: Path, size: int) -> Iterator[None]:
+    """Turn what the system says about a failed write into a sentence that helps."""
+    try:
+        yield
+    except OSError as error:
+        again = "type the same command again; what is complete is kept"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            advice = f"free some space (or choose another place with -o) and {again}"
+        elif error.errno == errno.EFBIG:
+            advice = f"raise the limit of a file's size (ulimit -f) and {again}"
+        elif error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            advice = f"allow writing there (or choose another place with -o) and {again}"
+        elif error.errno == errno.ENAMETOOLONG:
+            advice = f"choose a place with a shorter name with -o and {again}"
+        else:
+            advice = f"see to that (or choose another place with -o) and {again}"
+        reason = error.strerror or str(error)
+        raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
+
+
+def _amount(size: int) -> str:
+    return f"{size} bytes" if size < 10_000 else f"{size / 1e6:.3g} MB"
+
+
+@contextlib.contextmanager
+def workspace(tmp: Path) -> Iterator[Path]:
+    """A new folder of one's own, which is gone afterwards, whatever happens."""
+    _make_folder(tmp)
+    work = tmp / f"{os.getpid()}-{secrets.token_hex(8)}"
+    os.mkdir(work)  # fails where the name exists
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and what is missing above it, so that it outlives a loss of power."""
+    if folder.is_dir():
+        return
+    _make_folder(folder.parent)
+    with contextlib.suppress(FileExistsError):  # another worker was faster
+        os.mkdir(folder)
+    _sync(folder.parent)
+
+
+def inside(root: Path, relative: str) -> Path:
+    """`root / relative`, with the folders above it made, none of which may be a link to somewhere else."""
+    folder = root
+    for part in relative.split("/")[:-1]:
+        folder = folder / part
+        _make_folder(folder)
+        if folder.is_symlink():
+            raise SpadError(f"{folder}: this is a symbolic link; inside a dataset only real folders are written to")
+    return root / relative
+
+
+def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
+    """Write a new file (not yet synchronised); its size and SHA-256, taken from memory.
+
+    The pieces come from a generator that compresses them, so that only one at a time is in memory: fresh
+    memory for all of them would cost more time than the compression.
+    """
+    digest, size = hashlib.sha256(), 0
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb") as file:
+        for piece in pieces:
+            digest.update(piece)
+            size += len(piece)
+            file.write(piece)
+    return {"bytes": size, "sha256": digest.hexdigest()}
+
+
+def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
+    """Write new files below a folder that is made here, and synchronise all of it.
+
+    First all are written, then all are synchronised: the system then writes them in one go.
+    """
+    folders = {folder}
+    os.mkdir(folder)
+    records = {}
+    for name, pieces in sorted(files.items()):
+        path = folder / name
+        missing = [parent for parent in path.parents if folder in parent.parents and parent not in folders]
+        for parent in reversed(missing):
+            os.mkdir(parent)
+            folders.add(parent)
+        records[name] = _put(path, pieces)
+    for name in files:
+        _sync(folder / name)
+    for parent in folders:
+        _sync(parent)
+    return records
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+        if hasattr(os, "posix_fadvise") and os.fstat(handle).st_size >= _LARGE_FILE:
+            # what is safe on disk need not push others' data out of memory; its pages serve the next shard
+            os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+    finally:
+        os.close(handle)
+
+
+def install(new: Path, final: Path, aside: Path) -> None:
+    """Rename a folder or file into its place; what stood there goes."""
+    try:
+        os.rename(new, final)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        os.rename(final, aside)  # no full folder is replaced at once; for a moment none is there
+        try:
+            os.rename(new, final)
+        except OSError:
+            os.rename(aside, final)
+            raise
+    _sync(final.parent)

@@ -1,0 +1,448 @@
+"""The command line: what it says, where it says it, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from test_factory import COMMAND, assert_same, assert_sentence, make, run, tree, write_config
+
+from spadmnist.cli import cli
+
+VERBS = sorted(cli.commands)
+IMPORTS = (
+    "import sys; sys.argv = {argv!r}\ntry:\n    from spadmnist.cli import main; main()\nexcept SystemExit:\n    pass\n"
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """(config, dataset)."""
+    home = tmp_path_factory.mktemp("made")
+    file = write_config(home / "small.yaml", levels=("5 mlux", "2560 mlux"), train=20, test=6)
+    make(file, home / "out")
+    return file, home / "out"
+
+
+# --- help ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_verbs_of_a_dataset_are_there() -> None:
+    assert {"generate", "reconstruct", "inspect", "verify", "effects", "methods"} <= set(VERBS)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_names_every_option(verb: str) -> None:
+    result = CliRunner().invoke(cli, [verb, "--help"])
+    assert result.exit_code == 0
+    for parameter in cli.commands[verb].params:
+        for name in parameter.opts:
+            assert (name if name.startswith("-") else name.upper()) in result.output, name
+    assert "--help" in result.output
+    assert max(len(line) for line in result.output.splitlines()) <= 100
+
+
+def test_the_options_of_generate() -> None:
+    options = {name for parameter in cli.commands["generate"].params for name in parameter.opts}
+    promised = {"-o", "--lux", "--limit", "--images-dir", "--jobs", "--seed", "--format", "--dry-run", "--plugin"}
+    assert promised <= options
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], *[[verb, "--help"] for verb in VERBS]])
+def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+    code = IMPORTS.format(argv=["spadmnist", *arguments]) + "print('LOADED', *sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    loaded = set(result.stdout.partition("LOADED")[2].split())
+    assert "spadmnist.cli" in loaded, result.stderr
+    assert not loaded & {"numpy", "numba", "zarr", "h5py", "scipy", "joblib", "pydantic", "matplotlib", "yaml"}
+
+
+def test_help_is_there_at_once() -> None:
+    """The best of some, as other programs run here, too."""
+    best = 9.0
+    for _ in range(5):
+        started = time.perf_counter()
+        assert run("--help").returncode == 0
+        best = min(best, time.perf_counter() - started)
+    assert best < 0.3
+
+
+# --- exit statuses and streams ------------------------------------------------------------------------------------
+
+
+def test_nothing_to_do_is_said_on_standard_error(made: tuple[Path, Path]) -> None:
+    result = run("generate", made[0], "-o", made[1])
+    assert result.returncode == 0
+    assert "nothing was done" in result.stderr and "nothing was done" not in result.stdout
+    assert "2560 mlux" in result.stdout
+
+
+def test_json_is_all_that_stands_on_standard_output(made: tuple[Path, Path], tmp_path: Path) -> None:
+    file, root = made
+    commands: list[tuple[Any, ...]] = [
+        ("generate", file, "-o", tmp_path / "out", "--limit", 3, "--jobs", 1),
+        ("generate", file, "-o", root),
+        ("generate", file, "-o", tmp_path / "dry", "--dry-run"),
+        ("reconstruct", root),
+        ("inspect", root),
+        ("verify", root),
+        ("effects",),
+        ("effects", "dead_time"),
+        ("methods",),
+        ("methods", "counts"),
+    ]
+    for command in commands:
+        result = run(*command, "--json")
+        assert result.returncode == 0, result
+        json.loads(result.stdout)
+
+
+def test_no_colours_and_no_bars_where_there_is_no_terminal(made: tuple[Path, Path], tmp_path: Path) -> None:
+    result = run("generate", made[0], "-o", tmp_path / "out", "--limit", 3, "--jobs", 1)
+    assert result.returncode == 0
+    for stream in (result.stdout, result.stderr):
+        assert "\x1b" not in stream and "\r" not in stream and "%|" not in stream
+
+
+def shell(command: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A shell line in which `spadmnist` is this one."""
+    env = {**os.environ, "PATH": f"{Path(COMMAND).parent}{os.pathsep}{os.environ['PATH']}"}
+    return subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, timeout=60, env=env, **options
+    )
+
+
+COMMANDS = [
+    "generate {file} -o {root}",
+    "generate {file} -o {root} --json",
+    "inspect {root}",
+    "verify {root}",
+    "effects",
+]
+
+
+def quiet(result: subprocess.CompletedProcess[str]) -> None:
+    for word in ("Traceback", "Exception ignored", "fault of the program", "BrokenPipe"):
+        assert word not in result.stderr, result.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_reader_that_goes_away(command: str, made: tuple[Path, Path]) -> None:
+    for reader in ("head -c 1", "true"):
+        result = shell(f"spadmnist {command.format(file=made[0], root=made[1])} | {reader}")
+        quiet(result)
+        assert result.returncode in (0, 1, 141), result
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_full_standard_output(command: str, made: tuple[Path, Path]) -> None:
+    result = shell(f"spadmnist {command.format(file=made[0], root=made[1])} > /dev/full")
+    quiet(result)
+    assert result.returncode == 2, result
+    assert "space" in result.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_full_standard_error_does_no_harm(command: str, made: tuple[Path, Path]) -> None:
+    """What is said there is not the result."""
+    result = shell(f"spadmnist {command.format(file=made[0], root=made[1])} 2> /dev/full")
+    assert result.returncode == 0, result
+    assert result.stdout
+
+
+def test_an_error_that_cannot_be_said_keeps_its_status() -> None:
+    for redirected in ("2> /dev/full", "2>&-", "> /dev/full 2>&1", ">&- 2>&-"):
+        assert shell(f"spadmnist verify /nonexistent {redirected}").returncode == 2, redirected
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_closed_streams(command: str, made: tuple[Path, Path]) -> None:
+    for redirected in (">&-", "2>&-", "<&-", ">&- 2>&- <&-"):
+        result = shell(f"spadmnist {command.format(file=made[0], root=made[1])} {redirected}")
+        quiet(result)
+        assert result.returncode == 0, (redirected, result)
+
+
+def test_a_terminal_that_knows_ascii_alone(made: tuple[Path, Path], tmp_path: Path) -> None:
+    env = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+    commands: list[tuple[Any, ...]] = [("effects",), ("methods",), ("inspect", made[1]), ("--help",)]
+    commands += [("effects", name) for name in json.loads(run("effects", "--json").stdout)]
+    commands += [("methods", "inter_photon"), ("generate", made[0], "-o", tmp_path / "x", "--dry-run")]
+    for command in commands:
+        names = command if len(command) < 2 or isinstance(command[1], str | Path) else (command[0], command[1]["name"])
+        result = run(*names, env=env)
+        assert result.returncode == 0, result
+    result = run("verify", tmp_path / "nö", env=env)
+    assert_sentence(result)
+
+
+# --- dry run ------------------------------------------------------------------------------------------------------
+
+
+def test_dry_run_counts_photons(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """White is 683 lm/W at 555 nm: photons from the closed form; detections as a real run records them."""
+    import numpy as np
+
+    import spadmnist
+
+    file = write_config(tmp_path / "c.yaml", levels=("5 mlux", "2560 mlux"), train=600, test=100)
+    result = run("generate", file, "--dry-run", "--json", "--limit", 500, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    estimate = json.loads(result.stdout)
+    assert sorted(tree(tmp_path)) == ["c.yaml"], "something was written"
+    make(file, tmp_path / "out", limit=500)
+    ds = spadmnist.open(tmp_path / "out")
+    for row, lux in zip(estimate["levels"], ds.lux, strict=True):
+        grey = sum(float(ds[row["level"], split].images[:].sum()) for split in ds.splits) / 255
+        power = lux * 25e-12 / 683
+        photons = grey * power * 555e-9 / (6.62607015e-34 * 299792458) * 1e-3
+        assert row["images"] == 600
+        assert row["photons"] == pytest.approx(photons, rel=1e-6)
+        counted = sum(len(ds[row["level"], split].tr[:]) for split in ds.splits)
+        assert abs(row["detections"] - counted) < max(0.01 * counted, 4 * counted**0.5)
+        assert isinstance(row["detections"], float) and np.isfinite(row["seconds"])
+    size = sum(len(c) for n, c in tree(tmp_path / "out").items() if "mlux" in n and not n.endswith(".json"))
+    assert 0.5 < estimate["total"]["bytes"] / size < 2
+    assert estimate["shards"] == 2 + 4
+
+
+def test_dry_run_for_people(made: tuple[Path, Path], tmp_path: Path) -> None:
+    result = run("generate", made[0], "-o", tmp_path / "out", "--dry-run")
+    assert result.returncode == 0 and "Nothing was made" in result.stdout
+    for word in ("photons", "size", "memory", "time", "5 mlux", "all"):
+        assert word in result.stdout
+    assert tree(tmp_path) == {}
+
+
+# --- wrong input --------------------------------------------------------------------------------------------------
+
+WRONG = {
+    "limit": (["--limit", "0"], ["--limit", "0"]),
+    "jobs": (["--jobs", "0"], ["--jobs", "0"]),
+    "negative seed": (["--seed", "-1"], ["--seed", "-1"]),
+    "level": (["--lux", "7 mlux"], ["7 mlux", "5 mlux, 2560 mlux"]),
+    "level without a unit": (["--lux", "5"], ["--lux", "5 mlux"]),
+    "format": (["--format", "tiff"], ["tiff", "zarr", "hdf5"]),
+    "plug-in": (["--plugin", "nothing.py"], ["nothing.py"]),
+    "option": (["--lmit", "3"], ["--lmit", "--limit"]),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options(case: str, made: tuple[Path, Path], tmp_path: Path) -> None:
+    options, words = WRONG[case]
+    result = run("generate", made[0], "-o", tmp_path / "out", *options)
+    assert_sentence(result, *words)
+    assert result.stdout == ""
+    assert sum("rror" in line for line in result.stderr.splitlines()) == 1
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
+    arguments = {
+        "reconstruct": [made[1], "--method", "countz"],
+        "effects": ["dead_tme"],
+        "methods": ["countz"],
+    }.get(verb, ["/nonexistent/nothing"])
+    result = run(verb, *arguments)
+    assert_sentence(result)
+    if verb in ("reconstruct", "methods"):
+        assert "Did you mean counts" in result.stderr
+    if verb == "effects":
+        assert "Did you mean dead_time" in result.stderr
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert result.stdout == ""
+
+
+def test_every_mistake_of_a_config_on_a_line_of_its_own(made: tuple[Path, Path], tmp_path: Path) -> None:
+    text = made[0].read_text()
+    for old, new in (
+        ("seed: 3", "seed: three"),
+        ("exposure: 1 ms", "exposure: 1"),
+        ("rate: 100 Hz", "rate: 100 ns"),
+        ("dead_time: {duration", "dead_tme: {duration"),
+        ("[counts,", "[countz,"),
+        ("rows: 8, columns: 8, pixel_area", "rows: 8, colums: 8, pixel_area"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "bad.yaml").write_text(text)
+    result = run("generate", tmp_path / "bad.yaml", "-o", tmp_path / "out")
+    assert_sentence(result, "dead_tme", "Did you mean dead_time", "100 ns", "colums")
+    lines = result.stderr.splitlines()
+    assert len(lines) >= 5 and all(line.startswith("Error: ") and "bad.yaml:" in line for line in lines), lines
+    assert sorted(tree(tmp_path)) == ["bad.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("lux: [5 mlux, 2560 mlux]", "lux: [1e20 lux]"),
+        ("lux: [5 mlux, 2560 mlux]", "lux: [5 mlux, 1e12 lux]"),
+        ("rate: 100 Hz", "rate: 1e18 Hz"),
+        ("seed: 3", f"seed: {'9' * 5000}"),
+        ("frames: 100, frame_time: 10.0 us", "frames: 1000000000, frame_time: 1 ps"),
+        ("rows: 8, columns: 8}}", "rows: 8, columns: 8}}"),
+        ("train: 20", "train: 1000000000"),
+        ("lux: [5 mlux, 2560 mlux]", "lux: [.nan lux]"),
+        ("lux: [5 mlux, 2560 mlux]", "lux: [0 lux]"),
+        ("exposure: 1 ms", "exposure: -1 ms"),
+    ],
+)
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_absurd_values_are_refused_at_once(
+    old: str, new: str, dry: list[str], made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """1e15 photons a pixel, among others: before anything is written, without much memory."""
+    text = made[0].read_text()
+    if old not in text:
+        pytest.skip("not in this config")
+    (tmp_path / "c.yaml").write_text(text.replace(old, new))
+    started = time.monotonic()
+    result = run("generate", tmp_path / "c.yaml", "-o", tmp_path / "out", *dry)
+    assert_sentence(result)
+    assert time.monotonic() - started < 10
+    assert sorted(tree(tmp_path)) == ["c.yaml"]
+
+
+# --- places -------------------------------------------------------------------------------------------------------
+
+
+def test_places_that_are_taken(made: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("mine")
+    (tmp_path / "broken").symlink_to("nowhere")
+    before = tree(tmp_path)
+    for place in ("file", "foreign", "file/below", "broken", "x" * 300):
+        result = run("generate", made[0], "-o", tmp_path / place)
+        assert_sentence(result, place)
+        assert len(result.stderr.splitlines()) == 1, result.stderr
+        assert_same(tmp_path, before)
+
+
+def _mounted(options: str, place: Path) -> Iterator[Path]:
+    place.mkdir()
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("mounting needs root")
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", place], capture_output=True).returncode:
+        pytest.skip("mounting is not allowed here")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own."""
+    yield from _mounted("size=64m", tmp_path / "disk")
+
+
+def remount(disk: Path, options: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,{options}", disk], check=True)
+
+
+def test_a_place_that_cannot_be_written(made: tuple[Path, Path], tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere; the read-only disk stands for it")
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "closed").chmod(stat.S_IRUSR | stat.S_IXUSR)
+    assert_sentence(run("generate", made[0], "-o", tmp_path / "closed" / "out"), "closed", "-o")
+
+
+def test_a_read_only_disk(made: tuple[Path, Path], disk: Path) -> None:
+    shutil.copytree(made[1], disk / "out")
+    shutil.copy(made[0], disk / "c.yaml")
+    shutil.copytree(made[1], disk / "hurt")
+    next((disk / "hurt").rglob("labels/c.0")).write_bytes(b"")
+    remount(disk, "ro")
+    before = tree(disk)
+    for arguments in (
+        ["generate", disk / "c.yaml", "-o", disk / "new"],
+        ["generate", disk / "c.yaml", "-o", disk / "new" / "deeper"],
+        ["verify", disk / "hurt", "--repair"],
+        ["inspect", disk / "out", "--plot", disk / "x.png"],
+    ):
+        result = run(*arguments)
+        assert_sentence(result, str(disk), "read-only" if arguments[0] == "generate" else "ead-only")
+        assert len(result.stderr.splitlines()) == 1, result.stderr
+    # what only reads, works
+    assert run("verify", disk / "out").returncode == 0
+    assert run("inspect", disk / "out").returncode == 0
+    assert run("generate", disk / "c.yaml", "-o", disk / "out").returncode == 0
+    assert_same(disk, before)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_full_disk(jobs: int, made: tuple[Path, Path], disk: Path) -> None:
+    need = sum(-(-p.stat().st_size // 4096) * 4096 for p in made[1].rglob("*") if p.is_file())
+    remount(disk, f"size={int(need * 0.7)}")
+    result = run("generate", made[0], "-o", disk / "out", "--jobs", jobs)
+    assert_sentence(result, str(disk), "space")
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    kept = {n: c for n, c in tree(disk / "out").items() if not n.startswith(".spadmnist")}
+    assert kept, "nothing was made before the disk was full"
+    complete = tree(made[1])
+    assert all(complete.get(n) == c for n, c in kept.items()), "something incomplete is in place"
+    remount(disk, "size=64m")
+    again = run("generate", made[0], "-o", disk / "out", "--jobs", jobs)
+    assert again.returncode == 0, again.stderr
+    assert "were there already" in again.stderr or "was there already" in again.stderr
+    assert_same(disk / "out", complete)
+
+
+def test_a_disk_that_fills_during_reconstruct(made: tuple[Path, Path], disk: Path) -> None:
+    few = write_config(disk / "few.yaml", levels=("5 mlux", "2560 mlux"), methods=("counts",), train=20, test=6)
+    make(few, disk / "out")
+    used = sum(-(-p.stat().st_size // 4096) * 4096 for p in disk.rglob("*") if p.is_file())
+    remount(disk, f"size={used + 60_000}")
+    result = run("reconstruct", disk / "out", "--jobs", 1)
+    assert_sentence(result, "space")
+    remount(disk, "size=64m")
+    methods = [
+        w
+        for m in ("passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
+        for w in ("--method", m)
+    ]
+    remount(disk, "size=64m")
+    assert run("inspect", disk / "out").returncode == 0
+    assert run("reconstruct", disk / "out", "--jobs", 1).returncode == 0
+    assert run("verify", disk / "out").returncode == 0
+    assert run("reconstruct", disk / "out", "--jobs", 1, *methods).returncode == 0
+
+
+# --- names --------------------------------------------------------------------------------------------------------
+
+
+def test_names_with_blanks_and_of_any_alphabet(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """Relative, with a plug-in, for every verb."""
+    home = tmp_path / "Größe mit Leer 数"
+    home.mkdir()
+    (home / "my effect.py").write_text(
+        'from spadmnist import Effect\n\n\nclass Dimmer(Effect, stage="light"):\n    """Halves the light."""\n\n'
+        "    def apply(self, rate, conditions):\n        return rate / 2\n"
+    )
+    write_config(home / "a b.yaml", levels=("2560 mlux",), train=4, test=2, more="    dimmer: {}\n")
+    plugin = ("--plugin", "my effect.py", "--jobs", 1)
+    result = run("generate", "a b.yaml", *plugin, cwd=home)
+    assert result.returncode == 0, result.stderr
+    assert run("verify", "a b", cwd=home).returncode == 0
+    assert run("inspect", "a b", "--plot", "ü b.png", cwd=home).returncode in (0, 2)
+    expected = tree(home / "a b")
+    next((home / "a b").rglob("frames/bits/c*")).write_bytes(b"x")
+    assert_sentence(run("verify", "a b", "--repair", cwd=home), "dimmer")
+    repaired = run("verify", "a b", "--repair", *plugin, cwd=home)
+    assert repaired.returncode == 0, repaired
+    assert_same(home / "a b", expected)
