@@ -23,10 +23,10 @@ from typing import Any, Generic, Protocol, TypeVar, overload
 import numpy as np
 
 from . import config, kernels, plugins, reconstruct, store, units
-from .config import Experiment, Level
 from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
+from .experiment import Experiment, Level
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
@@ -439,7 +439,7 @@ class Reconstruction(Field[np.ndarray]):
     @cached_property
     def normalisation(self) -> float | None:
         """The median of the non-zero pixels of the training split; None where the method is not normalised."""
-        return self._backend.normalisation(self.method) if reconstruct.find(self.method).normalised else None
+        return self._backend.normalisation(self.method)
 
     @property
     def normalised(self) -> Field[np.ndarray]:
@@ -687,7 +687,7 @@ class _Simulated:
         return medians_of_nonzero(chunks)
 
     def normalisation(self, method: str) -> float | None:
-        return self._normalisations[method]
+        return self._normalisations[method] if reconstruct.find(method).normalised else None
 
     def originals(self, start: int, stop: int) -> np.ndarray:
         return self._splits[self._split].pixels[start:stop]

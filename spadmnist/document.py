@@ -5,6 +5,7 @@ No tag runs anything; aliases are refused (a few bytes of them can stand for gig
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from .errors import ConfigError, InputError
 
 _MOST_BYTES = 1 << 20
 _DEEPEST = 50
+_LONGEST_NUMBER = 60  # characters
 
 Path_ = tuple[Any, ...]
 
@@ -119,7 +121,7 @@ def _value(node: Any, path: Path_, document: Document, problems: list[str], seen
         out: dict[Any, Any] = {}
         first: dict[Any, int] = {}
         for key_node, value_node in node.value:
-            key = _scalar(key_node, document, problems)
+            key = _scalar(key_node, path, document, problems)
             key_line = key_node.start_mark.line + 1
             if key in first:
                 problems.append(
@@ -133,16 +135,23 @@ def _value(node: Any, path: Path_, document: Document, problems: list[str], seen
         return out
     if isinstance(node, yaml.SequenceNode):
         return [_value(item, (*path, i), document, problems, seen) for i, item in enumerate(node.value)]
-    return _scalar(node, document, problems)
+    return _scalar(node, path, document, problems)
 
 
-def _scalar(node: Any, document: Document, problems: list[str]) -> Any:
+def _scalar(node: Any, path: Path_, document: Document, problems: list[str]) -> Any:
     line = node.start_mark.line + 1
     if not isinstance(node, yaml.ScalarNode):
         problems.append(f"{document.name}:{line}: a key must be plain text")
         return f"<line {line}>"
     kind = node.tag.rpartition(":")[2]
     text = node.value
+    plain = node.style is None
+    if kind != "str" and node.tag != _Loader("").resolve(yaml.ScalarNode, text, (plain, not plain)):
+        problems.append(f"{document.place(path)}: the tag {node.tag} is not allowed; write plain YAML")
+        return None
+    if kind != "str" and len(text) > _LONGEST_NUMBER:
+        problems.append(f"{document.place(path)}: {text[:20]}... is not a number that can be held")
+        return None
     try:
         if kind == "null":
             return None
@@ -151,13 +160,13 @@ def _scalar(node: Any, document: Document, problems: list[str]) -> Any:
         if kind == "int":
             return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
         if kind == "float":
-            return float(text.replace(".inf", "inf").replace(".nan", "nan").replace(".NaN", "nan"))
+            return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
         if kind == "str":
             return text
     except ValueError:
-        problems.append(f"{document.name}:{line}: {text[:40]!r} is not a number that can be held")
+        problems.append(f"{document.place(path)}: {text[:40]!r} is not a number that can be held")
         return None
-    problems.append(f"{document.name}:{line}: the tag {node.tag} is not allowed; write plain YAML")
+    problems.append(f"{document.place(path)}: the tag {node.tag} is not allowed; write plain YAML")
     return None
 
 
@@ -194,9 +203,22 @@ def _text(item: Any) -> str:
         return "null"
     if isinstance(item, bool):
         return "true" if item else "false"
+    if isinstance(item, float) and not math.isfinite(item):
+        return ".nan" if math.isnan(item) else ".inf" if item > 0 else "-.inf"
     if isinstance(item, (int, float)):
         return repr(item)
     plain = _PLAIN.fullmatch(item) and item.lower() not in ("true", "false", "null")
     if plain or re.fullmatch(r"[0-9.]+ [A-Za-z%][A-Za-z0-9^/%]*", item):
         return str(item)
-    return '"' + item.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t") + '"'
+    return '"' + "".join(map(_escaped, item)) + '"'
+
+
+def _escaped(character: str) -> str:
+    """A character inside double quotes; what YAML cannot hold as it is becomes its number."""
+    if character in '"\\':
+        return "\\" + character
+    code = ord(character)
+    shown = 0x20 <= code <= 0x7E or 0xA0 <= code <= 0xD7FF or 0xE000 <= code <= 0xFFFD or code >= 0x10000
+    if shown and code not in (0x2028, 0x2029, 0xFEFF):
+        return character
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"

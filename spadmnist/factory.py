@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 
 from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
-from .config import Experiment
 from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
+from .experiment import Experiment
 from .images import Images
 from .plugins import Distribution, MapFile
 from .reconstruct import median_of_nonzero
@@ -271,14 +271,23 @@ def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, 
             },
         },
         "maps": {name: hashlib.sha256(data).hexdigest() for name, data in portable(experiment)[1].items()},
-        "plugins": {
-            path.name: {"sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
-            for path, text in sorted(plugins.loaded_files().items())
-            if any(plugins.source_file(type(e)) == str(path) for e in experiment.sensor.effects)
-            or any(plugins.source_file(type(reconstruct.find(m))) == str(path) for m in experiment.methods)
-        },
+        "plugins": plugin_sources(experiment),
         "versions": versions(),
     }
+
+
+def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:
+    """The files that define the user's own effects and methods of an experiment, whole."""
+    classes = [type(e) for e in experiment.sensor.effects] + [type(reconstruct.find(m)) for m in experiment.methods]
+    used = {plugins.source_file(cls) for cls in classes}
+    return sorted(
+        (
+            {"file": path.name, "sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
+            for path, text in plugins.loaded_files().items()
+            if str(path) in used
+        ),
+        key=lambda found: (found["file"], found["sha256"]),
+    )
 
 
 def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -541,8 +550,8 @@ def add_reconstructions(
     if not new:
         return [], manifest
     after = before.with_methods((*before.methods, *new))
-    kept = ("format", "images", "maps", "plugins", "versions")
-    wanted = {**{key: manifest[key] for key in kept}, "config": portable(after)[0]}
+    kept = ("format", "images", "maps", "versions")
+    wanted = {**{k: manifest[k] for k in kept}, "config": portable(after)[0], "plugins": plugin_sources(after)}
     shards = dataset.shards_in(manifest)
     with locked(root):
         plan = root / STATE / "plan.json"

@@ -167,6 +167,7 @@ def _to_pixels(image: Any, path: Path) -> np.ndarray:
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:
+    """One array of a `.npz` archive, after its declared size was compared with what the file can hold."""
     if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise InputError(
             f"{place} is encrypted or packed in an unusual way; store it by np.savez or np.savez_compressed"

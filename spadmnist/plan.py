@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import dataset, factory, store
-from .config import Experiment
+from .experiment import Experiment
 from .images import Images
 
 _PROBE = 64  # images a level

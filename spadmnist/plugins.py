@@ -2,7 +2,7 @@
 
 `Plugin` is the base of effects (`spadmnist.effects.Effect`) and of reconstruction methods
 (`spadmnist.reconstruct.Method`). A subclass of one of those is known by its name in snake case as soon as its file
-has been imported: by `discover` (the package's own folders and the entry points of group `spadmnist.plugins`) or by
+has been imported: by `discover` (the package's own places and the entry points of group `spadmnist.plugins`) or by
 `load_file` (`--plugin FILE.py`). There is no list of them anywhere.
 """
 
@@ -27,7 +27,7 @@ import numpy as np
 from . import units
 from .errors import EffectError, InputError, did_you_mean
 
-FOLDERS = ("spadmnist.effects",)
+PLACES = ("spadmnist.effects", "spadmnist.reconstruct")  # a package with a file each, or a module
 ENTRY_POINTS = "spadmnist.plugins"
 
 
@@ -63,14 +63,15 @@ class Parameter:
             return f"at most {units.show(high, self.unit)}"
         return "any number"
 
-    def check(self, value: float) -> None:
-        """Raises ValueError where a value lies outside the bounds."""
+    def check(self, value: float, written: str | None = None) -> None:
+        """Raises ValueError where a value lies outside the bounds. written: as the user wrote it."""
         low, high = self.bounds
         outside = (low is not None and (value < low or (self.open_bounds and value == low))) or (
             high is not None and (value > high or (self.open_bounds and value == high))
         )
         if outside or not np.isfinite(value):
-            raise ValueError(f"{units.show(value, self.unit)} is not possible; {self.name} is {self.allowed()}")
+            shown = written if written is not None else units.show(value, self.unit)
+            raise ValueError(f"{shown} is not possible; {self.name} is {self.allowed()}")
 
 
 def parameter(
@@ -93,6 +94,8 @@ def parameter(
     off: the value at which the effect vanishes. bounds: what is possible. search: where a fit looks.
     per_pixel: it may be a map from a file or a distribution; by_wavelength: it may be a table over the wavelength.
     """
+    if unit != "bool" and not units.is_known(unit):
+        raise TypeError(f"{unit!r} is not an SI unit that is known here")
     return Parameter(default, unit, about, symbol, bounds, open_bounds, off, search, per_pixel, by_wavelength, required)
 
 
@@ -166,7 +169,7 @@ def read_value(declared: Parameter, raw: Any, base: Path, problem: Problem) -> A
 def _read_number(declared: Parameter, raw: Any, path: tuple[Any, ...], problem: Problem) -> float | None:
     try:
         value = units.parse(raw, declared.unit)
-        declared.check(value)
+        declared.check(value, value.text)
     except ValueError as error:
         problem(path, str(error))
         return None
@@ -266,34 +269,43 @@ def _read_mixture(declared: Parameter, body: Any, path: tuple[Any, ...], problem
     return Distribution("mixture", (), tuple(parts))
 
 
-def settle(declared: Parameter, value: Any, pixels: int, key: str) -> Any:
+def settle(declared: Parameter, value: Any, shape: tuple[int, int], key: str) -> Any:
     """The value an effect computes with: a float, a bool, a `ByWavelength`, or (pixels,) float64.
 
-    key: what a distribution is drawn from (chip seed, effect and parameter in one string). Drawn values outside
-    the bounds are set to the bound. Raises InputError where a map is unreadable, of another shape or out of bounds.
+    shape: (rows, columns) of the array; key: what a distribution is drawn from (chip seed, effect and parameter in
+    one string). Drawn values outside the bounds are set to the bound. Raises InputError where a map is unreadable, of
+    another shape or out of bounds, or where a distribution has no finite values.
     """
     if isinstance(value, Distribution):
         digest = hashlib.sha256(key.encode()).digest()
         rng = np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
         low, high = declared.bounds
-        return np.clip(value.draw(rng, pixels), low, high)
+        with np.errstate(over="ignore", invalid="ignore"):
+            drawn = np.clip(value.draw(rng, shape[0] * shape[1]), low, high)
+        if not np.all(np.isfinite(drawn)):
+            raise InputError(
+                f"the distribution of {declared.name} is so wide that it has no finite values; lower sigma"
+            )
+        return drawn
     if isinstance(value, MapFile):
-        return _read_map(declared, value.path, pixels)
+        return _read_map(declared, value.path, shape)
     return value
 
 
-def _read_map(declared: Parameter, path: Path, pixels: int) -> np.ndarray:
+def _read_map(declared: Parameter, path: Path, shape: tuple[int, int]) -> np.ndarray:
     try:
         values = np.load(path, allow_pickle=False)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read as a .npy map ({error}); write one with numpy.save") from None
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.size != pixels:
-        shape = getattr(values, "shape", None)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or 'it is damaged'})") from None
+    except (ValueError, EOFError):
+        raise InputError(f"{path}: is not a .npy file of plain numbers; write the map with numpy.save") from None
+    allowed = (shape, (shape[0] * shape[1],))
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.shape not in allowed:
+        what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "an archive"
         raise InputError(
-            f"{path}: the map has shape {shape} and type {getattr(values, 'dtype', None)}, "
-            f"but {declared.name} needs one number for each of the {pixels} pixels"
+            f"{path}: is {what}, but {declared.name} needs one number for each pixel: shape {shape} (rows, columns)"
         )
     flat = values.astype(np.float64).ravel()
     for index in np.flatnonzero(~np.isfinite(flat))[:1]:
@@ -309,12 +321,18 @@ def _read_map(declared: Parameter, path: Path, pixels: int) -> np.ndarray:
 # --- plug-ins -----------------------------------------------------------------------------------------------------
 
 
+_registries: list[Registry] = []
+
+
 @dataclass
 class Registry:
     """The classes of one kind, by name."""
 
     kind: str
     classes: dict[str, type[Plugin]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _registries.append(self)
 
     def __iter__(self) -> Iterator[str]:
         discover()
@@ -368,7 +386,7 @@ class Plugin:
     @classmethod
     def summary(cls) -> str:
         """The first line of the docstring."""
-        return (inspect.getdoc(cls) or "").split("\n")[0]
+        return (inspect.cleandoc(cls.__doc__) if cls.__doc__ else "(no description)").split("\n")[0]
 
 
 def source_file(cls: type) -> str:
@@ -386,12 +404,10 @@ def discover() -> None:
     global _discovered
     if _discovered:
         return
-    _discovered = True
-    for folder in FOLDERS:
-        package = importlib.import_module(folder)
-        for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"{folder}.{module.name}")
-    importlib.import_module("spadmnist.reconstruct")
+    for place in PLACES:
+        package = importlib.import_module(place)
+        for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+            importlib.import_module(f"{place}.{module.name}")
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:
             entry.load()
@@ -400,6 +416,7 @@ def discover() -> None:
                 f"the installed plug-in {entry.name} ({entry.value}) cannot be loaded: "
                 f"{type(error).__name__}: {error}; mend it or uninstall it"
             ) from error
+    _discovered = True
 
 
 def load_file(path: str | Path) -> None:
@@ -421,11 +438,13 @@ def load_file(path: str | Path) -> None:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except EffectError:
-        del sys.modules[name]
-        raise
     except BaseException as error:
         del sys.modules[name]
+        for registry in _registries:
+            for known in [k for k, cls in registry.classes.items() if cls.__module__ == name]:
+                del registry.classes[known]
+        if isinstance(error, (EffectError, KeyboardInterrupt)):
+            raise
         raise EffectError(f"{_place(error, file)}: the plug-in cannot be loaded: {_what(error)}") from error
     _loaded[file] = text
 

@@ -48,14 +48,16 @@ class Sensor:
         """The same sensor with every map read and every distribution drawn. Raises InputError for a bad map."""
         if self._settled:
             return self
-        effects = []
-        for effect in in_order(self.effects):
-            values = {}
-            for name, declared in effect.parameters.items():
-                key = f"chip/{self.chip_seed}/{effect.name}/{name}"
-                values[name] = settle(declared, getattr(effect, name), self.layout.pixels, key)
-            effects.append(type(effect)(**values))
+        effects = [
+            type(effect)(**{name: self.settle(effect, name) for name in effect.parameters})
+            for effect in in_order(self.effects)
+        ]
         return Sensor(self.layout, effects, self.rules, self.chip_seed, self.name, True)
+
+    def settle(self, effect: Effect, name: str) -> Any:
+        """The value of one parameter: a map is read, a distribution is drawn. Raises InputError for a bad map."""
+        key = f"chip/{self.chip_seed}/{effect.name}/{name}"
+        return settle(effect.parameters[name], getattr(effect, name), self.layout.shape, key)
 
     def at(self, stage: str) -> list[Effect]:
         """The effects of one stage, in order."""
@@ -83,11 +85,12 @@ class Sensor:
 
     @cached_property
     def tick(self) -> float:
-        """Length of a TDC's tick, s; 0 without one."""
-        probe = Events(np.zeros(0), np.zeros(1, np.int64), 1)
+        """Length of a converter's tick, s; 0 without one. Found out by an empty batch that passes the timing stage."""
+        none = np.zeros(0, np.uint64)
+        probe = Events(np.zeros(0), np.zeros(1, np.int64), self.layout.pixels)
         for effect in self.at("timing"):
-            if isinstance(effect, Tdc):
-                probe = effect.apply(probe, None)
+            rng = Draws(np.zeros(3, np.uint64), none) if effect.counted else np.random.Generator(np.random.SFC64(0))
+            probe = self._checked(effect, self._call(effect, "apply", probe, rng), probe)
         return probe.tick or 0.0
 
     def nominal_pdp(self, wavelength: float | None) -> float:
@@ -428,7 +431,9 @@ class Sensor:
 
     def _apply(self, effect: Effect, events: Events, streams: Streams, suffix: str = "") -> Events:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""
-        after = self._call(effect, "apply", events, self._rng(effect, streams, suffix))
+        return self._checked(effect, self._call(effect, "apply", events, self._rng(effect, streams, suffix)), events)
+
+    def _checked(self, effect: Effect, after: Any, events: Events) -> Events:
         if not effect.counted:
             wrong = after.problem() if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
             if not wrong and len(after.offsets) != len(events.offsets):

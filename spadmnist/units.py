@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 
 # dimension (named by its SI unit) -> (what people call it, unit -> factor to SI, an example to show)
 _DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
@@ -47,7 +47,10 @@ _DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
     "": ("number without a dimension", {"": "1", "%": "1e-2"}, "0.5 %"),
 }
 
-_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\S*)\s*")
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\S*)\s*", re.ASCII)
+
+
+_LONGEST = 60  # characters of a quantity
 
 
 class Quantity(float):
@@ -67,6 +70,11 @@ class Quantity(float):
 
     def __str__(self) -> str:
         return self.text
+
+
+def is_known(unit: str) -> bool:
+    """Is there a dimension whose SI unit is `unit`?"""
+    return unit in _DIMENSIONS
 
 
 def dimension_name(unit: str) -> str:
@@ -101,6 +109,8 @@ def parse(value: object, unit: str) -> Quantity:
         text = repr(value)
     else:
         text = value.strip()
+        if len(text) > _LONGEST:
+            raise ValueError(f"{text[:20]!r}... is not {_a(name)}; write {_how(unit, sample)}")
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
@@ -112,7 +122,7 @@ def parse(value: object, unit: str) -> Quantity:
     try:
         # exact decimal arithmetic, so that 1000 mlux and 1 lux are the same double
         si = float(Decimal(number) * Decimal(units[written]))
-    except (InvalidOperation, OverflowError):
+    except ArithmeticError:
         si = math.inf
     if not math.isfinite(si):
         raise ValueError(f"{value!r} is too large for {_a(name)}")

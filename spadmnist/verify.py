@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from . import config, dataset, disk, factory, store
-from .config import Experiment
 from .dataset import CONFIG, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
+from .experiment import Experiment
 from .factory import Progress
 from .images import Images
 from .store import ShardReader

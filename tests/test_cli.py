@@ -293,7 +293,6 @@ def test_every_mistake_of_a_config_on_a_line_of_its_own(made: tuple[Path, Path],
         ("rate: 100 Hz", "rate: 1e18 Hz"),
         ("seed: 3", f"seed: {'9' * 5000}"),
         ("frames: 100, frame_time: 10.0 us", "frames: 1000000000, frame_time: 1 ps"),
-        ("rows: 8, columns: 8}}", "rows: 8, columns: 8}}"),
         ("train: 20", "train: 1000000000"),
         ("lux: [5 mlux, 2560 mlux]", "lux: [.nan lux]"),
         ("lux: [5 mlux, 2560 mlux]", "lux: [0 lux]"),
@@ -306,14 +305,41 @@ def test_absurd_values_are_refused_at_once(
 ) -> None:
     """1e15 photons a pixel, among others: before anything is written, without much memory."""
     text = made[0].read_text()
-    if old not in text:
-        pytest.skip("not in this config")
+    assert old in text
     (tmp_path / "c.yaml").write_text(text.replace(old, new))
     started = time.monotonic()
     result = run("generate", tmp_path / "c.yaml", "-o", tmp_path / "out", *dry)
     assert_sentence(result)
     assert time.monotonic() - started < 10
     assert sorted(tree(tmp_path)) == ["c.yaml"]
+
+
+@pytest.mark.parametrize("level", [".5 lux", "+5 mlux", "5. mlux", "5e-3 lux", "5 ulux"])
+def test_levels_in_any_spelling(level: str, tmp_path: Path) -> None:
+    """Made and found again by the name that the config gives, or refused with a sentence."""
+    file = write_config(tmp_path / "c.yaml", levels=(level,), train=3, test=1)
+    result = run("generate", file, "-o", tmp_path / "out", "--jobs", 1)
+    if result.returncode:
+        assert_sentence(result, level)
+    else:
+        assert level in result.stdout
+        assert run("verify", tmp_path / "out").returncode == 0
+
+
+def test_a_vast_number_of_images_is_planned_at_once(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """All of them are the same: none need be looked at twice."""
+    text = (
+        made[0]
+        .read_text()
+        .replace(
+            "{source: digits, train: 20, test: 6, rows: 8, columns: 8}", "{source: uniform, repetitions: 2000000000}"
+        )
+    )
+    assert "uniform" in text
+    (tmp_path / "c.yaml").write_text(text)
+    dry = run("generate", tmp_path / "c.yaml", "-o", tmp_path / "out", "--dry-run", timeout=20)
+    assert dry.returncode == 0 or "Error: " in dry.stderr
+    assert_sentence(run("generate", tmp_path / "c.yaml", "-o", tmp_path / "out", timeout=20), "free")
 
 
 # --- places -------------------------------------------------------------------------------------------------------
@@ -392,7 +418,8 @@ def test_a_full_disk(jobs: int, made: tuple[Path, Path], disk: Path) -> None:
     result = run("generate", made[0], "-o", disk / "out", "--jobs", jobs)
     assert_sentence(result, str(disk), "space")
     assert len(result.stderr.splitlines()) == 1, result.stderr
-    kept = {n: c for n, c in tree(disk / "out").items() if not n.startswith(".spadmnist")}
+    there = tree(disk / "out").items()
+    kept = {n: c for n, c in there if not n.startswith(".spadmnist") and c != "empty folder"}
     assert kept, "nothing was made before the disk was full"
     complete = tree(made[1])
     assert all(complete.get(n) == c for n, c in kept.items()), "something incomplete is in place"
@@ -411,16 +438,10 @@ def test_a_disk_that_fills_during_reconstruct(made: tuple[Path, Path], disk: Pat
     result = run("reconstruct", disk / "out", "--jobs", 1)
     assert_sentence(result, "space")
     remount(disk, "size=64m")
-    methods = [
-        w
-        for m in ("passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
-        for w in ("--method", m)
-    ]
-    remount(disk, "size=64m")
     assert run("inspect", disk / "out").returncode == 0
     assert run("reconstruct", disk / "out", "--jobs", 1).returncode == 0
     assert run("verify", disk / "out").returncode == 0
-    assert run("reconstruct", disk / "out", "--jobs", 1, *methods).returncode == 0
+    assert len(json.loads((disk / "out" / "manifest.json").read_text())["config"]["reconstruct"]) == 6
 
 
 # --- names --------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import pickle
 import platform
 import random
 import re
@@ -91,7 +92,8 @@ def make(
 
 def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """`spadmnist ARGUMENTS`."""
-    return subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=120, **options)
+    options = {"timeout": 120, **options}
+    return subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True, **options)
 
 
 def tree(root: Path) -> dict[str, bytes | str]:
@@ -267,6 +269,21 @@ def test_a_part_of_the_levels_and_images_holds_the_same_values(made: tuple[Path,
         assert_same_images(few["2560 mlux", split], all_["2560 mlux", split], slice(0, 7))
     alone = spadmnist.open(tmp_path / "out" / "config.yaml")
     assert_same_images(few["2560 mlux", "test"], alone["2560 mlux", "test"], slice(0, 7))
+
+
+def test_a_part_can_be_sent_to_another_process(made: tuple[Path, Path]) -> None:
+    """As loaders of training data do."""
+    for path in made:
+        part = spadmnist.open(path)["2560 mlux", "test"]
+        assert_same_images(pickle.loads(pickle.dumps(part)), part, slice(None))
+
+
+def test_an_index_is_a_whole_number(made: tuple[Path, Path]) -> None:
+    part = spadmnist.open(made[1])["2560 mlux", "test"]
+    assert_same_images(part, part, np.int64(3), 3)
+    for wrong in (1.5, "1", None, 12, -13):
+        with pytest.raises((IndexError, TypeError)):
+            part.images[wrong]  # type: ignore[index]
 
 
 def test_another_seed_draws_other_values(made: tuple[Path, Path], tmp_path: Path) -> None:
@@ -680,7 +697,7 @@ class Slow(Effect, stage="light"):
     """Waits."""
 
     def apply(self, rate, conditions):
-        time.sleep(1)
+        time.sleep(0.4)
         return rate
 '''
 

@@ -284,18 +284,18 @@ def test_a_table_ends_at_its_ends() -> None:
 def test_a_distribution_is_drawn_by_its_law() -> None:
     """Means and spreads of 100,000 draws, 5 standard errors wide (false-alarm rate 1e-6)."""
     n = 100_000
-    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), n, "k")
+    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), (1, n), "k")
     assert abs(normal.mean() - 5e-7) < 5 * 1e-8 / np.sqrt(n) and abs(normal.std() / 1e-8 - 1) < 5 / np.sqrt(2 * n)
     wide = Parameter(1.0, "Hz", "", bounds=(0, None), per_pixel=True)
-    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), n, "k") / 20.0)
+    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), (1, n), "k") / 20.0)
     assert abs(logs.mean()) < 5 * 2.27 / np.sqrt(n) and abs(logs.std() / 2.27 - 1) < 5 / np.sqrt(2 * n)
     few = Distribution(
         "mixture", (), ((0.97, Distribution("normal", (1.0, 0.0))), (0.03, Distribution("normal", (9.0, 0.0))))
     )
-    mixed = plugins.settle(wide, few, n, "k")
+    mixed = plugins.settle(wide, few, (1, n), "k")
     assert set(np.unique(mixed)) == {1.0, 9.0}
     assert abs((mixed == 9).mean() - 0.03) < 5 * np.sqrt(0.03 * 0.97 / n)
-    assert not np.array_equal(plugins.settle(wide, few, n, "other"), mixed)
+    assert not np.array_equal(plugins.settle(wide, few, (1, n), "other"), mixed)
 
 
 # --- entry points --------------------------------------------------------------------------------------------------

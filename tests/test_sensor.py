@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spadmnist import config, document
-from spadmnist.config import Experiment, Level
 from spadmnist.effects import Conditions, Effect, parameter
 from spadmnist.effects.afterpulsing import Afterpulsing
 from spadmnist.effects.dark_counts import DarkCounts
@@ -25,6 +24,7 @@ from spadmnist.effects.detection import Detection
 from spadmnist.effects.tdc import Tdc
 from spadmnist.errors import EffectError
 from spadmnist.events import Children, Events, Layout
+from spadmnist.experiment import Experiment, Level
 from spadmnist.images import Images
 from spadmnist.readout import Recorded, no_detection, unsigned_for
 from spadmnist.sensor import Sensor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 import time
 from decimal import Decimal
 from fractions import Fraction
@@ -195,7 +196,7 @@ def test_a_quantity_is_finite(text: str) -> None:
     if text.startswith("-"):
         assert units.parse(text, "s") == -1e308
     else:
-        assert "too large" in refused(text)
+        assert re.search("too large|is not a time", refused(text))
 
 
 @pytest.mark.parametrize("text", ["9" * 900_000 + " s", "9" * 1_000_000 + " s", "1 " + "s" * 1_000_000])

@@ -385,7 +385,7 @@ def test_data_of_another_dataset_are_not_put_in(root: Path, tmp_path: Path) -> N
     before = tree(root)
     damage = verify.verify(root)
     with pytest.MonkeyPatch.context() as patch:
-        from spadmnist.config import Experiment
+        from spadmnist.experiment import Experiment
 
         load = Experiment.load_images
 
@@ -487,7 +487,8 @@ def test_reconstruct_of_damaged_data_is_refused(few: dict[int, Path], made: Path
             content = bytearray(victim.read_bytes())
             content[int(len(content) * at)] ^= 255
             victim.write_bytes(content)
-        result = run("reconstruct", root, "--jobs", 1)
+        options = [word for method in METHODS[2:] for word in ("--method", method)]
+        result = run("reconstruct", root, "--jobs", 1, *options)
         if result.returncode == 0 and (root / "data").exists():
             assert_same(root, expected)
         else:

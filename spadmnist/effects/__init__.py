@@ -50,7 +50,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 class Conditions:
     """How a recording is made; every hook on rates and times gets it.
 
-    exposure, frame_time, frame_period: s; frames: their number; wavelength: m, None in the dark.
+    exposure, frame_time, frame_period: s; frames: their number; wavelength: m, None where no light falls on the sensor.
     """
 
     exposure: float

@@ -13,7 +13,8 @@ from . import Conditions, Effect, parameter
 class Afterpulsing(Effect, stage="correlated"):
     """An avalanche fills a trap, and its release fires the same pixel again: at most once, an exponential time later.
 
-    `spawn` gives the time from the end of the dead time on; the sensor adds the dead time.
+    The time counts from the end of the dead time. By the paper's rules every event may have an afterpulse, also one
+    that the dead time hides; by a device's, recorded ones alone, afterpulses among them.
     Source: Suonsivu et al., Alg. 1 lines 14-18; probability below 1 % (Table 1), lifetimes from a few to thousands
     of ns.
     """
@@ -33,7 +34,7 @@ class Afterpulsing(Effect, stage="correlated"):
     lifetime = parameter(
         25e-9,
         "s",
-        "mean time to the release, after the dead time",
+        "de-trapping lifetime: mean time to the release, after the dead time",
         symbol="tau_bar",
         bounds=(0, None),
         open_bounds=True,
@@ -46,6 +47,7 @@ class Afterpulsing(Effect, stage="correlated"):
             return np.ascontiguousarray(np.broadcast_to(-np.log1p(-np.asarray(self.probability)), pixels))
 
     def spawn(self, events: Events, rng: Draws) -> Children:
+        # the release alone: the sensor, which knows the rules, adds the dead time
         parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key)
         return Children(parent, self.lifetime * delay)
 

@@ -10,8 +10,8 @@ from . import Conditions, Effect, parameter
 class DeadTime(Effect, stage="dead_time"):
     """After a detection the pixel is blind while it is quenched and recharged; what comes then is lost.
 
-    Non-paralyzable: a lost event does not prolong the blindness. It acts on TR streams; in frames it acts under
-    `rules: device` alone (physics, Table 2 of the paper).
+    Non-paralyzable: a lost event does not prolong the blindness. It acts on TR streams. In frames the paper applies
+    none (its Table 2); under `rules: device` a pixel fires once a frame, and its afterpulses wait for the dead time.
     Source: Suonsivu et al., Alg. 1 lines 24-29; typical 1-100 ns (Table 1).
     """
 

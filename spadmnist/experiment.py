@@ -1,0 +1,189 @@
+"""An experiment: scene, recording, sensor, reconstructions; everything that decides what a dataset contains."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import light, units
+from .effects import Conditions
+from .errors import InputError, did_you_mean
+from .images import Images, check_size
+from .readout import Recorded
+from .reconstruct import Settings
+from .sensor import Sensor
+from .streams import Streams
+
+_MOST_EVENTS = 2_000_000_000  # of one image
+_MOST_STAGED_EVENTS = 100_000_000  # of one image, where a batch goes through one stage after the other
+_MOST_BYTES = 4 * 2**30  # of one image on disk
+
+
+@dataclass(frozen=True)
+class Level:
+    """One light level: white in lux (`kind` "lux") or in W/m^2 ("irradiance"), as written and in SI."""
+
+    text: str
+    kind: str
+    value: float
+
+    @property
+    def folder(self) -> str:
+        """Its name on disk: `5 mlux` -> `5_mlux`, `120 nW/cm^2` -> `120_nW_per_cm2`."""
+        return re.sub(r"[^A-Za-z0-9.+-]+", "_", self.text.replace("/", "_per_").replace("^", "")).strip("_")
+
+    @property
+    def key(self) -> str:
+        """What its random numbers are keyed by: the value, however it is written."""
+        return f"{self.kind}/{float(self.value).hex()}"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Everything that decides what a dataset contains, besides the images.
+
+    resolved: the config with all defaults filled in and the sensor in place, as text and numbers: what a manifest
+    keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split.
+    """
+
+    name: str
+    resolved: dict[str, Any]
+    base: Path
+    seed: int
+    levels: tuple[Level, ...]
+    source: Any
+    conditions: Conditions
+    readouts: tuple[str, ...]
+    methods: tuple[str, ...]
+    sensor: Sensor
+    format: str
+    limit: int | None = None
+    notes: tuple[str, ...] = ()
+    _photons: dict[str, float] = field(default_factory=dict, repr=False, compare=False)
+
+    # --- light ---------------------------------------------------------------------------------------------------
+
+    def white(self, level: Level) -> float:
+        """Photons/s on the active area of a white pixel."""
+        if level.text not in self._photons:
+            convert = light.photons_from_lux if level.kind == "lux" else light.photons_from_irradiance
+            assert self.conditions.wavelength is not None
+            area = self.sensor.layout.active_area
+            self._photons[level.text] = convert(level.value, area, self.conditions.wavelength)
+        return self._photons[level.text]
+
+    def photons(self, level: Level, pixels: np.ndarray, white: float) -> np.ndarray:
+        """(images, channels * rows * columns) photons/s from grey levels: linear, white at the level."""
+        flat = pixels.reshape(len(pixels), -1)
+        if flat.dtype == np.uint8:
+            # a table is the same arithmetic, once for each of the 256 grey levels
+            return (np.arange(256) / white * self.white(level))[flat]
+        return flat / white * self.white(level)
+
+    def level(self, text: str) -> Level:
+        """The level written as `text`, or of the same value. Raises KeyError with a sentence."""
+        for level in self.levels:
+            if level.text == text:
+                return level
+        for level in self.levels:
+            try:
+                if units.parse(text, "lux" if level.kind == "lux" else "W/m^2") == level.value:
+                    return level
+            except ValueError:
+                continue
+        known = [x.text for x in self.levels]
+        near = next((x for x in known if x.split()[0] == text.strip()), None)
+        hint = f' Did you mean "{near}"?' if near else did_you_mean(text, known)
+        raise KeyError(f"{text!r} is not a light level here.{hint} There are {', '.join(known)}")
+
+    # --- images --------------------------------------------------------------------------------------------------
+
+    def load_images(self, images_dir: Path | None = None) -> dict[str, Images]:
+        """The splits that the config names, "train" first, checked against the sensor's layout.
+
+        Where an effect draws by blocks of images, a `limit` does not cut a block: `wanted` says how many are meant.
+        """
+        limit = None if self.limit is None else -(-self.limit // self.sensor.block) * self.sensor.block
+        splits = self.source.load(self.sensor.layout.shape, images_dir, self.base, limit)
+        check_size(splits, self.sensor.layout.shape, "sensor.layout")
+        return splits
+
+    def wanted(self, images: Images) -> int:
+        """How many of a split's images belong to the dataset."""
+        return len(images) if self.limit is None else min(self.limit, len(images))
+
+    # --- simulation ----------------------------------------------------------------------------------------------
+
+    def streams(self, level: Level, split: str, images: np.ndarray) -> Streams:
+        return Streams(self.seed, level.key, split, images)
+
+    def simulate(self, level: Level, split: str, images: Images, start: int, stop: int) -> Recorded:
+        """What the sensor records of `images[start:stop]` of a whole split: the same bytes however it is cut.
+
+        Where an effect draws by blocks of images, the whole blocks around them are simulated.
+        """
+        block = self.sensor.block
+        first, last = start // block * block, min(-(-stop // block) * block, len(images))
+        return self.simulate_block(level, split, images.pixels[first:last], images.white, first).images(
+            start - first, stop - first
+        )
+
+    def simulate_block(self, level: Level, split: str, pixels: np.ndarray, white: float, first: int) -> Recorded:
+        """As `simulate`, for the images `pixels` whose first has the index `first` (a multiple of the block)."""
+        channels = pixels[0].size // self.sensor.layout.pixels
+        # each channel is an image of its own to the sensor
+        numbers = np.arange(first * channels, (first + len(pixels)) * channels, dtype=np.uint64)
+        photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
+        made = self.sensor.expose(photons, self.conditions, self.streams(level, split, numbers), self.readouts)
+        return made.grouped(channels)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What the reconstructions are told."""
+        c = self.conditions
+        return Settings(
+            self.sensor.nominal_pdp(c.wavelength),
+            c.exposure,
+            self.sensor.nominal_dead_time,
+            self.sensor.tick,
+            c.frames,
+            c.frame_time,
+        )
+
+    def with_levels(self, texts: tuple[str, ...]) -> Experiment:
+        """The same with some of the light levels only, in the config's order. Raises KeyError with a sentence."""
+        chosen = {self.level(text).text for text in texts}
+        levels = tuple(x for x in self.levels if x.text in chosen)
+        scene = {**self.resolved["scene"], levels[0].kind: [x.text for x in levels]}
+        return replace(self, levels=levels, resolved={**self.resolved, "scene": scene})
+
+    def with_methods(self, names: tuple[str, ...]) -> Experiment:
+        """The same with these reconstructions."""
+        return replace(self, methods=names, resolved={**self.resolved, "reconstruct": list(names)})
+
+    def check_volume(self, mean_grey: float, channels: int) -> None:
+        """Raise InputError where one image holds more than can be simulated. mean_grey: from 0 to 1."""
+        brightest = max(self.levels, key=self.white)
+        pixels = self.sensor.layout.pixels * channels
+        photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
+        candidates, _ = self.sensor.expected(photons, self.conditions)
+        events = float(candidates.sum())
+        most = _MOST_EVENTS if self.sensor.is_paper_line else _MOST_STAGED_EVENTS
+        if not events <= most:
+            raise InputError(
+                f"{self.name}: one image at {brightest.text} would hold {events:.3g} events "
+                f"({events / pixels:.3g} a pixel), more than the {most:.0e} that can be simulated at once; "
+                "lower the light, the dark count rate or the exposure"
+            )
+        stored = pixels * self.conditions.frames / 8 if set(self.readouts) & {"qis", "str"} else 0
+        stored += 4 * events * len(set(self.readouts) & {"tr", "str"})
+        if stored > _MOST_BYTES:
+            raise InputError(
+                f"{self.name}: one image at {brightest.text} would take {stored / 2**30:.1f} GiB, more than "
+                f"the {_MOST_BYTES / 2**30:.0f} GiB that one may; lower the frames, the exposure or the light"
+            )
