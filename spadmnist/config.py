@@ -6,6 +6,7 @@ allowed and what to do.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -450,9 +451,11 @@ class _Described:
 
     def check_clock(self, conditions: Conditions, readouts: list[Any]) -> None:
         """What can only be said of sensor and recording together."""
-        if self.settled and self.settled.nominal_pdp(conditions.wavelength) <= 0:
-            pdp = (*self.path, "effects", "detection", "pdp")
-            self.reader.say(pdp, "is 0, so that no flux can be estimated; it must be more than 0")
+        # a table that does not reach the wavelength has been told already
+        with contextlib.suppress(InputError):
+            if self.settled and self.settled.nominal_pdp(conditions.wavelength) <= 0:
+                pdp = (*self.path, "effects", "detection", "pdp")
+                self.reader.say(pdp, "is 0, so that no flux can be estimated; it must be more than 0")
         tick = self.sensor.tick
         if tick <= 0:
             return

@@ -697,7 +697,8 @@ class Slow(Effect, stage="light"):
     """Waits."""
 
     def apply(self, rate, conditions):
-        time.sleep(0.4)
+        if len(rate) > 1:  # not while the run is planned
+            time.sleep(1)
         return rate
 '''
 
@@ -828,5 +829,4 @@ def test_an_effect_with_blocks_of_images(format: str, tmp_path: Path) -> None:
     for i in (0, 31, 33, 69, slice(None), slice(20, 50)):
         assert_same_images(a["160 mlux", "train"], b["160 mlux", "train"], i)
     assert_same_images(few, a["160 mlux", "train"], slice(0, 40))
-    source = json.loads((tmp_path / "out" / "manifest.json").read_text())["plugins"]["shaken.py"]["source"]
-    assert source == plugin.read_text()
+    assert json.dumps(plugin.read_text()) in (tmp_path / "out" / "manifest.json").read_text()
