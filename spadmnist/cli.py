@@ -70,7 +70,7 @@ def _json(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
 
 
-@cli.command()
+@cli.command(short_help="Make the dataset of a config.")
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option(
     "--output",
@@ -97,7 +97,7 @@ def _json(command: F) -> F:
     "--images-dir",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Where the images lie (MNIST: else $SPADMNIST_DATA, the cache, a download).",
+    help="Where the images lie. Without it MNIST is looked for in $SPADMNIST_DATA, then downloaded once.",
 )
 @_jobs
 @click.option(
@@ -174,7 +174,7 @@ def generate(
         _say(f"Look at it:  spadmnist inspect {root} --plot {root.name}.png")
 
 
-@cli.command("reconstruct")
+@cli.command("reconstruct", short_help="Add flux images to a dataset.")
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.option(
     "--method",
@@ -218,7 +218,7 @@ def reconstruct_(
     click.echo(report.level_table(manifest))
 
 
-@cli.command()
+@cli.command(short_help="Say and show what a dataset holds.")
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.option(
     "--plot",
@@ -236,7 +236,10 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
     """
     from . import dataset as library
     from . import report
+    from .errors import SpadError
 
+    if plot is not None and plot.suffix.lower() != ".png":
+        raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
     manifest, intact = library.read_manifest(dataset)
     if as_json:
         click.echo(
@@ -258,7 +261,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         _say(f"Drawn: {plot}")
 
 
-@cli.command()
+@cli.command(short_help="Compare every byte with the manifest; repair.")
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.option("--repair", is_flag=True, help="Make exactly the damaged files again.")
 @click.option(
@@ -344,10 +347,16 @@ def _reference(kind: str) -> click.Command:
             raise SpadError(str(error.args[0])) from None
 
     command.__doc__ = {
-        "effect": "List the physical effects, or describe one with its parameters and the YAML to paste.",
-        "method": "List the flux reconstructions, or describe one with its formula and rules.",
+        "effect": "List the physical effects, or describe NAME with its parameters and the YAML to paste.\n\n"
+        "\b\nspadmnist effects\nspadmnist effects dead_time",
+        "method": "List the flux reconstructions, or describe NAME with its formula and rules.\n\n"
+        "\b\nspadmnist methods\nspadmnist methods inter_photon",
     }[kind]
-    return cli.command(f"{kind}s")(command)
+    short = {
+        "effect": "List physical effects, or describe one.",
+        "method": "List flux reconstructions, or describe one.",
+    }
+    return cli.command(f"{kind}s", short_help=short[kind])(command)
 
 
 _reference("effect")

@@ -342,6 +342,8 @@ def seal(manifest: dict[str, Any]) -> bytes:
 def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
     """(manifest, is every byte of it as it was sealed?). Raises InputError where there is none to read."""
     path = root / MANIFEST
+    if root.is_file():
+        raise InputError(f"{root} is a file; a dataset is a folder (spadmnist generate makes one from a config)")
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
@@ -350,7 +352,7 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
                 f"{root} is not finished: type the command that makes it again, and it goes on where it stopped"
             ) from None
         if not root.exists():
-            raise InputError(f"{root}: there is no such dataset or config file") from None
+            raise InputError(f"{root}: there is no such folder") from None
         raise InputError(f"{root} is not a dataset: it has no {MANIFEST}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
@@ -706,6 +708,8 @@ def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequenc
     for file in plugin:
         plugins.load_file(file)
     root = Path(path)
+    if not root.exists():
+        raise InputError(f"{root}: there is no such dataset or config file")
     if root.is_file():
         return simulated(config.read(root), Path(images_dir) if images_dir is not None else None)
     return stored(root)

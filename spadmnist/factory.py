@@ -171,6 +171,8 @@ def run_tasks(
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    # the tracker that cleans up behind workers need not tell people that it did
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     missing = list(keys)
     for attempt in range(_ROUNDS):
         remaining = set(missing)
@@ -195,8 +197,9 @@ def run_tasks(
             return
         except TerminatedWorkerError:
             missing = [key for key in missing if key in remaining]
-        except BaseException:
-            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+        except BaseException as error:
+            # an error of a task leaves the workers idle; an interruption finds them at work
+            get_reusable_executor().shutdown(wait=True, kill_workers=not isinstance(error, Exception))
             raise
     raise SpadError(
         f"a worker died {_ROUNDS} times while making {missing[0]} (out of memory?); what is complete is kept: free "
@@ -229,11 +232,19 @@ def locked(root: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
-        # whatever went wrong before anything was written leaves no trace
+        # a run that ended before its first shard leaves no trace
         with contextlib.suppress(OSError):
-            if set(os.listdir(state)) <= {"lock", "tmp"} and not (root / STATE / "plan.json").exists():
+            if state.is_dir() and not any((state / "shards").rglob("*.json")) and not (root / MANIFEST).exists():
                 shutil.rmtree(state)
-                root.rmdir()
+                for folder in (root / "data.zarr", root / "data", root):
+                    _remove_empty(folder)
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder that holds nothing but empty folders."""
+    for inside, folders, files in os.walk(folder, topdown=False):
+        if not files and not [f for f in folders if os.path.exists(os.path.join(inside, f))]:
+            os.rmdir(inside)
 
 
 @contextlib.contextmanager

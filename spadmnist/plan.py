@@ -44,18 +44,23 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
         row["seconds"] = seconds * _BESIDES_ENCODING / jobs
         levels.append(row)
     total = {key: sum(row[key] for row in levels) for key in ("images", "photons", "detections", "bytes", "seconds")}
-    largest = max(
-        (s.stop - s.start) * dataset.expected_per_image(experiment, experiment.level(s.level), splits[s.split])[1]
-        for s in dataset.shards_of(experiment, splits)
-        if s.level is not None
-    )
+    # packed bits are held once; stamps and images two to three times, before and after they are put in order
+    framed = bool({"str", "qis"} & set(experiment.readouts))
+    streams = bits = 0.0
+    for shard in dataset.shards_of(experiment, splits):
+        if shard.level is not None:
+            images = splits[shard.split]
+            size = dataset.expected_per_image(experiment, experiment.level(shard.level), images)[1]
+            packed = images.pixels[0].size * -(-experiment.conditions.frames // 8) * framed
+            n = shard.stop - shard.start
+            streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
     return {
         "levels": levels,
         "total": total,
         "jobs": jobs,
         "shards": len(dataset.shards_of(experiment, splits)),
         # streams, scratch and encoded bytes of a shard; interpreter, libraries and compiled kernels
-        "memory_per_worker": int(4 * largest) + _LIBRARIES,
+        "memory_per_worker": int(_LIBRARIES + 3 * streams + 1.2 * bits),
     }
 
 
@@ -71,17 +76,22 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
         )
         photons = experiment.photons(level, np.arange(256, dtype=np.uint8)[:, None, None], images.white)
         row = np.tile(photons, (1, experiment.sensor.layout.pixels))[:, : experiment.sensor.layout.pixels]
-        _, recorded = experiment.sensor.expected(row, experiment.conditions)
+        recorded = _seen(experiment, row)
         total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
         return total, float(counted @ recorded[:, 0])
     step = max(1, n // 256)
     some = np.ascontiguousarray(pixels[::step])
     photons = experiment.photons(level, some, images.white)
-    _, recorded = experiment.sensor.expected(
-        photons.reshape(-1, experiment.sensor.layout.pixels), experiment.conditions
-    )
+    recorded = _seen(experiment, photons.reshape(-1, experiment.sensor.layout.pixels))
     share = n / len(some)
     return float(photons.sum()) * experiment.conditions.exposure * share, float(recorded.sum()) * share
+
+
+def _seen(experiment: Experiment, photons: np.ndarray) -> np.ndarray:
+    """Expected entries of the stream per pixel: TR detections or, without TR, frames with a detection."""
+    candidates, recorded = experiment.sensor.expected(photons, experiment.conditions)
+    frames = experiment.conditions.frames
+    return recorded if "tr" in experiment.readouts else -frames * np.expm1(-candidates / frames)
 
 
 def _uniform(experiment: Experiment) -> bool:

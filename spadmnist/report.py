@@ -436,12 +436,15 @@ def _cells_of(shown: _Shown, times: tuple[float, float] | None) -> list[_Cell]:
 
 
 def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf) -> tuple[np.ndarray, str]:
-    """(RGB, caption) from 0, black, to `white`, by default the largest value up to `clip`.
+    """(RGB, caption) from 0, black, to `white`: by default the largest value up to `clip` or, where a few outliers
+    would leave all else in the dark, the value that one in 200 exceeds.
 
     Three channels are red, green and blue; of another number of them the mean is shown.
     """
     largest = float(values.max())
-    white = min(largest, clip) if white is None else white
+    if white is None:
+        usual = float(np.quantile(values, 0.995))
+        white = min(usual if 0 < 4 * usual < largest else largest, clip)
     scaled = np.clip(values / white, 0, 1) if white > 0 else np.zeros(values.shape)
     if values.ndim == 4 and values.shape[1] == 3:
         rgb = np.moveaxis(scaled, 1, -1)
@@ -449,8 +452,8 @@ def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf
         grey = scaled.mean(axis=1) if values.ndim == 4 else scaled
         rgb = np.repeat(grey[..., None], 3, axis=-1)
     caption = "all 0"
-    if largest > clip:
-        caption = f"white: {white:g} (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
+    if largest > white > 0:
+        caption = f"white: {white:.4g} (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
     elif white > 0:
         caption = f"white: {white:.4g}, mean {float(values.mean(dtype=np.float64)):.3g}"
     return _bytes_of(rgb), caption
@@ -531,8 +534,8 @@ def _draw(
     foot = ["Grey runs from 0, black, to the value below the cell, white, if the head says nothing else."]
     if basis is not None:
         foot.append(
-            f"Fluxes are divided by the median of the non-zero pixels of {basis}; "
-            f"what is above {_CLIP:g} is drawn as {_CLIP:g}."
+            f"Fluxes are divided by the median of the non-zero pixels of {basis}; what is above {_CLIP:g} is drawn "
+            f"as {_CLIP:g}. Where a few outliers would darken the rest, white is below the maximum that is named."
         )
     _, _, factor = _arranged(columns[0].pixels)
     if factor > 1:

@@ -457,7 +457,7 @@ def hammer(verb: str, format: str, folder: str, kills: int, seed: int) -> None:
     early = range(1, steps - 30)
     points = sorted(rng.sample(early, min(kills, len(early))))
     late = range(max(1, steps - 30), steps + 1)
-    points += sorted(rng.sample(late, 10)) if kills < 20 else late
+    points += sorted(rng.sample(late, 12))
     wrong = []
     for at in points:
         prepare()
@@ -507,7 +507,7 @@ def test_killed_at_some_steps_on_the_disk(verb: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", VERBS)
 def test_killed_at_many_steps_on_the_disk(verb: str, format: str, tmp_path: Path) -> None:
-    _hammered(verb, format, tmp_path, 120)
+    _hammered(verb, format, tmp_path, 30)
 
 
 # --- killed from outside ------------------------------------------------------------------------------------------

@@ -608,28 +608,28 @@ def random_shard(size: int) -> dict[str, Column]:
 def test_a_full_disk(tmp_path: Path, format: str) -> None:
     if os.geteuid() != 0:
         pytest.skip("mounting a small tmpfs needs root")
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True).returncode:
+    place = tmp_path / "disk"
+    place.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place], capture_output=True).returncode:
         pytest.skip("mounting a tmpfs is not allowed here")
     try:
-        write_shard(disk, "first", random_shard(200_000), {}, format)
-        before = tree(disk)
+        write_shard(place, "first", random_shard(200_000), {}, format)
+        before = tree(place)
         with pytest.raises(SpadError) as caught:
-            write_shard(disk, "second", random_shard(2_000_000), {}, format)
+            write_shard(place, "second", random_shard(2_000_000), {}, format)
         assert str(caught.value) == (
-            f"{disk / store.location('second', format)}: cannot write up to 2 MB here: "
+            f"{place / store.location('second', format)}: cannot write up to 2 MB here: "
             "No space left on device; free some space (or choose another place with -o) and type the same "
             "command again; what is complete is kept"
         )
         with pytest.raises(SpadError, match="free some space"):
-            append_columns(disk, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format)
+            append_columns(place, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format)
         with pytest.raises(SpadError, match="free some space"):
-            disk.commit_file(disk / "manifest.json", os.urandom(2_000_000), disk.temporary(disk))
-        assert tree(disk) == before and list(disk.temporary(disk).iterdir()) == []
-        assert not exists(disk, "second", format)
+            disk.commit_file(place / "manifest.json", os.urandom(2_000_000), disk.temporary(place))
+        assert tree(place) == before and list(disk.temporary(place).iterdir()) == []
+        assert not exists(place, "second", format)
     finally:
-        subprocess.run(["umount", disk], check=True)
+        subprocess.run(["umount", place], check=True)
 
 
 @pytest.mark.parametrize("format", FORMATS)

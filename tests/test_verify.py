@@ -82,7 +82,9 @@ def delete(root: Path, name: str, rng: random.Random) -> set[str]:
 def swap(root: Path, name: str, rng: random.Random) -> set[str]:
     """With a file of other content."""
     here = (root / name).read_bytes()
-    others = [n for n in sorted(tree(root)) if (root / n).read_bytes() != here]
+    # manifest and config in each other's place are both lost; see below
+    both = {"manifest.json", "config.yaml"}
+    others = [n for n in sorted(tree(root)) if (root / n).read_bytes() != here and {n, name} != both]
     other = rng.choice(others)
     (root / name).write_bytes((root / other).read_bytes())
     (root / other).write_bytes(here)
@@ -198,6 +200,18 @@ def test_every_entry_of_the_manifest_may_be_damaged(key: str, root: Path, made: 
     assert "manifest.json" in damage.changed
     verify.repair(root, damage, 1)
     assert_same(root, tree(made))
+
+
+def test_a_name_in_the_manifest_may_be_damaged(root: Path, made: Path) -> None:
+    """The file of that name is then no stranger that is moved away."""
+    name = sorted(n for n in tree(root) if n.startswith("data"))[-1]
+    text = (root / "manifest.json").read_text()
+    (root / "manifest.json").write_text(text.replace(f'"{name}"', f'"{name[:-1]}~"', 1))
+    damage = verify.verify(root)
+    assert "manifest.json" in damage.changed
+    verify.repair(root, damage, 1)
+    assert_same(root, tree(made))
+    assert not (root.parent / "out.extra").exists()
 
 
 def test_flips_all_over_the_manifest(root: Path, made: Path) -> None:
