@@ -544,7 +544,8 @@ def _resolved(
     for effect in described.sensor.effects:
         given = described.written.get(effect.name) or {}
         effects[effect.name] = {
-            name: given.get(name, _default_text(declared)) for name, declared in effect.parameters.items()
+            name: given[name] if name in given else _default_text(declared)
+            for name, declared in effect.parameters.items()
         }
     return {
         "seed": parts["seed"],

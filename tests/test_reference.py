@@ -51,12 +51,13 @@ def pasted(page: str, key: str) -> document.Document:
 
 def effect_of(page: str) -> Effect:
     source = pasted(page, "sensor:")
-    layout = {"rows": 2, "columns": 3, "pixel_area": "25 um^2"}
-    problems: list[str] = []
-    raw = {**source.value["sensor"], "layout": layout}
-    sensor, _ = config.read_sensor(raw, source, ("sensor",), Path(), problems)
-    assert not problems
-    assert sensor is not None
+    whole = {
+        "seed": 1,
+        "scene": {"images": {"source": "uniform"}, "lux": ["1 lux"]},
+        "recording": {"exposure": "1 ms", "readouts": ["tr"]},
+        "sensor": {**source.value["sensor"], "layout": {"rows": 2, "columns": 3, "pixel_area": "25 um^2"}},
+    }
+    sensor = config.build(document.Document("pasted", whole), Path()).sensor
     [effect] = sensor.effects
     return effect
 
