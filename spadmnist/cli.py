@@ -7,6 +7,7 @@ nor numba.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -240,7 +241,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
 
     if plot is not None and plot.suffix.lower() != ".png":
         raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
-    manifest, intact = library.read_manifest(dataset)
+    manifest = library.intact_manifest(dataset)
     if as_json:
         click.echo(
             json.dumps(
@@ -253,8 +254,6 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         )
     else:
         click.echo(report.level_table(manifest))
-    if not intact:
-        _say(f"Note: {dataset / library.MANIFEST} was changed; spadmnist verify {dataset} says more.")
     if plot is not None:
         with _writing(plot):
             report.sheet(library.open(dataset), plot)
@@ -290,12 +289,10 @@ def verify(
     _load(plugin_files)
     with _terminal() as progress:
         damage = library.verify(dataset, progress)
-        did: list[str] = []
-        if damage and repair:
+        left, did = damage, []
+        if repair:
             did = library.repair(dataset, damage, jobs or _processors(), images_dir, progress)
-            left = library.verify(dataset, progress)
-        else:
-            left = damage
+            left = library.verify(dataset, progress) if damage else damage
     if as_json:
         found = {
             "changed": damage.changed,
@@ -314,7 +311,7 @@ def verify(
             click.echo(f"{dataset}: all {damage.files} files are as they were made")
         elif not left:
             click.echo(f"{dataset}: repaired; all {left.files} files are as they were made")
-        elif not repair:
+        else:
             click.echo(f"{dataset}: {_count(damage)} not as made; spadmnist verify {dataset} --repair makes them again")
     if left:
         sys.exit(1)
@@ -367,7 +364,9 @@ _reference("method")
 
 
 def _say(text: str) -> None:
-    click.echo(text, err=True)
+    # where nobody can be told there is nothing to do about it
+    with contextlib.suppress(OSError, ValueError):
+        click.echo(text, err=True)
 
 
 def _duration(seconds: float) -> str:
@@ -448,6 +447,9 @@ class _terminal:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: one clear sentence and no traceback for whatever a user can cause."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     sys.exit(_run(arguments))
 
@@ -465,7 +467,8 @@ def _run(arguments: list[str] | None) -> int:
         _say("\nInterrupted. What is complete is kept: the same command goes on from there.")
         return 130
     except click.ClickException as error:
-        error.show()
+        with contextlib.suppress(OSError, ValueError):
+            error.show()
         return 2
     except ConfigError as error:
         for problem in error.problems:

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 
-from . import config, kernels, plugins, reconstruct, store, units
+from . import config, disk, kernels, plugins, reconstruct, store, units
 from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
@@ -33,6 +34,7 @@ from .reconstruct import medians_of_nonzero
 from .store import Column, ShardReader
 
 FORMAT = "spadmnist-dataset/1"
+_LARGEST_MANIFEST = 1 << 30  # bytes
 MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
 STATE = ".spadmnist"
@@ -345,7 +347,7 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
     if root.is_file():
         raise InputError(f"{root} is a file; a dataset is a folder (spadmnist generate makes one from a config)")
     try:
-        raw = path.read_bytes()
+        raw = disk.read_file(path, _LARGEST_MANIFEST)
     except FileNotFoundError:
         if (root / STATE).is_dir():
             raise InputError(
@@ -355,7 +357,7 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
             raise InputError(f"{root}: there is no such folder") from None
         raise InputError(f"{root} is not a dataset: it has no {MANIFEST}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); spadmnist verify {root} says more") from None
     try:
         manifest = json.loads(raw)
         intact = isinstance(manifest, dict) and seal(manifest) == raw
@@ -366,6 +368,14 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
     if manifest["format"] != FORMAT:
         raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
     return manifest, intact
+
+
+def intact_manifest(root: Path) -> dict[str, Any]:
+    """The manifest as it was sealed. Raises InputError where it is not."""
+    manifest, intact = read_manifest(root)
+    if not intact:
+        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+    return manifest
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
@@ -410,7 +420,7 @@ class Field(Generic[T]):
             if step != 1:
                 raise IndexError("slices go in steps of 1; take every n-th image one by one")
             return self._get(start, max(start, stop))
-        i = int(index)
+        i = operator.index(index)
         if i < 0:
             i += self._length
         if not 0 <= i < self._length:
@@ -436,7 +446,7 @@ class Reconstruction(Field[np.ndarray]):
     def __init__(self, length: int, backend: _Backend, method: str):
         self._backend = backend
         self.method = method
-        super().__init__(length, lambda a, b: backend.reconstruction(method, a, b), _first)
+        super().__init__(length, partial(backend.reconstruction, method), _first)
 
     @cached_property
     def normalisation(self) -> float | None:
@@ -445,11 +455,11 @@ class Reconstruction(Field[np.ndarray]):
 
     @property
     def normalised(self) -> Field[np.ndarray]:
-        def get(start: int, stop: int) -> np.ndarray:
-            raw = self._backend.reconstruction(self.method, start, stop)
-            return raw if self.normalisation is None else raw / np.float32(self.normalisation)
+        return Field(self._length, self._divided, _first)
 
-        return Field(self._length, get, _first)
+    def _divided(self, start: int, stop: int) -> np.ndarray:
+        raw = self._backend.reconstruction(self.method, start, stop)
+        return raw if self.normalisation is None else raw / np.float32(self.normalisation)
 
 
 class Part:
@@ -495,22 +505,22 @@ class Part:
         """QIS and STR as they are stored: bits packed, and the stamps of those that are set."""
         what: Any = "str" if "str" in self.readouts else "qis"
         self._recorded(what)
-        return Field(self._length, lambda a, b: self._backend.recorded(a, b, what), _same)
+        return Field(self._length, partial(self._backend.recorded, what=what), _same)
 
     @property
     def tr(self) -> Field[Events]:
         self._recorded("tr")
-        return Field(self._length, lambda a, b: self._backend.recorded(a, b, "tr"), _same)
+        return Field(self._length, partial(self._backend.recorded, what="tr"), _same)
 
     @property
     def qis(self) -> Field[np.ndarray]:
         self._recorded("qis")
-        return Field(self._length, lambda a, b: self._frames(a, b, "qis", Frames.unpacked), _first)
+        return Field(self._length, partial(self._frames, what="qis", unpack=Frames.unpacked), _first)
 
     @property
     def str(self) -> Field[np.ndarray]:
         self._recorded("str")
-        return Field(self._length, lambda a, b: self._frames(a, b, "str", Frames.stamps), _first)
+        return Field(self._length, partial(self._frames, what="str", unpack=Frames.stamps), _first)
 
     def _frames(self, start: int, stop: int, what: Any, unpack: Callable[[Frames], np.ndarray]) -> np.ndarray:
         dense = unpack(self._backend.recorded(start, stop, what))
@@ -732,9 +742,7 @@ def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset
 
 def stored(root: Path) -> Dataset:
     """A finished dataset. Only its manifest is read here; checksums are compared as the data are read."""
-    manifest, intact = read_manifest(root)
-    if not intact:
-        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+    manifest = intact_manifest(root)
     levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
     shards = [Shard(**x) for x in manifest["shards"]]
     shape = tuple(manifest["images"]["shape"])

@@ -12,6 +12,7 @@ import hashlib
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,18 @@ def commit_file(path: str | os.PathLike[str], data: bytes, tmp: str | os.PathLik
         os.rename(work / "file", path)
         _sync(path.parent)
     return record
+
+
+def read_file(path: str | os.PathLike[str], most: int) -> bytes:
+    """A regular file's content. Raises OSError for a link, a pipe and whatever else is no file, or a larger one."""
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(handle, "rb") as file:
+        facts = os.fstat(file.fileno())
+        if not stat.S_ISREG(facts.st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+        if facts.st_size > most:
+            raise OSError(errno.EFBIG, f"it is larger than {most} bytes", str(path))
+        return file.read()
 
 
 def sweep(tmp: str | os.PathLike[str]) -> int:

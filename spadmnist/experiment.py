@@ -35,7 +35,8 @@ class Level:
     @property
     def folder(self) -> str:
         """Its name on disk: `5 mlux` -> `5_mlux`, `120 nW/cm^2` -> `120_nW_per_cm2`."""
-        return re.sub(r"[^A-Za-z0-9.+-]+", "_", self.text.replace("/", "_per_").replace("^", "")).strip("_")
+        text = re.sub(r"^\+?(?=\.)", "0", self.text.lstrip("+")).replace("/", "_per_").replace("^", "")
+        return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")
 
     @property
     def key(self) -> str:
@@ -127,6 +128,8 @@ class Experiment:
 
         Where an effect draws by blocks of images, the whole blocks around them are simulated.
         """
+        if stop <= start:
+            return self.simulate(level, split, images, 0, 1).images(0, 0)
         block = self.sensor.block
         first, last = start // block * block, min(-(-stop // block) * block, len(images))
         return self.simulate_block(level, split, images.pixels[first:last], images.white, first).images(

@@ -162,7 +162,7 @@ def run_tasks(
     A worker that dies takes its call down with it; what is missing is tried again, at last one by one, so that the
     task that kills its worker is named. Errors that a task raises itself are passed on.
     """
-    if jobs == 1 or len(keys) == 1:
+    if jobs == 1:
         keep_freed_memory()
         for key, task in zip(keys, tasks(keys), strict=True):
             done(key, function(task))
@@ -173,16 +173,16 @@ def run_tasks(
 
     # the tracker that cleans up behind workers need not tell people that it did
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
-    missing = list(keys)
-    for attempt in range(_ROUNDS):
-        remaining = set(missing)
-        workers = jobs if attempt < _ROUNDS - 1 else 1
+    missing, fatal, attempt = list(keys), [], 1
+    while missing:
+        remaining = dict.fromkeys(missing)
+        alone = attempt > _ROUNDS
         try:
             with Parallel(
-                n_jobs=min(workers, len(missing)) if workers > 1 else 2,
+                n_jobs=2 if alone else min(jobs, max(2, len(missing))),
                 backend="loky",
                 return_as="generator_unordered",
-                pre_dispatch="n_jobs" if workers > 1 else 1,
+                pre_dispatch=1 if alone else "n_jobs",
                 batch_size=1,
                 max_nbytes=None,
                 initializer=_start_worker,
@@ -192,19 +192,22 @@ def run_tasks(
                     delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
                 )
                 for key, result in parallel(calls):
-                    remaining.discard(key)
+                    del remaining[key]
                     done(key, result)
-            return
         except TerminatedWorkerError:
-            missing = [key for key in missing if key in remaining]
+            if alone:  # the one that was under way is the one that kills
+                fatal.append(next(iter(remaining)))
+                del remaining[fatal[-1]]
         except BaseException as error:
             # an error of a task leaves the workers idle; an interruption finds them at work
             get_reusable_executor().shutdown(wait=True, kill_workers=not isinstance(error, Exception))
             raise
-    raise SpadError(
-        f"a worker died {_ROUNDS} times while making {missing[0]} (out of memory?); what is complete is kept: free "
-        "some memory or give fewer --jobs, and type the same command again"
-    )
+        missing, attempt = list(remaining), attempt + 1
+    if fatal:
+        raise SpadError(
+            f"a worker died each time it made {', '.join(map(str, fatal))} (out of memory?); all else is complete: "
+            "free some memory or give fewer --jobs, and type the same command again"
+        )
 
 
 def _keyed(function: Callable[[Any], Any], key: Any, task: Any) -> tuple[Any, Any]:
@@ -219,25 +222,54 @@ def locked(root: Path) -> Iterator[None]:
     """Hold the dataset for writing. The system frees the lock of a process that is killed."""
     state = root / STATE
     path = state / "lock"
-    with _writable(root):
-        state.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
+    while True:
+        with _writable(root):
+            state.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            os.close(handle)
             raise SpadError(
                 f"{root}: another run is writing there; wait for it, or choose another folder with -o"
             ) from None
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), os.stat(path)):
+                break
+        os.close(handle)  # the run that held it has finished and removed it: what is locked is nobody's lock
+    try:
         yield
     finally:
-        os.close(handle)
-        # a run that ended before its first shard leaves no trace
         with contextlib.suppress(OSError):
-            if state.is_dir() and not any((state / "shards").rglob("*.json")) and not (root / MANIFEST).exists():
+            if (root / MANIFEST).exists():
+                if not (state / "plan.json").exists() and not (state / "repairing").exists():
+                    shutil.rmtree(state)
+            elif not any((state / "shards").rglob("*.json")):
+                # a run that ended before its first shard leaves no trace
                 shutil.rmtree(state)
                 for folder in (root / "data.zarr", root / "data", root):
                     _remove_empty(folder)
+        os.close(handle)
+
+
+def clear_state(root: Path) -> None:
+    """Forget a run that has come to its end. A kill in the middle of this is made good by the next run."""
+    for name in ("plan.json", "repairing"):
+        (root / STATE / name).unlink(missing_ok=True)
+    shutil.rmtree(root / STATE, ignore_errors=True)
+
+
+def clear_records(root: Path) -> None:
+    """Forget what was made, and by which plan."""
+    shutil.rmtree(root / STATE / "shards", ignore_errors=True)
+    (root / STATE / "plan.json").unlink(missing_ok=True)
+
+
+def tidy(root: Path) -> None:
+    """Remove what a kill at the very end of a run has left beside a finished dataset."""
+    if (root / STATE).is_dir():
+        with locked(root):
+            clear_state(root)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -365,10 +397,12 @@ def generate(
     started = time.monotonic()
     check_volume(experiment, splits)
     wanted = identity(experiment, splits)
-    _check_place(root, wanted)
-    if (root / MANIFEST).exists():
+    if _check_place(root, wanted):
+        tidy(root)
         return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
     with locked(root):
+        if _check_place(root, wanted):  # another run has finished it meanwhile
+            return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted)
         _check_space(root, experiment, splits)
         shards = dataset.shards_of(experiment, splits)
@@ -386,16 +420,16 @@ def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
     experiment.check_volume(float(shown.mean(dtype=np.float64)) / images.white, channels)
 
 
-def _check_place(root: Path, wanted: dict[str, Any]) -> None:
-    """Refuse a folder that holds something else, before anything is written."""
+def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
+    """Is the dataset there and finished? Refuse a folder that holds something else, before anything is written."""
     with _writable(root):
         if not root.exists():
-            return
+            return False
         if not root.is_dir():
             raise SpadError(f"{root} is a file; choose another place with -o")
         if (root / MANIFEST).exists():
             _refuse_other(root, wanted, dataset.read_manifest(root)[0])
-            return
+            return True
         content = set(os.listdir(root))
         plan = root / STATE / "plan.json"
         if not plan.exists():
@@ -404,18 +438,22 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> None:
                     f"{root} is not empty and holds no dataset (there is {sorted(content)[0]}); "
                     "choose another folder with -o"
                 )
-            return
+            return False
     try:
         there = json.loads(plan.read_bytes())
     except ValueError:
         raise SpadError(f"{plan}: is damaged; remove {root} and begin again") from None
     _refuse_other(root, wanted, there)
+    return False
 
 
 def begin(root: Path, wanted: dict[str, Any]) -> None:
     """Note what is being made, so that the same command can go on with it and no other can."""
     with _writable(root):
         disk.sweep(disk.temporary(root))
+        if not (root / STATE / "plan.json").exists():
+            # records without a plan are those of a run that has finished
+            shutil.rmtree(root / STATE / "shards", ignore_errors=True)
         disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
@@ -437,7 +475,16 @@ def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images
 
 
 def _is_made(root: Path, shard: Shard, format: str) -> bool:
-    return _record_path(root, shard).exists() and store.exists(root, shard.path, format)
+    return _record(root, shard) is not None and store.exists(root, shard.path, format)
+
+
+def _record(root: Path, shard: Shard) -> Files | None:
+    """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
+    try:
+        found = json.loads(_record_path(root, shard).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _make(
@@ -546,9 +593,7 @@ def add_reconstructions(
 
     Returns (methods that were added, manifest). An interrupted run is taken up by the same call.
     """
-    manifest, intact = dataset.read_manifest(root)
-    if not intact:
-        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+    manifest = dataset.intact_manifest(root)
     before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
     chosen = list(names) or [
         m for m in reconstruct.Method.registry if set(reconstruct.find(m).readouts()) <= set(before.readouts)
@@ -559,6 +604,7 @@ def add_reconstructions(
             raise InputError(f"{root}: {name} needs {', '.join(sorted(lacking))}, which was not recorded")
     new = tuple(dict.fromkeys(m for m in chosen if m not in before.methods))
     if not new:
+        tidy(root)
         return [], manifest
     after = before.with_methods((*before.methods, *new))
     kept = ("format", "images", "maps", "versions")
@@ -567,9 +613,13 @@ def add_reconstructions(
     with locked(root):
         plan = root / STATE / "plan.json"
         if plan.exists():
-            _refuse_other(root, wanted, json.loads(plan.read_bytes()))
+            there = json.loads(plan.read_bytes())
+            if all(there.get(key) == manifest.get(key) for key in wanted):
+                clear_records(root)  # of the run that made what is here, and was killed at its very end
+            else:
+                _refuse_other(root, wanted, there)
         begin(root, wanted)
-        by_path = {s.path: s for s in shards if not _record_path(root, s).exists()}
+        by_path = {s.path: s for s in shards if _record(root, s) is None}
         job = job_of(after)
 
         def files_of(shard: Shard) -> Files:
@@ -642,7 +692,7 @@ def finish(
     temporary = disk.temporary(root)
     files: Files = {}
     for shard in shards:
-        files |= json.loads(_record_path(root, shard).read_bytes())
+        files |= _record(root, shard) or {}
     small, groups = small_files(experiment, shards, normalisation)
     files |= store.write_groups(root, groups, experiment.format)
     for name, data in small.items():
@@ -661,7 +711,7 @@ def finish(
     }
     sealed = dataset.seal(manifest)
     disk.commit_file(root / MANIFEST, sealed, temporary)
-    shutil.rmtree(root / STATE)
+    clear_state(root)
     return json.loads(sealed)
 
 
@@ -695,7 +745,7 @@ def _level_attributes(
         return {"content": "original images and labels"}
     level = experiment.level(shard.level)
     unit = "lux" if level.kind == "lux" else "W/m^2"
-    medians = {f"normalisation_{k}": v for k, v in sorted(normalisation[shard.level].items()) if v is not None}
+    medians = {f"normalisation_{k}": v for k, v in sorted(normalisation.get(shard.level, {}).items()) if v is not None}
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 

@@ -709,7 +709,7 @@ class Uniform(_Source):
     """Uniform images of the sensor's own size, repetitions of one: for flat and dark recordings."""
 
     source: Literal["uniform"] = "uniform"
-    repetitions: int = Field(default=10, ge=1, le=2**31 - 1, description="number of images")
+    repetitions: int = Field(default=10, ge=1, le=1_000_000, description="number of images")
     grey: int = Field(default=255, ge=0, le=255, description="grey level; 255, white, is the scene's full light")
 
     def describe(self) -> str:

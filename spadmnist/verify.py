@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import shutil
 import stat
@@ -40,11 +41,14 @@ class Damage:
 
 
 def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
-    """Read every byte of a dataset. Raises InputError where the folder never was a dataset."""
+    """Read every byte of a dataset. Raises InputError where the folder never was a dataset.
+
+    What a damaged manifest says of other files is not to be trusted: then it alone is named (and a lost config).
+    """
     manifest = _manifest(root)
     if manifest is None:
-        state = [MANIFEST] if (root / MANIFEST).exists() else []
-        return Damage(tuple(state), () if state else (MANIFEST,), (), 0)
+        lost = tuple(name for name in (CONFIG, MANIFEST) if not os.path.lexists(root / name))
+        return Damage((MANIFEST,) if MANIFEST not in lost else (), lost, (), 0)
     listed: dict[str, dict[str, Any]] = manifest["files"]
     found = set(_walk(root))
     present = sorted(found & set(listed))
@@ -56,25 +60,26 @@ def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
             if not same:
                 changed.append(name)
     progress.stop()
-    if not dataset.read_manifest(root)[1]:
-        changed.append(MANIFEST)
-    return Damage(
-        tuple(sorted(changed)),
-        tuple(sorted(set(listed) - found)),
-        tuple(sorted(found - set(listed) - {MANIFEST})),
-        len(present) + 1,
-    )
+    missing = sorted(set(listed) - found)
+    return Damage(tuple(changed), tuple(missing), tuple(sorted(found - set(listed) - {MANIFEST})), len(present) + 1)
 
 
 def _manifest(root: Path) -> dict[str, Any] | None:
-    """The manifest, None where a dataset has lost it. Raises InputError where there never was one."""
+    """The manifest as it was sealed; None where a dataset has lost it. Raises InputError where there never was one."""
     try:
-        return dataset.read_manifest(root)[0]
+        manifest, intact = dataset.read_manifest(root)
+        return manifest if intact else None
     except InputError:
-        once = (root / CONFIG).is_file() and ((root / "data.zarr").is_dir() or (root / "data").is_dir())
-        if not once or (root / STATE / "plan.json").exists():
+        if (root / STATE / "repairing").exists():
+            return None  # a repair of the manifest that was interrupted
+        if not _was_dataset(root) or (root / STATE / "plan.json").exists():
             raise
         return None
+
+
+def _was_dataset(root: Path) -> bool:
+    data = (root / "data.zarr" / "images", root / "data" / "images")
+    return os.path.lexists(root / MANIFEST) or any(folder.is_dir() for folder in data)
 
 
 def _walk(root: Path) -> Iterator[str]:
@@ -114,10 +119,18 @@ def repair(
     The images come from the dataset itself where they are intact, else from where the config says. Without a
     manifest everything is simulated again and compared. Returns what was done, a line each.
     """
-    manifest = None if {MANIFEST} & {*damage.changed, *damage.missing} else dataset.read_manifest(root)[0]
+    if not damage:
+        factory.tidy(root)
+        return []
+    manifest = _manifest(root)
+    if manifest is None and not (root / CONFIG).is_file():
+        raise SpadError(
+            f"{root}: {MANIFEST} and {CONFIG} are both lost, so that nothing says what was here; "
+            "generate the dataset anew from its config, in another folder"
+        )
     experiment = _experiment(root, manifest, damage)
     if manifest is not None and manifest["versions"] != factory.versions():
-        wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions()[k] != v)
+        wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions().get(k) != v)
         raise SpadError(f"{root}: was made with {wanted}; install these versions to make the same bytes again")
     splits = _images(root, manifest, experiment, damage, images_dir)
     identity = factory.identity(experiment, splits)
@@ -128,27 +141,35 @@ def repair(
                 f"{root}: cannot be made again from what is here: {', '.join(lines)} differ from the manifest's; "
                 "give the same images (--images-dir) and plug-ins (--plugin)"
             )
+    shards = dataset.shards_of(experiment, splits)
+    bad = {*damage.changed, *damage.missing}
     did: list[str] = []
     with factory.locked(root):
-        shards = dataset.shards_of(experiment, splits)
-        bad = set(damage.changed) | set(damage.missing)
         if manifest is None:
-            factory.begin(root, identity)
-            again = list(shards)
+            disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
+            again = shards
         else:
             again = [s for s in shards if any(_belongs(name, s, experiment.format) for name in bad)]
-        did += _remake(experiment, splits, root, again, manifest, jobs, progress)
         did += _set_aside(root, damage.extra)
+        remade, lines = _remake(experiment, splits, root, again, manifest, jobs, progress)
+        did += lines
         if manifest is None:
+            factory.begin(root, identity)
+            for shard in shards:
+                factory.note(root, shard, remade[shard.path])
+            for name in (*factory.small_files(experiment, shards, {})[0], MANIFEST):
+                did += _clear_way(root, name)
             factory.finish(experiment, root, identity, shards, jobs, progress)
             did.append(f"made again: {MANIFEST}")
         else:
-            small, _ = factory.small_files(experiment, shards, manifest["normalisation"])
-            for name, data in small.items():
+            for name, data in factory.small_files(experiment, shards, manifest["normalisation"])[0].items():
                 if name in bad:
+                    did += _clear_way(root, name)
                     disk.commit_file(root / name, data, disk.temporary(root))
                     did.append(f"made again: {name}")
-            shutil.rmtree(root / STATE)
+            factory.clear_state(root)
+    if manifest is None:  # only now is it known what belongs here
+        did += _set_aside(root, verify(root, progress).extra)
     return did
 
 
@@ -199,11 +220,15 @@ def _remake(
     manifest: dict[str, Any] | None,
     jobs: int,
     progress: Progress,
-) -> list[str]:
-    """Simulate shards into a folder apart, and put in place the files that differ from what is there."""
+) -> tuple[dict[str, Files], list[str]]:
+    """Simulate shards into a folder apart, and put in place the files that differ from what is there.
+
+    Returns (the files of each shard, what was done).
+    """
     apart = root / STATE / "again"
     by_path = {s.path: s for s in shards}
     job = factory.job_of(experiment)
+    remade: dict[str, Files] = {}
     did: list[str] = []
 
     def tasks(paths: Sequence[str]) -> Iterator[Any]:
@@ -216,19 +241,29 @@ def _remake(
                 raise SpadError(
                     f"{root / name}: what is made now is not what the manifest lists; generate the dataset anew"
                 )
+            did.extend(_clear_way(root, name))
             if not _same(root / name, facts):
-                (root / name).parent.mkdir(parents=True, exist_ok=True)
-                if (root / name).is_symlink():
-                    (root / name).unlink()
                 os.replace(apart / name, root / name)
                 did.append(f"made again: {name}")
-        if manifest is None:
-            factory.note(root, by_path[path], result[1])
+        remade[path] = result[1]
 
     progress.start("making again", len(shards), 0)
     if shards:
         factory.run_tasks(factory.make_shard, tasks, list(by_path), jobs, done)
     progress.stop()
+    return remade, did
+
+
+def _clear_way(root: Path, name: str) -> list[str]:
+    """Move aside what keeps a file from its place (a link, a file instead of a folder, ...), and make its folder."""
+    parts = name.split("/")
+    did = []
+    for folder in ("/".join(parts[:i]) for i in range(1, len(parts))):
+        if os.path.lexists(root / folder) and (os.path.islink(root / folder) or not os.path.isdir(root / folder)):
+            did += _set_aside(root, [folder])
+    if os.path.lexists(root / name) and (os.path.islink(root / name) or not os.path.isfile(root / name)):
+        did += _set_aside(root, [name])
+    (root / name).parent.mkdir(parents=True, exist_ok=True)
     return did
 
 
@@ -239,7 +274,13 @@ def _set_aside(root: Path, extra: Sequence[str]) -> list[str]:
     for name in extra:
         if name.startswith(f"{STATE}/"):
             continue  # left by a run that was interrupted; goes with the state
+        if not os.path.lexists(root / name):
+            continue  # it went with the folder that it lay in
         target = aside / name
+        for number in itertools.count(1):
+            if not os.path.lexists(target):
+                break
+            target = aside / f"{name}.{number}"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(root / name, target)
         did.append(f"moved to {target}: {name}")
