@@ -240,16 +240,23 @@ def locked(root: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):
-            if (root / MANIFEST).exists():
-                if not (state / "plan.json").exists() and not (state / "repairing").exists():
-                    shutil.rmtree(state)
-            elif not any((state / "shards").rglob("*.json")):
-                # a run that ended before its first shard leaves no trace
+        try:
+            _leave(root)
+        finally:
+            os.close(handle)
+
+
+def _leave(root: Path) -> None:
+    """Remove the state where nothing hangs on it: beside a finished dataset, or before a first shard."""
+    state = root / STATE
+    with contextlib.suppress(OSError):
+        if (root / MANIFEST).exists():
+            if not (state / "plan.json").exists() and not (state / "repairing").exists():
                 shutil.rmtree(state)
-                for folder in (root / "data.zarr", root / "data", root):
-                    _remove_empty(folder)
-        os.close(handle)
+        elif not any((state / "shards").rglob("*.json")):
+            shutil.rmtree(state)
+            for folder in (root / "data.zarr", root / "data", root):
+                _remove_empty(folder)
 
 
 def clear_state(root: Path) -> None:

@@ -79,7 +79,7 @@ def _manifest(root: Path) -> dict[str, Any] | None:
 
 def _was_dataset(root: Path) -> bool:
     data = (root / "data.zarr" / "images", root / "data" / "images")
-    return os.path.lexists(root / MANIFEST) or any(folder.is_dir() for folder in data)
+    return any(folder.is_dir() for folder in data)
 
 
 def _walk(root: Path) -> Iterator[str]:
