@@ -33,8 +33,8 @@ verify: $(VENV)/installed  ## the slow statistical and fault tests
 	$(RUN)/python -m pytest -m slow -q
 
 lint: $(VENV)/installed
-	$(RUN)/ruff check .
-	$(RUN)/ruff format --check .
+	$(RUN)/ruff check spadmnist scripts tests
+	$(RUN)/ruff format --check spadmnist scripts tests
 	$(RUN)/mypy
 
 bench: $(VENV)/installed  ## measure the README's table on this machine (about 4 minutes; never fails on time)

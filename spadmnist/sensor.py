@@ -25,7 +25,6 @@ from .plugins import blame, settle, source_file
 from .readout import Frames, Recorded, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
 
-RULES = ("paper", "device")
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
 _GENERATIONS = 10_000
 
@@ -150,9 +149,8 @@ class Sensor:
         """Simulate images.
 
         photons: (images, pixels of the layout) photons/s on each pixel's active area (a colour image is one image a
-        channel); streams: of the same images; readouts: of
-        `tr`, `str`, `qis`. Where `block` is more than 1 the images are whole blocks. staged: take the staged line
-        even where the fused one would serve.
+        channel); streams: of the same images; readouts: of `tr`, `str`, `qis`. Where `block` is more than 1 the
+        images are whole blocks. staged: take the staged line even where the fused one would serve.
 
         Raises EffectError where an effect's own code fails or returns what it must not.
         """
