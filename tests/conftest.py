@@ -1,0 +1,22 @@
+"""What every test gets: the effects and methods of the package, and none that another test has loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from spadmnist import plugins
+
+
+@pytest.fixture(autouse=True)
+def no_plugins_of_other_tests() -> Iterator[None]:
+    plugins.discover()
+    before = [(registry, dict(registry.classes)) for registry in plugins._registries]
+    loaded = dict(plugins._loaded)
+    yield
+    for registry, classes in before:
+        registry.classes.clear()
+        registry.classes.update(classes)
+    plugins._loaded.clear()
+    plugins._loaded.update(loaded)
