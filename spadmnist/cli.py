@@ -423,12 +423,12 @@ class _terminal:
                     desc=what,
                     disable=None,
                     leave=False,
-                    bar_format="{desc} {percentage:3.0f}%|{bar}| {postfix}{elapsed}, {remaining} left",
+                    bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
                 )
             )
 
         def advance(work: float, note: str) -> None:
-            bar[-1].set_postfix_str(f"{note}  ", refresh=False)
+            bar[-1].set_postfix_str(note, refresh=False)
             bar[-1].update(work)
 
         def stop() -> None:

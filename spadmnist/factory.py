@@ -507,10 +507,14 @@ def _make(
     total = sum(work.values())
     progress.start("simulating", total, total - sum(work[s.path] for s in missing))
     by_path = {s.path: s for s in missing}
+    started, images = time.monotonic(), 0
 
     def done(path: str, _: Any) -> None:
+        nonlocal images
         shard = by_path[path]
-        progress.advance(work[path], f"{shard.level or 'images'} {shard.split}")
+        images += shard.stop - shard.start if shard.level is not None else 0
+        rate = images / (time.monotonic() - started)
+        progress.advance(work[path], f"{shard.level or 'images'} {shard.split}, {rate:,.0f} images/s")
 
     if missing:
         job = job_of(experiment)

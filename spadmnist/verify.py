@@ -7,6 +7,7 @@ import itertools
 import os
 import shutil
 import stat
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -54,9 +55,12 @@ def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
     present = sorted(found & set(listed))
     changed = []
     progress.start("reading", sum(int(listed[name]["bytes"]) for name in present), 0)
+    started, read = time.monotonic(), 0
     with ThreadPoolExecutor(max_workers=2) as pool:
         for name, same in zip(present, pool.map(lambda n: _same(root / n, listed[n]), present), strict=True):
-            progress.advance(int(listed[name]["bytes"]), name)
+            read += int(listed[name]["bytes"])
+            rate = read / 1e6 / (time.monotonic() - started)
+            progress.advance(int(listed[name]["bytes"]), f"{rate:,.0f} MB/s")
             if not same:
                 changed.append(name)
     progress.stop()
