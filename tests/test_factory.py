@@ -543,7 +543,10 @@ def wait_for(condition: Callable[[], bool], seconds: float) -> bool:
 
 def records(root: Path) -> int:
     """How many shards an unfinished run has noted."""
-    return len(list((root / ".spadmnist" / "shards").rglob("*.json")))
+    try:
+        return len(list((root / ".spadmnist" / "shards").rglob("*.json")))
+    except FileNotFoundError:  # the run is just removing them: it has finished
+        return 1 << 30
 
 
 def descendants(process: psutil.Process) -> list[psutil.Process]:
