@@ -77,9 +77,13 @@ class Method(Plugin, abstract=True):
             return values, self.saturated(settings, *columns)
         for start in range(0, len(values), _ROWS_AT_ONCE):
             part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
-            values[start : start + _ROWS_AT_ONCE] = self._finite(settings, *part)
-            saturated += self.saturated(settings, *part)
+            values[start : start + _ROWS_AT_ONCE], bounded = self._worked_out(settings, *part)
+            saturated += bounded
         return values, saturated
+
+    def _worked_out(self, settings: Settings, *columns: Any) -> tuple[np.ndarray, int]:
+        """(finite values, how many were saturated)."""
+        return self._finite(settings, *columns), self.saturated(settings, *columns)
 
     def _finite(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
         values = self.estimate(settings, *columns)
