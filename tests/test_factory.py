@@ -520,6 +520,8 @@ def running(*arguments: object, **options: Any) -> Iterator[psutil.Popen]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # what a shell starts in the background ignores Ctrl-C, and so would all that it starts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **options,
     )
     try:
