@@ -35,7 +35,6 @@ from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .images import Images
-from .plugins import Distribution, MapFile
 from .reconstruct import median_of_nonzero
 from .store import ShardReader
 
@@ -790,6 +789,3 @@ def _statistics(
                 kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
                 total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
     return out
-
-
-__all__ = ["Distribution", "InputError", "MapFile", "Outcome", "Progress", "generate"]
