@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+
+from . import kernels
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A rectangular array of pixels.
+    """The array of pixels: a grid, or a list of places, which counts as 1 row x n columns.
 
     pixel_area: total area of one pixel, m^2; fill_factor: its photosensitive share.
+    positions: (pixels, 2) m, the centres (x, y) of the pixels, no two the same; None on a grid.
     """
 
     rows: int
     columns: int
     pixel_area: float
     fill_factor: float
+    positions: np.ndarray | None = field(default=None, compare=False)
 
     @property
     def pixels(self) -> int:
@@ -33,6 +38,61 @@ class Layout:
     def shape(self) -> tuple[int, int]:
         return self.rows, self.columns
 
+    @cached_property
+    def places(self) -> np.ndarray:
+        """(pixels, 2) centres (x, y) of the pixels in units of the pitch, the distance of side neighbours."""
+        if self.positions is None:
+            y, x = np.divmod(np.arange(self.pixels), self.columns)
+            return np.stack([x, y], axis=1).astype(np.float64)
+        if self.pixels == 1:
+            return np.zeros((1, 2))
+        from scipy.spatial import cKDTree  # takes longer to import than all the rest
+
+        nearest = cKDTree(self.positions).query(self.positions, k=2)[0][:, 1]
+        return np.asarray(self.positions / nearest.min())
+
+    @cached_property
+    def centred(self) -> np.ndarray:
+        """(pixels, 2) places (x, y) with the middle of the array at 0 and its edges' pixels at -0.5 and 0.5."""
+        low, high = self.places.min(axis=0), self.places.max(axis=0)
+        extent = np.where(high > low, high - low, 1.0)
+        return np.asarray((self.places - (low + high) / 2) / extent)
+
+    def neighbours(self, reach: float) -> Neighbours:
+        """Every pixel's neighbours up to a distance of `reach` pitches (a little rounding allowed)."""
+        reach = reach * (1 + 1e-3)
+        if self.positions is None:
+            far = int(reach)
+            dy, dx = (a.ravel() for a in np.mgrid[-far : far + 1, -far : far + 1])
+            distance = np.hypot(dx, dy)
+            near = (distance <= reach) & (distance > 0)
+            near &= (np.abs(dy) < self.rows) & (np.abs(dx) < self.columns)
+            order = np.argsort(distance[near], kind="stable")
+            return Neighbours(self, distance[near][order], np.stack([dx[near], dy[near]], axis=1)[order], None)
+        from scipy.spatial import cKDTree
+
+        pairs = cKDTree(self.places).query_pairs(reach, output_type="ndarray")
+        both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64).reshape(-1, 2)
+        distance = np.hypot(*(self.places[both[:, 0]] - self.places[both[:, 1]]).T)
+        order = np.lexsort((both[:, 1], np.round(distance, 9), both[:, 0]))
+        first = np.searchsorted(both[order, 0], np.arange(self.pixels + 1))
+        return Neighbours(self, distance[order], both[order, 1], first)
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Who lies near whom.
+
+    On a grid (`first` is None) all pixels have the same ones: distance (k,) in pitches, step (k, 2) columns and rows
+    to go; a step may lead out of the array. Otherwise pixel p has the entries first[p] to first[p + 1]: step (k,) is
+    the neighbour itself.
+    """
+
+    layout: Layout
+    distance: np.ndarray
+    step: np.ndarray
+    first: np.ndarray | None
+
 
 class Events:
     """Time stamps of many rows, a row being one pixel of one image, in one flat array.
@@ -44,9 +104,13 @@ class Events:
         otherwise `times` is `ticks * tick`.
     pixels: rows per image.
     row_pixel: (rows,) the pixel of each row where a row is no whole pixel (STR: a row holds one frame's stamp).
+    end: s, where the exposure (in STR: the frame) ends that the stamps count from; every time is less.
+    cause: (events,) uint8, what made each event, a number of `Sensor.causes`; parent: (events,) int64, the event of
+        this batch that caused it, -1 where none did, -2 where that one was not recorded. Both None where the causes
+        were not asked for.
     """
 
-    __slots__ = ("_times", "offsets", "pixels", "row_pixel", "tick", "ticks")
+    __slots__ = ("_times", "cause", "end", "offsets", "parent", "pixels", "row_pixel", "tick", "ticks")
 
     def __init__(
         self,
@@ -56,9 +120,15 @@ class Events:
         ticks: np.ndarray | None = None,
         tick: float | None = None,
         row_pixel: np.ndarray | None = None,
+        end: float | None = None,
+        cause: np.ndarray | None = None,
+        parent: np.ndarray | None = None,
     ):
         self._times = times
         self.row_pixel = row_pixel
+        self.end = end
+        self.cause = cause
+        self.parent = parent
         self.offsets = offsets
         self.pixels = pixels
         self.ticks = ticks
@@ -102,8 +172,35 @@ class Events:
         """The events for which `mask` (events,) is true."""
         running = np.concatenate([[0], np.cumsum(mask)])
         offsets = running[self.offsets].astype(np.int64)
+        cause = parent = None
+        if self.cause is not None and self.parent is not None:
+            cause, parent = self.cause[mask], self.parent[mask]
+            known = parent >= 0
+            parent[known] = np.where(mask[parent[known]], running[parent[known]], -2)
         ticks = None if self.ticks is None else self.ticks[mask]
-        return Events(None if ticks is not None else self.times[mask], offsets, self.pixels, ticks, self.tick)
+        times = None if ticks is not None else self.times[mask]
+        return Events(times, offsets, self.pixels, ticks, self.tick, self.row_pixel, self.end, cause, parent)
+
+    def moved(self, times: np.ndarray) -> Events:
+        """The same events at other times (s), brought into order within their rows, and into [0, `end`).
+
+        times: (events,) float64, finite.
+        """
+        end = np.inf if self.end is None else self.end
+        order = np.empty(len(times) if self.cause is not None else 0, np.int64)
+        ordered = kernels.sort_rows(times, self.offsets, np.nextafter(end, 0.0), order)
+        cause = parent = None
+        if self.cause is not None and self.parent is not None:
+            place = np.empty(len(order), np.int64)
+            place[order] = np.arange(len(order))
+            cause, parent = self.cause[order], self.parent[order]
+            known = parent >= 0
+            parent[known] = place[parent[known]]
+        return Events(ordered, self.offsets, self.pixels, None, None, self.row_pixel, self.end, cause, parent)
+
+    def stamped(self, ticks: np.ndarray, tick: float) -> Events:
+        """The same events with whole ticks (events,) of a converter in place of their times."""
+        return Events(None, self.offsets, self.pixels, ticks, tick, self.row_pixel, self.end, self.cause, self.parent)
 
     def images(self, start: int, stop: int) -> Events:
         """The images `start` to `stop` alone, with offsets from 0."""
@@ -111,11 +208,13 @@ class Events:
         part = slice(int(offsets[0]), int(offsets[-1]))
         ticks = None if self.ticks is None else self.ticks[part]
         times = None if self._times is None else self._times[part]
-        return Events(times, offsets - offsets[0], self.pixels, ticks, self.tick)
+        cause = None if self.cause is None else self.cause[part]
+        parent = None if self.parent is None else _shifted(self.parent[part], -offsets[0])
+        return Events(times, offsets - offsets[0], self.pixels, ticks, self.tick, None, self.end, cause, parent)
 
     def regrouped(self, pixels: int) -> Events:
         """The same rows with another number of them to an image."""
-        return Events(self._times, self.offsets, pixels, self.ticks, self.tick)
+        return Events(self._times, self.offsets, pixels, self.ticks, self.tick, None, self.end, self.cause, self.parent)
 
     @staticmethod
     def join(parts: list[Events]) -> Events:
@@ -125,10 +224,13 @@ class Events:
         starts = np.cumsum([0] + [len(p) for p in parts])
         offsets = np.concatenate([[0], *(p.offsets[1:] + s for p, s in zip(parts, starts, strict=False))])
         first = parts[0]
-        if first.ticks is not None:
-            ticks = np.concatenate([p.ticks for p in parts])
-            return Events(None, offsets, first.pixels, ticks, first.tick)
-        return Events(np.concatenate([p.times for p in parts]), offsets, first.pixels)
+        ticks = None if first.ticks is None else np.concatenate([p.ticks for p in parts])
+        times = None if ticks is not None else np.concatenate([p.times for p in parts])
+        cause = parent = None
+        if first.cause is not None:
+            cause = np.concatenate([p.cause for p in parts])
+            parent = np.concatenate([_shifted(p.parent, s) for p, s in zip(parts, starts, strict=False)])
+        return Events(times, offsets, first.pixels, ticks, first.tick, None, first.end, cause, parent)
 
     def problem(self, end: float | None = None) -> str | None:
         """What is wrong with the batch, or None: the invariants of the class docstring, and times in [0, end)."""
@@ -151,6 +253,12 @@ class Events:
         if len(times) and (times.min() < 0 or (end is not None and times.max() >= end)):
             return f"times reach from {times.min():g} s to {times.max():g} s, outside the exposure"
         return None
+
+
+def _shifted(parent: np.ndarray | None, by: int) -> np.ndarray:
+    """Indices moved by so much; what is negative stays."""
+    assert parent is not None
+    return np.where(parent >= 0, parent + by, parent)
 
 
 @dataclass(frozen=True)

@@ -123,6 +123,11 @@ def _exponential(word):
     return -_log(_uniform(word))
 
 
+# for effects with a kernel of their own
+jit, inline = _jit, _inline
+philox, uniform, exponential = _philox, _uniform, _exponential
+
+
 @_jit
 def _exponentials(block, image, key0, key1, word, out):
     """Fill `out[:BATCH]` with the exponentials of the blocks from `block` on; `out[BATCH]` becomes +inf, a stop."""
@@ -478,6 +483,30 @@ def merge(times, offsets, extra, extra_rows):
             j += 1
         new_offsets[row + 1] = k
     return merged, new_offsets, origin
+
+
+@_jit
+def sort_rows(times, offsets, last_moment, order):
+    """Bring nearly ordered times into order within their rows, each first put into [0, last_moment].
+
+    `order` (events,) int64, or of size 0 where it is not wanted, is filled with where each of them came from.
+    Returns the ordered times (float64); equal ones stay in their order.
+    """
+    out = np.empty(times.size)
+    for row in range(offsets.size - 1):
+        start = offsets[row]
+        for i in range(start, offsets[row + 1]):
+            time = min(max(times[i], 0.0), last_moment)
+            place = i
+            while place > start and out[place - 1] > time:
+                out[place] = out[place - 1]
+                if order.size:
+                    order[place] = order[place - 1]
+                place -= 1
+            out[place] = time
+            if order.size:
+                order[place] = i
+    return out
 
 
 # --- the pixel's memory -------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from .errors import EffectError, InputError, did_you_mean
 
 PLACES = ("spadmnist.effects", "spadmnist.reconstruct")  # a package with a file each, or a module
 ENTRY_POINTS = "spadmnist.plugins"
+PER = ("", "pixel", "row", "column", "code")  # what a parameter may have a value for each of
 
 
 # --- parameters ---------------------------------------------------------------------------------------------------
@@ -46,13 +47,21 @@ class Parameter:
     open_bounds: bool = False  # the bounds themselves are not allowed
     off: float | bool | None = None
     search: tuple[float, float] | None = None
-    per_pixel: bool = False
+    per: str = ""  # "pixel", "row", "column" or "code" (see `PER`): it may be a map or a distribution
     by_wavelength: bool = False
+    choices: tuple[str, ...] = ()
     required: bool = False
     name: str = ""
 
+    @property
+    def per_pixel(self) -> bool:
+        """It may vary from pixel to pixel."""
+        return self.per == "pixel"
+
     def allowed(self) -> str:
         """`"between 0 and 1"`, for people."""
+        if self.choices:
+            return " or ".join(self.choices)
         low, high = self.bounds
         edge = "more than" if self.open_bounds else "at least"
         if low is not None and high is not None:
@@ -85,18 +94,29 @@ def parameter(
     off: float | bool | None = None,
     search: tuple[float, float] | None = None,
     per_pixel: bool = False,
+    per: str = "",
     by_wavelength: bool = False,
+    choices: tuple[str, ...] = (),
     required: bool = False,
 ) -> Any:
     """Declare a parameter in the body of a plug-in's class.
 
     unit: an SI unit of `spadmnist.units` (`"s"`, `"Hz"`, `""`, ...) or `"bool"`; default, bounds, off, search: SI.
     off: the value at which the effect vanishes. bounds: what is possible. search: where a fit looks.
-    per_pixel: it may be a map from a file or a distribution; by_wavelength: it may be a table over the wavelength.
+    per_pixel: it may be a map from a file or a distribution; per: the same over "row", "column" or "code" (of a
+    converter; the effect declares a parameter `period`, their number) instead of "pixel". by_wavelength: it may be a
+    table over the wavelength. choices: the words that are allowed, where it is no number.
     """
+    per = "pixel" if per_pixel else per
+    if per not in PER:
+        raise TypeError(f"{per!r} is none of {', '.join(repr(one) for one in PER)}")
+    if choices and default not in choices:
+        raise TypeError(f"{default!r} is none of the choices {', '.join(choices)}")
     if unit != "bool" and not units.is_known(unit):
         raise TypeError(f"{unit!r} is not an SI unit that is known here")
-    return Parameter(default, unit, about, symbol, bounds, open_bounds, off, search, per_pixel, by_wavelength, required)
+    return Parameter(
+        default, unit, about, symbol, bounds, open_bounds, off, search, per, by_wavelength, choices, required
+    )
 
 
 # --- values as a config gives them --------------------------------------------------------------------------------
@@ -122,7 +142,7 @@ class ByWavelength:
 
 @dataclass(frozen=True)
 class MapFile:
-    """One value per pixel from a `.npy` file, (rows, columns) or (pixels,)."""
+    """One value per pixel (row, column, code) from a `.npy` file."""
 
     path: Path
 
@@ -156,6 +176,11 @@ def read_value(declared: Parameter, raw: Any, base: Path, problem: Problem) -> A
 
     base: the folder of the config file. Every mistake goes to `problem`; then None is returned.
     """
+    if declared.choices:
+        if raw in declared.choices:
+            return raw
+        problem((), f"{raw!r} is not possible; {declared.name} is {declared.allowed()}")
+        return None
     if declared.unit == "bool":
         if isinstance(raw, bool):
             return raw
@@ -179,7 +204,7 @@ def _read_number(declared: Parameter, raw: Any, path: tuple[Any, ...], problem: 
 def _read_mapping(declared: Parameter, raw: Mapping[Any, Any], base: Path, problem: Problem) -> Any:
     keys = set(raw)
     if keys == {"file"}:
-        if not declared.per_pixel:
+        if not declared.per:
             problem((), f"{declared.name} is one number for the whole array; a map is not allowed here")
             return None
         if not isinstance(raw["file"], str):
@@ -187,14 +212,14 @@ def _read_mapping(declared: Parameter, raw: Mapping[Any, Any], base: Path, probl
             return None
         return MapFile((base / raw["file"]).resolve())
     if keys & {"normal", "lognormal", "mixture"}:
-        if not declared.per_pixel:
+        if not declared.per:
             problem((), f"{declared.name} is one number for the whole array; a distribution is not allowed here")
             return None
         return _read_distribution(declared, raw, (), problem)
     if declared.by_wavelength:
         return _read_table(declared, raw, problem)
     forms = ["one value"]
-    if declared.per_pixel:
+    if declared.per:
         forms += [
             "{file: map.npy}",
             "{normal: {mean, sigma}}",
@@ -269,30 +294,32 @@ def _read_mixture(declared: Parameter, body: Any, path: tuple[Any, ...], problem
     return Distribution("mixture", (), tuple(parts))
 
 
-def settle(declared: Parameter, value: Any, shape: tuple[int, int], key: str) -> Any:
-    """The value an effect computes with: a float, a bool, a `ByWavelength`, or (pixels,) float64.
+def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...], key: str) -> Any:
+    """The value an effect computes with: a float, a bool, a word, a `ByWavelength`, or a float64 array.
 
-    shape: (rows, columns) of the array; key: what a distribution is drawn from (chip seed, effect and parameter in
-    one string). Drawn values outside the bounds are set to the bound. Raises InputError where a map is unreadable, of
-    another shape or out of bounds, or where a distribution has no finite values.
+    shapes: those that a map may have; a distribution is drawn for the first of them. Maps are returned in the shape
+    they have, but one value a pixel always as (pixels,). key: what a distribution is drawn from (chip seed, effect and
+    parameter in one string). Drawn values outside the bounds are set to the bound. Raises InputError where a map is
+    unreadable, of another shape or out of bounds, or where a distribution has no finite values.
     """
     if isinstance(value, Distribution):
         digest = hashlib.sha256(key.encode()).digest()
         rng = np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
         low, high = declared.bounds
         with np.errstate(over="ignore", invalid="ignore"):
-            drawn = np.clip(value.draw(rng, shape[0] * shape[1]), low, high)
+            drawn = np.clip(value.draw(rng, int(np.prod(shapes[0]))), low, high)
         if not np.all(np.isfinite(drawn)):
             raise InputError(
                 f"the distribution of {declared.name} is so wide that it has no finite values; lower sigma"
             )
         return drawn
     if isinstance(value, MapFile):
-        return _read_map(declared, value.path, shape)
+        values = _read_map(declared, value.path, shapes)
+        return values.ravel() if declared.per_pixel else values
     return value
 
 
-def _read_map(declared: Parameter, path: Path, shape: tuple[int, int]) -> np.ndarray:
+def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     try:
         values = np.load(path, allow_pickle=False)
     except FileNotFoundError:
@@ -301,21 +328,31 @@ def _read_map(declared: Parameter, path: Path, shape: tuple[int, int]) -> np.nda
         raise InputError(f"{path}: cannot be read ({error.strerror or 'it is damaged'})") from None
     except (ValueError, EOFError):
         raise InputError(f"{path}: is not a .npy file of plain numbers; write the map with numpy.save") from None
-    allowed = (shape, (shape[0] * shape[1],))
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.shape not in allowed:
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or not _fits(values.shape, shapes):
         what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "an archive"
-        raise InputError(
-            f"{path}: is {what}, but {declared.name} needs one number for each pixel: shape {shape} (rows, columns)"
-        )
-    flat = values.astype(np.float64).ravel()
+        wanted = " or ".join(str(shape).replace("-1", "n") for shape in shapes)
+        raise InputError(f"{path}: is {what}, but {declared.name} needs one number for each {declared.per}: {wanted}")
+    values = values.astype(np.float64)
+    flat = values.ravel()
     for index in np.flatnonzero(~np.isfinite(flat))[:1]:
-        raise InputError(f"{path}: entry {index} of the map is {flat[index]}; every pixel needs a finite number")
+        raise InputError(
+            f"{path}: entry {index} of the map is {flat[index]}; every {declared.per} needs a finite number"
+        )
     for index in (int(flat.argmin()), int(flat.argmax())):
         try:
             declared.check(float(flat[index]))
         except ValueError as error:
             raise InputError(f"{path}: entry {index} of the map: {error}") from None
-    return flat
+    return values
+
+
+def _fits(shape: tuple[int, ...], shapes: tuple[tuple[int, ...], ...]) -> bool:
+    """Is it one of these? -1 stands for any size but 0."""
+    return any(
+        len(shape) == len(one)
+        and all(size == wanted or (wanted == -1 and size > 0) for size, wanted in zip(shape, one, strict=True))
+        for one in shapes
+    )
 
 
 # --- plug-ins -----------------------------------------------------------------------------------------------------

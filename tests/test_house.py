@@ -20,8 +20,8 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 # a module imports from layers below its own, and within its own only along an arrow
 LAYERS = [
     {"errors", "units", "streams", "light"},
-    {"disk"},
-    {"document", "plugins", "events", "kernels", "image_files", "digits", "store"},
+    {"disk", "kernels"},
+    {"document", "plugins", "events", "image_files", "digits", "store"},
     {"effects", "readout", "images"},
     {"reconstruct", "sensor"},
     {"experiment"},

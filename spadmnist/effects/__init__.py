@@ -1,48 +1,59 @@
 """Effects: one class in one file each, at one stage of the line. A file in this folder is found by itself.
 
 A recording is a short line of physics: rates -> one Poisson draw -> avalanches -> recording. The stage of an effect
-fixes the order and what its hook receives:
+fixes the order and what its hooks receive:
 
 | stage | the author writes | receives -> returns |
 | --- | --- | --- |
 | light | apply(rate, conditions) | photons/s, (images, pixels) -> the same |
 | detection | apply(rate, conditions) | photons/s -> detections/s |
 | dark | apply(rate, conditions) | detections/s -> detections/s |
-| arrival | factor(t, conditions), maximum(conditions) | s, (events,) -> factor on the light or the dark rate |
+| arrival | factor(t, conditions), maximum(conditions) | s, (events,) -> factor on the light or on the dark rate |
+| | or modulate(events, conditions, rng) | Events -> the same, for what differs by pixel or is drawn |
 | gate | open(t, conditions) | s, (events,) -> bool: can the pixel fire? |
 | correlated | spawn(events, rng) | Events -> Children |
 | dead_time | blind_time() | -> s after a detection, one value or one per pixel |
-| timing | apply(events, rng) | Events -> Events |
-| readout | apply(events, rng) | Events -> Events |
+| | sensitivity(u) | s since the end of the blind time, (n,) -> from 0 to 1, never falling |
+| | carried() | -> share of the remaining blind time with which a pixel enters the next frame |
+| timing | apply(events, rng) | Events -> Events, with `events.moved(times)` or `events.stamped(ticks, tick)` |
+| readout | apply(events, rng) | Events -> Events, with `events.keep(mask)` |
+| | limit(counts) | the counts of frames, unsigned -> the same |
 
-An arrival effect acts on the light, or with `acts_on = "dark"` on the dark rate; `maximum` is the largest factor.
+An arrival effect acts on the light, or with `acts_on = "dark"` on the dark rate; `maximum` is the largest factor. With
+`acts_on = "own"` it brings a rate of its own, `added(conditions)`: 1/s, one value or one per pixel, at its largest.
 A timing effect sees TR streams, and the frames' first stamps (STR) with one frame a row, s since its start.
 `rng` is a `numpy.random.Generator` of the effect's own for each fixed block of images, or, with `counted = True` on
 the class, a `spadmnist.streams.Draws` for the counter-based kernels.
+
+Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
+it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
+of its mean.
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from ..events import Layout
 from ..plugins import Parameter, Plugin, Registry, parameter
 
-__all__ = ["STAGES", "Conditions", "Effect", "Parameter", "parameter"]
+__all__ = ["STAGES", "Chip", "Conditions", "Effect", "Parameter", "parameter"]
 
-# stage -> the hooks that an effect there must have
+# stage -> the hooks of which an effect there must have one (or all of those that are joined by "+")
 STAGES: dict[str, tuple[str, ...]] = {
     "light": ("apply",),
     "detection": ("apply",),
     "dark": ("apply",),
-    "arrival": ("factor", "maximum"),
+    "arrival": ("factor+maximum", "modulate+maximum", "modulate+added"),
     "gate": ("open",),
     "correlated": ("spawn",),
-    "dead_time": ("blind_time",),
+    "dead_time": ("blind_time", "sensitivity", "carried"),
     "timing": ("apply",),
-    "readout": ("apply",),
+    "readout": ("apply", "limit"),
 }
 
 
@@ -65,6 +76,26 @@ class Conditions:
         return self.wavelength is None
 
 
+@dataclass(frozen=True)
+class Chip:
+    """The sensor that an effect belongs to: its layout, its converter, and its own fixed random numbers.
+
+    tick: s, length of a converter's tick, 0 without one; origin: where the stamp k begins, in ticks from k (0 where
+    the converter rounds down, -0.5 where it rounds to the nearest).
+    """
+
+    layout: Layout
+    seed: int
+    effect: str
+    tick: float = 0.0
+    origin: float = 0.0
+
+    def generator(self, name: str = "") -> np.random.Generator:
+        """A generator of what is fixed on this chip: the same numbers each time it is asked for."""
+        digest = hashlib.sha256(f"chip/{self.seed}/{self.effect}//{name}".encode()).digest()
+        return np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
+
+
 class Effect(Plugin, abstract=True):
     """Base of every effect; see the table of stages above."""
 
@@ -73,18 +104,32 @@ class Effect(Plugin, abstract=True):
     after: ClassVar[str | None] = None  # the effect of the same stage that comes before this one
     last: ClassVar[bool] = False  # it comes behind all others of its stage
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
-    acts_on: ClassVar[str] = "light"  # arrival stage: "light" or "dark"
+    acts_on: ClassVar[str] = "light"  # arrival stage: "light", "dark" or "own"
+    cause: ClassVar[str] = (
+        ""  # dark, arrival ("own") and correlated stage: what its events are called; default: its name
+    )
+    # which statistics it moves, for the contract tests (`spadmnist.testing`); every other one stays as it is
+    moves: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         if stage is not None:
             cls.stage = stage
         chosen = getattr(cls, "stage", None)
+        if keywords.get("abstract") and chosen is None:
+            super().__init_subclass__(**keywords)
+            return
         if chosen not in STAGES:
             raise TypeError(f"{cls.__name__}: {chosen!r} is not a stage; the stages are {', '.join(STAGES)}")
-        missing = [hook for hook in STAGES[chosen] if not callable(getattr(cls, hook, None))]
-        if missing:
-            raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {' and '.join(missing)}")
+        have = {hook for group in STAGES[chosen] for hook in group.split("+") if callable(getattr(cls, hook, None))}
+        if not any(set(group.split("+")) <= have for group in STAGES[chosen]):
+            ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
+            raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
         super().__init_subclass__(**keywords)
+        if not keywords.get("abstract") and not vars(cls).get("cause"):
+            cls.cause = cls.name
+
+    def made(self, chip: Chip) -> None:
+        """Work out what is fixed for a chip; called once, when all parameters have their values."""
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """Mean rate behind this effect (1/s) from that before it; for planning. Default: unchanged."""
