@@ -103,14 +103,17 @@ class Events:
     ticks: (events,) unsigned, whole ticks of the converter; tick: their length, s. Both None without a converter;
         otherwise `times` is `ticks * tick`.
     pixels: rows per image.
-    row_pixel: (rows,) the pixel of each row where a row is no whole pixel (STR: a row holds one frame's stamp).
+    row_pixel: (rows,) the pixel of each row where a row is no whole pixel (STR: a row holds one frame's stamp);
+        otherwise None. image_offsets: (images + 1,) where each image's events begin.
     end: s, where the exposure (in STR: the frame) ends that the stamps count from; every time is less.
     cause: (events,) uint8, what made each event, a number of `Sensor.causes`; parent: (events,) int64, the event of
         this batch that caused it, -1 where none did, -2 where that one was not recorded. Both None where the causes
         were not asked for.
     """
 
-    __slots__ = ("_times", "cause", "end", "offsets", "parent", "pixels", "row_pixel", "tick", "ticks")
+    __slots__ = (
+        "_image_offsets", "_times", "cause", "end", "offsets", "parent", "pixels", "row_pixel", "tick", "ticks"
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -123,8 +126,10 @@ class Events:
         end: float | None = None,
         cause: np.ndarray | None = None,
         parent: np.ndarray | None = None,
+        image_offsets: np.ndarray | None = None,
     ):
         self._times = times
+        self._image_offsets = image_offsets
         self.row_pixel = row_pixel
         self.end = end
         self.cause = cause
@@ -148,6 +153,11 @@ class Events:
 
     def __repr__(self) -> str:
         return f"Events({len(self)} events in {len(self.offsets) - 1} rows)"
+
+    @property
+    def image_offsets(self) -> np.ndarray:
+        """(images + 1,) where each image's events begin, and the end."""
+        return self.offsets[:: self.pixels] if self._image_offsets is None else self._image_offsets
 
     @property
     def counts(self) -> np.ndarray:
@@ -179,7 +189,8 @@ class Events:
             parent[known] = np.where(mask[parent[known]], running[parent[known]], -2)
         ticks = None if self.ticks is None else self.ticks[mask]
         times = None if ticks is not None else self.times[mask]
-        return Events(times, offsets, self.pixels, ticks, self.tick, self.row_pixel, self.end, cause, parent)
+        images = None if self._image_offsets is None else running[self._image_offsets]
+        return Events(times, offsets, self.pixels, ticks, self.tick, self.row_pixel, self.end, cause, parent, images)
 
     def moved(self, times: np.ndarray) -> Events:
         """The same events at other times (s), brought into order within their rows, and into [0, `end`).
@@ -196,11 +207,15 @@ class Events:
             cause, parent = self.cause[order], self.parent[order]
             known = parent >= 0
             parent[known] = place[parent[known]]
-        return Events(ordered, self.offsets, self.pixels, None, None, self.row_pixel, self.end, cause, parent)
+        images = self._image_offsets
+        return Events(ordered, self.offsets, self.pixels, None, None, self.row_pixel, self.end, cause, parent, images)
 
     def stamped(self, ticks: np.ndarray, tick: float) -> Events:
         """The same events with whole ticks (events,) of a converter in place of their times."""
-        return Events(None, self.offsets, self.pixels, ticks, tick, self.row_pixel, self.end, self.cause, self.parent)
+        images = self._image_offsets
+        return Events(
+            None, self.offsets, self.pixels, ticks, tick, self.row_pixel, self.end, self.cause, self.parent, images
+        )
 
     def images(self, start: int, stop: int) -> Events:
         """The images `start` to `stop` alone, with offsets from 0."""
