@@ -180,16 +180,16 @@ class Events:
 
     def keep(self, mask: np.ndarray) -> Events:
         """The events for which `mask` (events,) is true."""
-        running = np.concatenate([[0], np.cumsum(mask)])
-        offsets = running[self.offsets].astype(np.int64)
         cause = parent = None
         if self.cause is not None and self.parent is not None:
             cause, parent = self.cause[mask], self.parent[mask]
             known = parent >= 0
-            parent[known] = np.where(mask[parent[known]], running[parent[known]], -2)
+            running = np.cumsum(mask)
+            parent[known] = np.where(mask[parent[known]], running[parent[known]] - 1, -2)
+        offsets = kernels.kept_offsets(mask, self.offsets)
+        images = None if self._image_offsets is None else kernels.kept_offsets(mask, self._image_offsets)
         ticks = None if self.ticks is None else self.ticks[mask]
         times = None if ticks is not None else self.times[mask]
-        images = None if self._image_offsets is None else running[self._image_offsets]
         return Events(times, offsets, self.pixels, ticks, self.tick, self.row_pixel, self.end, cause, parent, images)
 
     def moved(self, times: np.ndarray) -> Events:

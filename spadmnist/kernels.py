@@ -427,15 +427,50 @@ def children(offsets, hazards, images, key):
 
 
 @_jit
-def uniforms(offsets, pixels, images, key):
-    """A number from (0, 1) for each event, drawn image by image. Returns (events,) float64."""
-    out = np.empty(offsets[-1])
-    for i in range(images.size):
-        start = offsets[i * pixels]
-        for j in range(offsets[(i + 1) * pixels] - start):
-            a, _ = _philox(np.uint64(j), images[i], key[0], key[1], key[2])
-            out[start + j] = _uniform(a)
+def uniforms(events, image_offsets, images, key):
+    """A number from (0, 1) for each of some events; it depends on the event's place in its image alone.
+
+    events: ascending indices; image_offsets: (images + 1,). Returns float64 of the size of `events`.
+    """
+    out = np.empty(events.size)
+    i = 0
+    for k in range(events.size):
+        while events[k] >= image_offsets[i + 1]:
+            i += 1
+        a, _ = _philox(np.uint64(events[k] - image_offsets[i]), images[i], key[0], key[1], key[2])
+        out[k] = _uniform(a)
     return out
+
+
+@_jit
+def weigh(total, offsets, rates, factor):
+    """Add to each event's `total` the rate of its row times its factor (an empty `factor`: 1)."""
+    for row in range(offsets.size - 1):
+        rate = rates[row]
+        if rate != 0.0:
+            if factor.size:
+                for i in range(offsets[row], offsets[row + 1]):
+                    total[i] += rate * factor[i]
+            else:
+                for i in range(offsets[row], offsets[row + 1]):
+                    total[i] += rate
+
+
+@_jit
+def thinned(rates, offsets, drawn, image_offsets, images, key):
+    """Which events remain of a Poisson process that was drawn at too high a rate.
+
+    rates: (events,) 1/s, what the rate is at each; drawn: (rows,) 1/s. Returns (events,) bool.
+    """
+    kept = np.empty(rates.size, np.bool_)
+    pixels = (offsets.size - 1) // images.size
+    for row in range(offsets.size - 1):
+        image = row // pixels
+        begin = image_offsets[image]
+        for i in range(offsets[row], offsets[row + 1]):
+            a, _ = _philox(np.uint64(i - begin), images[image], key[0], key[1], key[2])
+            kept[i] = _uniform(a) * drawn[row] < rates[i]
+    return kept
 
 
 @_jit
@@ -455,8 +490,9 @@ def row_totals(values, offsets):
 def merge(times, offsets, extra, extra_rows):
     """Sort further events into their rows.
 
-    extra: (m,) s, any order; extra_rows: (m,) int64, ascending. Returns (times, offsets, origin): `origin` says
-    where each event came from, i for `times[i]` and len(times) + j for `extra[j]`.
+    extra: (m,) s, ascending within a row; extra_rows: (m,) int64, ascending. What is equally late comes behind.
+    Returns (times, offsets, origin): `origin` says where each event came from, i for `times[i]` and len(times) + j
+    for `extra[j]`.
     """
     total = times.size + extra.size
     merged = np.empty(total)
@@ -466,23 +502,55 @@ def merge(times, offsets, extra, extra_rows):
     k = 0
     j = 0
     for row in range(offsets.size - 1):
-        start = k
-        for i in range(offsets[row], offsets[row + 1]):
+        i = offsets[row]
+        stop = offsets[row + 1]
+        while j < extra.size and extra_rows[j] == row:
+            while i < stop and times[i] <= extra[j]:
+                merged[k] = times[i]
+                origin[k] = i
+                k += 1
+                i += 1
+            merged[k] = extra[j]
+            origin[k] = times.size + j
+            k += 1
+            j += 1
+        while i < stop:
             merged[k] = times[i]
             origin[k] = i
             k += 1
-        while j < extra.size and extra_rows[j] == row:
-            place = k
-            while place > start and merged[place - 1] > extra[j]:
-                merged[place] = merged[place - 1]
-                origin[place] = origin[place - 1]
-                place -= 1
-            merged[place] = extra[j]
-            origin[place] = times.size + j
-            k += 1
-            j += 1
+            i += 1
         new_offsets[row + 1] = k
     return merged, new_offsets, origin
+
+
+@_jit
+def relinked(origin, known, order, parents):
+    """Where the parents of merged children stand.
+
+    origin: of `merge`; known: how many events there were before; order: (m,) which child each of the merged `extra`
+    was; parents: (m,) of each child, i for the event i, known + c for the child c.
+    Returns (events,) int64: the parent's place among the merged events, -1 where there is none.
+    """
+    place = np.empty(origin.size, np.int64)
+    for k in range(origin.size):
+        one = origin[k]
+        place[one if one < known else known + order[one - known]] = k
+    out = np.full(origin.size, -1, np.int64)
+    for child in range(order.size):
+        out[place[known + child]] = place[parents[child]]
+    return out
+
+
+@_jit
+def kept_offsets(mask, offsets):
+    """The offsets of the rows when only the events remain for which `mask` is true."""
+    new = np.zeros_like(offsets)
+    k = 0
+    for row in range(offsets.size - 1):
+        for i in range(offsets[row], offsets[row + 1]):
+            k += np.int64(mask[i])
+        new[row + 1] = k
+    return new
 
 
 @_jit
@@ -553,32 +621,95 @@ def take(offsets, kept):
 
 
 @_jit
-def avalanches(times, pixel, parent, order, dead_times, frame_period, frame_time):
-    """What fires under `rules: device`: one pass in time order.
+def followers(times, offsets, within):
+    """The events (indices) that come at most `within` (pixels,) s after the one before them in their row."""
+    out = np.empty(256, np.int64)
+    found = 0
+    pixels = within.size
+    for row in range(offsets.size - 1):
+        limit = within[row % pixels]
+        for i in range(offsets[row] + 1, offsets[row + 1]):
+            if times[i] - times[i - 1] <= limit:
+                out = _grown(out, found, found + 1)
+                out[found] = i
+                found += 1
+    return out[:found].copy()
 
-    An event fires if its parent fired (parent -1: it has none) and its pixel is not blind. With `frame_period` = 0
-    the pixel is blind for its dead time after it fires; otherwise it fires at most once a frame, live again at the
-    next one, and nothing fires between frames.
 
-    times, pixel, parent: (events,) of one group of pixels; pixel indexes `dead_times`; order: indices by ascending
-    time. Returns (events,) bool.
+@_jit
+def avalanches(times, offsets, parents, blind, needed, extends, frame_period, frame_time, carried):
+    """What fires: an event whose parent fired, or that has none, and that does not find its pixel blind.
+
+    times, offsets: candidates, in order within a row; of equally late ones a parent stands before its child.
+    parents: (events,) index of the candidate that causes each, not later than it, -1: none (empty: none has one).
+    blind: (pixels,) s after a detection; needed: (events,) s that the pixel must have been awake again for this one
+    (empty: none needs any). extends: what finds its pixel blind makes it blind anew (paralyzable).
+    With `frame_period` > 0 a pixel fires at most once in a frame, the rest of which it is blind, and nothing fires
+    between frames; into the next frame it carries a share `carried` of what is left of its blind time.
+
+    A row is gone through in time order. Where a parent lies in another row that is not that far yet, that row comes
+    first, up to the parent; since causes come before their effects, this ends.
+    Returns (events,) bool.
     """
+    rows = offsets.size - 1
+    pixels = blind.size
     fired = np.zeros(times.size, np.bool_)
-    last = np.full(dead_times.size, -np.inf)
-    for k in range(order.size):
-        i = order[k]
-        if parent[i] >= 0 and not fired[parent[i]]:
-            continue
-        time = times[i]
-        p = pixel[i]
-        if frame_period > 0.0:
-            frame, since = _frame_of(time, frame_period)
-            if frame != last[p] and since < frame_time:
-                fired[i] = True
-                last[p] = frame
-        elif time - last[p] > dead_times[p]:
-            fired[i] = True
-            last[p] = time
+    reached = offsets[:-1].copy()
+    last = np.full(rows, -np.inf)  # TR: when the blindness began; frames: in which frame the pixel fired
+    awake = np.full(rows, -np.inf)  # frames: when it is live again
+    waiting = np.empty(64, np.int64)
+    goals = np.empty(64, np.int64)
+    for first in range(rows):
+        waiting[0] = first
+        goals[0] = offsets[first + 1]
+        depth = 1
+        while depth > 0:
+            row = waiting[depth - 1]
+            goal = goals[depth - 1]
+            dead = blind[row % pixels]
+            before = last[row]
+            i = reached[row]
+            found = True
+            while i < goal:
+                if parents.size:
+                    parent = parents[i]
+                    if parent >= 0:
+                        if not offsets[row] <= parent < offsets[row + 1]:
+                            home = np.searchsorted(offsets, parent, side="right") - 1
+                            if parent >= reached[home]:
+                                waiting = _grown(waiting, depth, depth + 1)
+                                goals = _grown(goals, depth, depth + 1)
+                                waiting[depth] = home
+                                goals[depth] = parent + 1
+                                found = False
+                                break
+                        if not fired[parent]:
+                            i += 1
+                            continue
+                time = times[i]
+                if frame_period > 0.0:
+                    frame, since = _frame_of(time, frame_period)
+                    if frame != before and since < frame_time and time >= awake[row]:
+                        fired[i] = True
+                        before = frame
+                        if carried > 0.0:
+                            start = (frame + 1.0) * frame_period
+                            awake[row] = start + carried * max(0.0, time + dead - start)
+                else:
+                    since = time - before
+                    if since <= dead:
+                        if extends:
+                            before = time
+                    elif needed.size == 0 or since - dead >= needed[i]:
+                        fired[i] = True
+                        before = time
+                i += 1
+            reached[row] = i
+            last[row] = before
+            if found:
+                depth -= 1
+            else:
+                depth += 1
     return fired
 
 
@@ -671,6 +802,20 @@ def frame_readout(times, offsets, frames, frame_time, frame_period, out):
             _, used = _row_frames(frame, first, 0, count, bits, row, out, used)
         first_offsets[row + 1] = used
     return bits, first_offsets
+
+
+@_jit
+def first_of_frames(times, offsets, frames, frame_time, frame_period):
+    """Which events (events,) bool are the first of their row in a frame; the others `frame_readout` leaves out."""
+    kept = np.zeros(times.size, np.bool_)
+    for row in range(offsets.size - 1):
+        last = -1.0
+        for i in range(offsets[row], offsets[row + 1]):
+            frame, since = _frame_of(times[i], frame_period)
+            if frame > last and since < frame_time and frame < frames:
+                kept[i] = True
+                last = frame
+    return kept
 
 
 @_inline

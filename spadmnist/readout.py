@@ -39,6 +39,7 @@ class Frames:
     bits: (rows, ceil(frames / 8)) uint8: is there a detection? Most significant bit first.
     first: for each bit set, in order, the first stamp since the start of its frame; None where STR is not recorded.
     frames: their number; frame_time: s.
+    cause, parent: for each bit set, in order, what made the detection, as in `Events`; None where not asked for.
     """
 
     bits: np.ndarray
@@ -46,6 +47,15 @@ class Frames:
     frames: int
     frame_time: float
     pixels: int
+    cause: np.ndarray | None = None
+    parent: np.ndarray | None = None
+
+    @property
+    def detections(self) -> Events:
+        """Every bit set as an event of its row: its cause and its parent. The times are empty."""
+        ones = np.bitwise_count(self.bits).sum(axis=1, dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum(ones)])
+        return Events(np.zeros(int(offsets[-1])), offsets, self.pixels, cause=self.cause, parent=self.parent)
 
     def unpacked(self) -> np.ndarray:
         """(images, frames, pixels) uint8, 0 or 1: QIS."""
@@ -63,7 +73,11 @@ class Frames:
     def images(self, start: int, stop: int) -> Frames:
         rows = slice(start * self.pixels, stop * self.pixels)
         first = None if self.first is None else self.first.images(start, stop)
-        return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels)
+        cause = parent = None
+        if self.cause is not None:
+            part = self.detections.images(start, stop)
+            cause, parent = part.cause, part.parent
+        return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels, cause, parent)
 
     @staticmethod
     def join(parts: list[Frames]) -> Frames:
@@ -72,7 +86,12 @@ class Frames:
             return parts[0]
         one = parts[0]
         first = None if one.first is None else Events.join([f.first for f in parts if f.first is not None])
-        return Frames(np.concatenate([f.bits for f in parts]), first, one.frames, one.frame_time, one.pixels)
+        cause = parent = None
+        if one.cause is not None:
+            made = Events.join([f.detections for f in parts])
+            cause, parent = made.cause, made.parent
+        bits = np.concatenate([f.bits for f in parts])
+        return Frames(bits, first, one.frames, one.frame_time, one.pixels, cause, parent)
 
 
 @dataclass(frozen=True)
@@ -118,7 +137,8 @@ class Recorded:
         frames = self.frames
         if frames is not None:
             first = None if frames.first is None else frames.first.regrouped(pixels)
-            frames = Frames(frames.bits, first, frames.frames, frames.frame_time, pixels)
+            one = frames
+            frames = Frames(one.bits, first, one.frames, one.frame_time, pixels, one.cause, one.parent)
         return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited)
 
     @staticmethod

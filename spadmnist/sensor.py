@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from . import kernels
-from .effects import Conditions, Effect, in_order
+from .effects import Chip, Conditions, Effect, in_order
 from .effects.afterpulsing import Afterpulsing
 from .effects.dead_time import DeadTime
 from .effects.tdc import Tdc
@@ -27,6 +27,8 @@ from .streams import BLOCK, Draws, Streams
 
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
 _GENERATIONS = 10_000
+_NONE = np.zeros(0)
+_NOBODY = np.zeros(0, np.int64)
 
 
 @dataclass
@@ -51,12 +53,27 @@ class Sensor:
             type(effect)(**{name: self.settle(effect, name) for name in effect.parameters})
             for effect in in_order(self.effects)
         ]
-        return Sensor(self.layout, effects, self.rules, self.chip_seed, self.name, True)
+        sensor = Sensor(self.layout, effects, self.rules, self.chip_seed, self.name, True)
+        for effect in effects:
+            tick, origin = sensor._converter or (0.0, 0.0)
+            self._call(effect, "made", Chip(self.layout, self.chip_seed, effect.name, tick, origin))
+        return sensor
 
     def settle(self, effect: Effect, name: str) -> Any:
         """The value of one parameter: a map is read, a distribution is drawn. Raises InputError for a bad map."""
         key = f"chip/{self.chip_seed}/{effect.name}/{name}"
-        return settle(effect.parameters[name], getattr(effect, name), self.layout.shape, key)
+        rows, columns = self.layout.shape
+        pixels = rows * columns
+        codes = int(getattr(effect, "period", 1))
+        shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+            "pixel": ((rows, columns), (pixels,)),
+            "row": ((rows,),),
+            "column": ((columns,),),
+            "code": ((codes,), (-1,), (pixels, -1)),
+            "": (),
+        }
+        declared = effect.parameters[name]
+        return settle(declared, getattr(effect, name), shapes[declared.per], key)
 
     def at(self, stage: str) -> list[Effect]:
         """The effects of one stage, in order."""
@@ -76,6 +93,8 @@ class Sensor:
         """(pixels,) s during which a pixel is blind after a detection; 0 without a dead time."""
         longest = np.zeros(self.layout.pixels)
         for effect in self.at("dead_time"):
+            if not hasattr(effect, "blind_time"):
+                continue
             blind = np.asarray(self._call(effect, "blind_time"))
             if blind.shape not in ((), longest.shape) or blind.dtype.kind not in "fiu" or not np.all(blind >= 0):
                 raise _wrong(effect, f"blind_time must return seconds, one value or {len(longest)}, not negative")
@@ -83,8 +102,25 @@ class Sensor:
         return longest
 
     @cached_property
+    def causes(self) -> tuple[str, ...]:
+        """What can make an event, in the order of the numbers in `Events.cause`; the first is a photon."""
+        makers = (e for e in self.effects if e.stage in ("dark", "correlated") or e.acts_on == "own")
+        return tuple(dict.fromkeys(["photon", *(e.cause for e in makers)]))
+
+    @cached_property
+    def _converter(self) -> tuple[float, float] | None:
+        """(tick s, origin in ticks) as the last effect that turns times into numbers says, or None."""
+        told = [self._call(e, "converter") for e in self.at("timing") if hasattr(e, "converter")]
+        return told[-1] if told else None
+
+    @cached_property
     def tick(self) -> float:
-        """Length of a converter's tick, s; 0 without one. Found out by an empty batch that passes the timing stage."""
+        """Length of a converter's tick, s; 0 without one.
+
+        Where no effect tells (`converter`), it is found out by an empty batch that passes the timing stage.
+        """
+        if self._converter is not None:
+            return self._converter[0]
         none = np.zeros(0, np.uint64)
         probe = Events(np.zeros(0), np.zeros(1, np.int64), self.layout.pixels)
         for effect in self.at("timing"):
@@ -145,29 +181,31 @@ class Sensor:
         streams: Streams,
         readouts: Collection[str],
         staged: bool = False,
+        causes: bool = False,
     ) -> Recorded:
         """Simulate images.
 
         photons: (images, pixels of the layout) photons/s on each pixel's active area (a colour image is one image a
         channel); streams: of the same images; readouts: of `tr`, `str`, `qis`. Where `block` is more than 1 the
-        images are whole blocks. staged: take the staged line even where the fused one would serve.
+        images are whole blocks. staged: take the staged line even where the fused one would serve. causes: say of
+        every event what made it (`Events.cause`, `Events.parent`); it changes no event.
 
         Raises EffectError where an effect's own code fails or returns what it must not.
         """
         if not self._settled:
-            return self.settled().expose(photons, conditions, streams, readouts, staged)
+            return self.settled().expose(photons, conditions, streams, readouts, staged, causes)
         if photons.ndim != 2 or photons.shape[1] != self.layout.pixels or len(photons) != len(streams.images):
             raise ValueError(
                 f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
             )
-        if self.is_paper_line and not staged and (self.tick > 0 or set(readouts) == {"qis"}):
+        if self.is_paper_line and not staged and not causes and (self.tick > 0 or set(readouts) == {"qis"}):
             return self._fused(photons, conditions, streams, readouts)
         step = self.block
         if step == 1:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1]
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + photons.shape[1]))))
         parts = [
-            self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts)
+            self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts, causes)
             for i in range(0, len(photons), step)
         ]
         return Recorded.join(parts)
@@ -177,7 +215,14 @@ class Sensor:
         """By the paper's rules, nothing follows the Poisson draw but afterpulsing, a dead time and a converter."""
         later = [e for e in self.effects if e.stage not in ("light", "detection", "dark")]
         kinds = [type(e) for e in later]
-        return self.rules == "paper" and set(kinds) <= {Afterpulsing, DeadTime, Tdc} and len(set(kinds)) == len(kinds)
+        plain = not self._extends and (self._converter is None or self._converter[1] == -0.5)
+        known = set(kinds) <= {Afterpulsing, DeadTime, Tdc} and len(set(kinds)) == len(kinds)
+        return self.rules == "paper" and known and plain
+
+    @cached_property
+    def _extends(self) -> bool:
+        """Does an event that finds its pixel blind make it blind anew?"""
+        return any(getattr(e, "extends", False) for e in self.at("dead_time"))
 
     def _fused(
         self, photons: np.ndarray, conditions: Conditions, streams: Streams, readouts: Collection[str]
@@ -220,68 +265,126 @@ class Sensor:
         return recorded
 
     def _staged(
-        self, photons: np.ndarray, conditions: Conditions, streams: Streams, readouts: Collection[str]
+        self,
+        photons: np.ndarray,
+        conditions: Conditions,
+        streams: Streams,
+        readouts: Collection[str],
+        causes: bool,
     ) -> Recorded:
-        rate, light = self.rates(photons, conditions)
         pixels = photons.shape[1]
-        events = self._arrivals(rate, light, conditions, streams)
-        events = self._gate(events, conditions)
-        dead_times = np.tile(self.dead_times, len(photons))
-        framed = "str" in readouts or "qis" in readouts
-        if self.rules == "paper":
-            candidates = self._with_children(events, conditions, streams, dead_times)
-            detected = candidates
-            if "tr" in readouts and dead_times.any():
-                kept = kernels.non_paralyzable(candidates.times, candidates.offsets, dead_times[:pixels])
-                detected = Events(candidates.times[kept], kernels.take(candidates.offsets, kept), pixels)
-        else:
-            latent = self._latent(events, conditions, streams, dead_times)
-            detected = latent.fired(dead_times, conditions, frames=False) if "tr" in readouts else events
-            candidates = latent.fired(dead_times, conditions, frames=True) if framed else events
+        events = self._gate(self._arrivals(photons, conditions, streams, causes), conditions)
+        candidates, parents = self._family(events, conditions, streams, causes)
         tr, frames = None, None
         if "tr" in readouts:
+            detected = self._fired(candidates, parents, conditions, streams, frames=False)
+            detected.end = conditions.exposure
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
-                    detected = self._apply(effect, detected, streams)
+                    if hasattr(effect, "apply"):
+                        detected = self._apply(effect, detected, streams)
             tr = self._narrow(detected, conditions.exposure, "TR stamps")
-        if framed:
-            frames = self._frames(candidates, conditions, streams, "str" in readouts)
+        if "str" in readouts or "qis" in readouts:
+            detected = self._fired(candidates, parents, conditions, streams, frames=True)
+            frames = self._frames(detected, conditions, streams, "str" in readouts)
         return summarised(pixels, tr, frames)
 
-    def _arrivals(self, rate: np.ndarray, light: np.ndarray, conditions: Conditions, streams: Streams) -> Events:
+    def _arrivals(self, photons: np.ndarray, conditions: Conditions, streams: Streams, causes: bool) -> Events:
         """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""
-        pixels = rate.shape[1]
+        rate, light = self.rates(photons, conditions)
         varying = self.at("arrival")
-        if not varying:
-            key = streams.key("photons and dark counts")
-            times, offsets = kernels.arrivals(np.ascontiguousarray(rate), conditions.exposure, streams.images, key)
-            return Events(times, offsets, pixels)
-        parts = {"light": light, "dark": rate - light}
-        largest: dict[str, float] = {}
-        most = dict(parts)
-        for effect in varying:
-            top = self._call(effect, "maximum", conditions)
-            if not isinstance(top, (int, float, np.floating)) or not 0 <= top < np.inf:
-                raise _wrong(effect, f"maximum must return one finite number, not negative; it returns {top!r}")
-            largest[effect.name] = float(top)
-            most[effect.acts_on] = most[effect.acts_on] * float(top)
-        drawn = most["light"] + most["dark"]
+        drawn = rate
+        # (what it is, its rate) of the parts that vary each in its own way
+        parts = [("light", light), ("dark", rate - light)]
+        if varying:
+            maxima = dict.fromkeys(("light", "dark"), 1.0)
+            for effect in varying:
+                if effect.acts_on == "own":
+                    added = np.asarray(self._call(effect, "added", conditions), np.float64)
+                    good = added.shape in ((), rate.shape[1:]) and bool(np.all((added >= 0) & (added < np.inf)))
+                    if not good:
+                        raise _wrong(effect, f"added must return 1/s, one value or {rate.shape[1]}, not negative")
+                    parts.append((effect.name, np.broadcast_to(added, rate.shape)))
+                else:
+                    maxima[effect.acts_on] *= self._maximum(effect, conditions)
+            drawn = np.zeros_like(rate)
+            for kind, part in parts:
+                drawn += part * maxima.get(kind, 1.0)
         key = streams.key("photons and dark counts")
         times, offsets = kernels.arrivals(np.ascontiguousarray(drawn), conditions.exposure, streams.images, key)
-        events = Events(times, offsets, pixels)
-        rows = events.rows
-        now = {kind: part.ravel()[rows] for kind, part in parts.items()}
-        for effect in varying:
-            factor = np.asarray(self._call(effect, "factor", times, conditions))
-            if factor.shape not in ((), times.shape) or factor.dtype.kind not in "fiu":
-                raise _wrong(effect, f"factor must return one number per time, {times.shape}, not {factor.shape}")
-            top = largest[effect.name]
-            if not np.all((factor >= 0) & (factor <= top * (1 + 1e-9))):
-                raise _wrong(effect, f"factor must lie between 0 and the maximum it states, {top:g}")
-            now[effect.acts_on] = now[effect.acts_on] * factor
-        share = (now["light"] + now["dark"]) / drawn.ravel()[rows]
-        chance = kernels.uniforms(offsets, pixels, streams.images, streams.key("thinning"))
-        return events.keep(chance < share)
+        events = Events(times, offsets, rate.shape[1], end=conditions.exposure)
+        factors: dict[str, np.ndarray] = {}
+        if varying:
+            for effect in varying:
+                kind = effect.name if effect.acts_on == "own" else effect.acts_on
+                factor = self._factor(effect, events, conditions, streams)
+                factors[kind] = factors[kind] * factor if kind in factors else factor
+            now = np.zeros(len(times))
+            for kind, part in parts:
+                kernels.weigh(now, offsets, part.ravel(), factors.get(kind, _NONE))
+            key = streams.key("thinning")
+            kept = kernels.thinned(now, offsets, drawn.ravel(), events.image_offsets, streams.images, key)
+            events = events.keep(kept)
+            factors = {kind: factor[kept] for kind, factor in factors.items()}
+        if causes:
+            events.cause = self._attributed(events, photons, parts, factors, conditions, streams)
+            events.parent = np.full(len(events), -1, np.int64)
+        return events
+
+    def _maximum(self, effect: Effect, conditions: Conditions) -> float:
+        top = self._call(effect, "maximum", conditions)
+        if not isinstance(top, (int, float, np.floating)) or not 0 <= top < np.inf:
+            raise _wrong(effect, f"maximum must return one finite number, not negative; it returns {top!r}")
+        return float(top)
+
+    def _factor(self, effect: Effect, events: Events, conditions: Conditions, streams: Streams) -> np.ndarray:
+        """(events,) what an arrival effect multiplies its part of the rate by."""
+        if hasattr(effect, "modulate"):
+            factor = np.asarray(self._call(effect, "modulate", events, conditions, self._rng(effect, streams)))
+        else:
+            factor = np.asarray(self._call(effect, "factor", events.times, conditions))
+        hook = "modulate" if hasattr(effect, "modulate") else "factor"
+        shape = events.times.shape
+        if factor.shape not in ((), shape) or factor.dtype.kind not in "fiub":
+            raise _wrong(effect, f"{hook} must return one number per time, {shape}, not {factor.shape}")
+        top = 1.0 if effect.acts_on == "own" else self._maximum(effect, conditions)
+        if factor.size and not (factor.min() >= 0 and factor.max() <= top * (1 + 1e-9)):
+            raise _wrong(effect, f"{hook} must lie between 0 and the maximum it states, {top:g}")
+        return np.ascontiguousarray(np.broadcast_to(factor, shape), np.float64)
+
+    def _attributed(
+        self,
+        events: Events,
+        photons: np.ndarray,
+        parts: list[tuple[str, np.ndarray]],
+        factors: dict[str, np.ndarray],
+        conditions: Conditions,
+        streams: Streams,
+    ) -> np.ndarray:
+        """(events,) what made each: drawn in proportion to the rates at its time, for the draw does not say."""
+        shares: list[tuple[str, str, np.ndarray]] = [("photon", "light", parts[0][1])]
+        rate = parts[0][1]
+        for effect in self.at("dark"):
+            after = self._rate(effect, rate, conditions)
+            shares.append((effect.cause, "dark", np.maximum(after - rate, 0.0)))
+            rate = after
+        for effect in self.at("arrival"):
+            if effect.acts_on == "own":
+                part = next(part for kind, part in parts if kind == effect.name)
+                shares.append((effect.cause, effect.name, part))
+        key = streams.key("causes")
+        chance = kernels.uniforms(np.arange(len(events)), events.image_offsets, streams.images, key)
+        running = np.zeros((len(shares) + 1, len(events)))
+        for i, (_, kind, part) in enumerate(shares):
+            running[i + 1] = running[i]
+            kernels.weigh(running[i + 1], events.offsets, part.ravel(), factors.get(kind, _NONE))
+        # the last one whose share begins at or before the point
+        place = chance * running[-1]
+        chosen = np.zeros(len(events), np.int64)
+        for i in range(1, len(shares)):
+            chosen[(place >= running[i]) & (running[i + 1] > running[i])] = i
+        codes = np.array([self.causes.index(cause) for cause, _, _ in shares], np.uint8)
+        return codes[chosen]
 
     def _gate(self, events: Events, conditions: Conditions) -> Events:
         return events.keep(self._open(events.times, conditions)) if self.at("gate") else events
@@ -297,7 +400,7 @@ class Sensor:
         return mask
 
     def _spawn(
-        self, effect: Effect, events: Events, streams: Streams, dead_times: np.ndarray, suffix: str = ""
+        self, effect: Effect, events: Events, streams: Streams, suffix: str
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(times, rows, parents) of an effect's children; in the parent's own pixel the dead time comes first."""
         children = self._call(effect, "spawn", events, self._rng(effect, streams, suffix))
@@ -321,77 +424,154 @@ class Sensor:
             ):
                 raise _wrong(effect, "the row of a child must be a whole number, and a pixel of its parent's own image")
             rows = rows.astype(np.int64)
-        times = events.times[parent] + (np.where(rows == home, dead_times[home], 0.0) + delay)
+        dead_times = self.dead_times[home % events.pixels]
+        times = events.times[parent] + (np.where(rows == home, dead_times, 0.0) + delay)
         return times, rows, parent
 
-    def _with_children(
-        self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray
-    ) -> Events:
-        """Rules of the paper: every event has its children, whether or not it will be recorded; they have none."""
-        times, rows = [], []
-        for effect in self.at("correlated"):
-            t, r, _ = self._spawn(effect, events, streams, dead_times)
-            inside = t < conditions.exposure
-            times.append(t[inside])
-            rows.append(r[inside])
-        if not times or not sum(map(len, times)):
-            return events
-        extra, extra_rows = np.concatenate(times), np.concatenate(rows).astype(np.int64)
-        order = np.argsort(extra_rows, kind="stable")
-        merged, offsets, _ = kernels.merge(events.times, events.offsets, extra[order], extra_rows[order])
-        return self._gate(Events(merged, offsets, events.pixels), conditions)
+    def _family(
+        self, events: Events, conditions: Conditions, streams: Streams, causes: bool
+    ) -> tuple[Events, np.ndarray]:
+        """The events with all that they may cause, and the parent of each (empty where there is none to look at).
 
-    def _latent(self, events: Events, conditions: Conditions, streams: Streams, dead_times: np.ndarray) -> _Latent:
-        """Rules of a device: everything that may happen, generation after generation."""
-        rows = len(events.offsets) - 1
-        times, row_of, parents = [events.times], [events.rows], [np.full(len(events), -1, np.int64)]
-        current, index = events, np.arange(len(events))
-        known = len(events)
-        for generation in range(_GENERATIONS):
-            found = [
-                self._spawn(effect, current, streams, dead_times, f"/generation {generation}" if generation else "")
-                for effect in self.at("correlated")
-            ]
-            if not found:
-                break
+        By the paper's rules every event has its children, whether or not it will be recorded, and they have none. By
+        a device's, children have children; which of them happen is settled later, when it is known what fires.
+        """
+        cascade = self.rules == "device"
+        correlated = self.at("correlated")
+        children: list[tuple[np.ndarray, ...]] = []  # times, rows, parents, generations, causes
+        current, index, known = events, np.arange(len(events)) if correlated else _NONE, len(events)
+        generation = 0
+        while correlated and len(current) and (cascade or generation == 0):
+            if generation == _GENERATIONS:
+                raise SpadError(
+                    f"the cascade of avalanches does not end ({_GENERATIONS} generations); "
+                    "lower the probabilities of the correlated effects"
+                )
+            suffix = f"/generation {generation}" if generation else ""
+            found = [self._spawn(effect, current, streams, suffix) for effect in correlated]
+            made = [np.full(len(t), self.causes.index(e.cause)) for (t, _, _), e in zip(found, correlated, strict=True)]
             t, r, p = (np.concatenate(column) for column in zip(*found, strict=True))
-            inside = (t < conditions.exposure) & self._open(t, conditions)
-            t, r, p = t[inside], r[inside], p[inside]
-            if not len(t):
-                break
+            inside = t < conditions.exposure
+            inside[inside] = self._open(t[inside], conditions)
+            t, r, p, made_by = t[inside], r[inside], p[inside], np.concatenate(made)[inside]
             order = np.lexsort((t, r))
-            t, r, p = t[order], r[order], p[order]
-            times.append(t)
-            row_of.append(r)
-            parents.append(index[p])
+            t, r, p, made_by = t[order], r[order], p[order], made_by[order]
+            children.append((t, r, index[p], np.full(len(t), generation), made_by))
+            generation += 1
             index = known + np.arange(len(t))
             known += len(t)
-            offsets = np.concatenate([[0], np.cumsum(np.bincount(r, minlength=rows))]).astype(np.int64)
-            current = Events(t, offsets, events.pixels)
-        else:
-            raise SpadError(
-                f"the cascade of avalanches does not end ({_GENERATIONS} generations); "
-                "lower the probabilities of the correlated effects"
-            )
-        return _Latent(np.concatenate(times), np.concatenate(row_of), np.concatenate(parents), rows, events.pixels)
+            offsets = np.searchsorted(r, np.arange(len(events.offsets)))
+            current = Events(t, offsets.astype(np.int64), events.pixels)
+        if known == len(events):
+            return events, _NOBODY
+        times, rows, parents, generations, made_by = (np.concatenate(column) for column in zip(*children, strict=True))
+        # what is equally late: the parent first
+        order = np.lexsort((generations, times, rows))
+        merged, offsets, origin = kernels.merge(events.times, events.offsets, times[order], rows[order])
+        out = Events(merged, offsets, events.pixels, end=conditions.exposure)
+        linked = kernels.relinked(origin, len(events), order, parents) if cascade or causes else _NOBODY
+        if causes and events.cause is not None:
+            out.cause = np.concatenate([events.cause, made_by[order].astype(np.uint8)])[origin]
+            out.parent = linked
+        return out, linked if cascade else _NOBODY
+
+    def _fired(
+        self, events: Events, parents: np.ndarray, conditions: Conditions, streams: Streams, frames: bool
+    ) -> Events:
+        """Those of the candidates that happen: the parent did, and the pixel was not blind."""
+        carried = self._carried
+        if self.rules == "paper":
+            if frames and carried == 0:
+                return events
+            plain = not frames and not self._soft and not self._extends
+            if plain and not self.dead_times.any():
+                return events
+            if plain and events.cause is None:
+                kept = kernels.non_paralyzable(events.times, events.offsets, self.dead_times)
+                return Events(events.times[kept], kernels.take(events.offsets, kept), events.pixels)
+        needed = _NONE if frames else self._needed(events, streams)
+        period = conditions.frame_period if frames else 0.0
+        times, offsets = events.times, events.offsets
+        fired = kernels.avalanches(
+            times, offsets, parents, self.dead_times, needed, self._extends, period, conditions.frame_time, carried
+        )
+        return events.keep(fired)
+
+    @cached_property
+    def _soft(self) -> list[Effect]:
+        """The effects that let a pixel wake up slowly."""
+        return [e for e in self.at("dead_time") if hasattr(e, "sensitivity")]
+
+    @cached_property
+    def _carried(self) -> float:
+        """Share of the remaining blind time with which a pixel enters the next frame."""
+        shares = [(e, self._call(e, "carried")) for e in self.at("dead_time") if hasattr(e, "carried")]
+        for effect, share in shares:
+            if not isinstance(share, (int, float, np.floating)) or not 0 <= share <= 1:
+                raise _wrong(effect, f"carried must return a share from 0 to 1, not {share!r}")
+        return max((float(share) for _, share in shares), default=0.0)
+
+    def _needed(self, events: Events, streams: Streams) -> np.ndarray:
+        """(events,) s that the pixel must have been awake for each to fire; empty where none needs any.
+
+        A pixel whose sensitivity has come up to S fires with probability S: each event draws a number, and fires if
+        the sensitivity has reached it. Only what follows another event closely can find a pixel half awake.
+        """
+        if not self._soft:
+            return _NONE
+        needed = np.zeros(len(events))
+        for effect in self._soft:
+            longest = float(self._recovered(effect, np.array([1 - 2.0**-53]))[0])
+            close = kernels.followers(events.times, events.offsets, self.dead_times + longest)
+            key = streams.key(f"{effect.name}/sensitivity")
+            chance = kernels.uniforms(close, events.image_offsets, streams.images, key)
+            needed[close] = np.maximum(needed[close], self._recovered(effect, chance))
+        return needed
+
+    def _recovered(self, effect: Effect, chance: np.ndarray) -> np.ndarray:
+        """s after the blind time at which an effect's sensitivity reaches `chance`."""
+        if hasattr(effect, "recovered"):
+            out = np.asarray(self._call(effect, "recovered", chance), np.float64)
+            if out.shape != chance.shape or not np.all(out >= 0):
+                raise _wrong(effect, f"recovered must return seconds, {chance.shape}, not negative")
+            return out
+        # by bisection on a scale that reaches from a femtosecond to an hour
+        low, high = np.zeros(chance.shape), np.full(chance.shape, 3600.0)
+        for step in range(120):
+            middle = np.sqrt(np.maximum(low, 1e-15) * high) if step < 60 else (low + high) / 2
+            value = np.asarray(self._call(effect, "sensitivity", middle))
+            if value.shape != chance.shape or not np.all((value >= 0) & (value <= 1)):
+                raise _wrong(effect, f"sensitivity must return numbers from 0 to 1, {chance.shape}")
+            reached = value >= chance
+            high = np.where(reached, middle, high)
+            low = np.where(reached, low, middle)
+        return high
 
     def _frames(self, events: Events, conditions: Conditions, streams: Streams, stamped: bool) -> Frames:
         pixels = events.pixels
+        if events.cause is not None:
+            # the first of each frame alone: then each has its bit and its stamp
+            events = events.keep(kernels.first_of_frames(events.times, events.offsets, *_clock(conditions)))
         out = np.empty(len(events) + 1)
         bits, offsets = kernels.frame_readout(
             events.times,
             events.offsets,
-            conditions.frames,
-            conditions.frame_time,
-            conditions.frame_period,
+            *_clock(conditions),
             out,
         )
         first = None
         if stamped:
             stamps = out[: offsets[-1]]
             # a row for each frame: its one stamp stays its own, whatever a timing effect does with it
-            pixel = Events(stamps, offsets, pixels).pixel
-            first = Events(stamps, np.arange(len(stamps) + 1), pixels, row_pixel=pixel)
+            rows = Events(stamps, offsets, pixels)
+            first = Events(
+                stamps,
+                np.arange(len(stamps) + 1),
+                pixels,
+                row_pixel=rows.pixel,
+                end=conditions.frame_time,
+                image_offsets=rows.image_offsets,
+            )
             for effect in self.at("timing"):
                 first = self._apply(effect, first, streams, "/frames")
             if len(first) != len(stamps):
@@ -402,7 +582,8 @@ class Sensor:
                 ticks = np.minimum(ticks, np.uint64(no_detection(conditions.frame_time, tick) - 1))
             first = Events(None if ticks is not None else first.times, offsets, pixels, ticks, tick)
             first = self._narrow(first, conditions.frame_time, "STR stamps")
-        return Frames(bits, first, conditions.frames, conditions.frame_time, pixels)
+        frames, frame_time = conditions.frames, conditions.frame_time
+        return Frames(bits, first, frames, frame_time, pixels, events.cause, events.parent)
 
     def _narrow(self, events: Events, end: float, what: str) -> Events:
         if events.ticks is None or events.tick is None:
@@ -410,7 +591,7 @@ class Sensor:
         kind = unsigned_for(end / events.tick, what)
         if len(events.ticks) and int(events.ticks.max()) > np.iinfo(kind).max:
             raise SpadError(f"{what}: a stamp of {int(events.ticks.max())} ticks does not fit {np.dtype(kind)}")
-        return Events(None, events.offsets, events.pixels, events.ticks.astype(kind, copy=False), events.tick)
+        return events.stamped(events.ticks.astype(kind, copy=False), events.tick)
 
     # --- calling effects ------------------------------------------------------------------------------------------
 
@@ -433,36 +614,22 @@ class Sensor:
 
     def _checked(self, effect: Effect, after: Any, events: Events) -> Events:
         if not effect.counted:
-            wrong = after.problem() if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
+            wrong = (
+                after.problem(events.end)
+                if isinstance(after, Events)
+                else f"it is a {type(after).__name__}, not Events"
+            )
             if not wrong and len(after.offsets) != len(events.offsets):
                 wrong = f"it has {len(after.offsets) - 1} rows, not {len(events.offsets) - 1}"
+            if not wrong and events.cause is not None and (after.cause is None or len(after.cause) != len(after)):
+                wrong = "the causes of the events are gone; use events.keep, events.moved or events.stamped"
             if wrong:
                 raise _wrong(effect, f"what apply returns cannot be used: {wrong}")
         return after
 
 
-@dataclass(frozen=True)
-class _Latent:
-    """Avalanches that may happen, with the one that would cause each (-1: none)."""
-
-    times: np.ndarray
-    rows: np.ndarray
-    parents: np.ndarray
-    n_rows: int
-    pixels: int
-
-    def fired(self, dead_times: np.ndarray, conditions: Conditions, frames: bool) -> Events:
-        """Those that happen: the parent did, and the pixel was not blind."""
-        # a cause lies in the same image, and earlier: one pass in time order, image by image
-        order = np.lexsort((self.times, self.rows // self.pixels))
-        period = conditions.frame_period if frames else 0.0
-        fired = kernels.avalanches(
-            self.times, self.rows, self.parents, order, dead_times, period, conditions.frame_time
-        )
-        times, rows = self.times[fired], self.rows[fired]
-        sort = np.lexsort((times, rows))
-        offsets = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=self.n_rows))]).astype(np.int64)
-        return Events(times[sort], offsets, self.pixels)
+def _clock(conditions: Conditions) -> tuple[int, float, float]:
+    return conditions.frames, conditions.frame_time, conditions.frame_period
 
 
 def _wrong(effect: Effect, what: str) -> EffectError:
@@ -471,4 +638,9 @@ def _wrong(effect: Effect, what: str) -> EffectError:
 
 def _draws(effect: Effect) -> bool:
     """Does an effect's hook take random numbers?"""
-    return effect.stage in ("correlated", "timing", "readout")
+    return effect.stage in ("correlated", "timing", "readout") or hasattr(effect, "modulate")
+
+
+def _end(after: Events, events: Events) -> float | None:
+    """Where the times must end; a stamp may be rounded up to it."""
+    return None if after.ticks is not None else events.end

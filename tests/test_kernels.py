@@ -206,14 +206,32 @@ def test_streams_are_named_by_what_they_are_for() -> None:
 
 
 def test_uniforms() -> None:
-    offsets = np.array([0, 3, 3, 200_000, 400_000], np.int64)
+    image_offsets = np.array([0, 3, 200_000], np.int64)
     images = np.array([4, 5], np.uint64)
-    u = kernels.uniforms(offsets, 2, images, KEY)
+    u = kernels.uniforms(np.arange(200_000), image_offsets, images, KEY)
     assert u.min() > 0 and u.max() < 1
     laws.distribution_is(u, lambda t: t)
-    assert len(kernels.uniforms(np.zeros(3, np.int64), 2, images[:1], KEY)) == 0
-    second = kernels.uniforms(offsets[2:] - 3, 2, images[1:], KEY)
+    assert len(kernels.uniforms(np.zeros(0, np.int64), np.zeros(2, np.int64), images[:1], KEY)) == 0
+    second = kernels.uniforms(np.arange(199_997), np.array([0, 199_997]), images[1:], KEY)
     assert np.array_equal(u[3:], second)  # an image alone
+    some = np.array([1, 2, 3, 77, 4000])
+    assert np.array_equal(kernels.uniforms(some, image_offsets, images, KEY), u[some])  # an event alone
+
+
+def test_thinned_draws_the_same_for_an_image_alone() -> None:
+    rng = np.random.default_rng(8)
+    offsets = np.concatenate([[0], np.cumsum(rng.integers(0, 60, 8))])
+    rates = rng.uniform(0, 2.0, offsets[-1])
+    drawn = np.full(8, 2.0)
+    images = np.array([9, 11], np.uint64)
+    both = kernels.thinned(rates, offsets, drawn, offsets[::4], images, KEY)
+    cut = offsets[4]
+    alone = kernels.thinned(rates[cut:], offsets[4:] - cut, drawn[4:], offsets[4::4] - cut, images[1:], KEY)
+    assert np.array_equal(both[cut:], alone)
+    many = kernels.thinned(
+        np.full(100_000, 0.3), np.array([0, 100_000]), np.ones(1), np.array([0, 100_000]), images[:1], KEY
+    )
+    laws.share_is(int(many.sum()), 100_000, 0.3)
 
 
 # ---- ragged rows ------------------------------------------------------------------------------------------
@@ -247,6 +265,7 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
     rows = len(offsets) - 1
     extra_rows = np.array(sorted(draw.draw(st.lists(st.integers(0, rows - 1), max_size=15))), np.int64)
     extra = np.array([draw.draw(st.sampled_from([0.0, 0.25, 0.5, 0.7, 0.99])) for _ in extra_rows], float)
+    extra = extra[np.lexsort((extra, extra_rows))]
     merged, new_offsets, origin = kernels.merge(times, offsets, extra, extra_rows)
     before = rows_of(times, offsets)
     assert rows_of(merged, new_offsets) == [
@@ -254,6 +273,36 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
     ]
     assert sorted(origin.tolist()) == list(range(len(times) + len(extra)))
     assert np.array_equal(np.concatenate([times, extra])[origin], merged)
+    same = np.diff(merged) == 0
+    assert np.all(origin[1:][same] > origin[:-1][same])  # of equally late ones the further events come behind
+    # the parents, told by who they were, are found where they are now
+    order = np.array(draw.draw(st.permutations(range(len(extra)))), np.int64)
+    total = len(times) + len(extra)
+    parents = np.array([draw.draw(st.integers(0, total - 1)) for _ in extra], np.int64)
+    linked = kernels.relinked(origin, len(times), order, parents)
+    who = np.where(origin < len(times), origin, 0)
+    who[origin >= len(times)] = len(times) + order[origin[origin >= len(times)] - len(times)]
+    for k, one in enumerate(who.tolist()):
+        assert linked[k] == -1 if one < len(times) else who[linked[k]] == parents[one - len(times)]
+
+
+@settings(max_examples=120, deadline=None, derandomize=True)
+@given(ragged(), st.data())
+def test_sort_rows_and_kept_offsets(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None:
+    times, offsets = data
+    moved = np.array([t + draw.draw(st.sampled_from([-0.3, 0.0, 0.2, 2.0])) for t in times.tolist()])
+    order = np.empty(len(times), np.int64)
+    out = kernels.sort_rows(moved, offsets, 0.9, order)
+    assert rows_of(out, offsets) == [sorted(np.clip(row, 0, 0.9).tolist()) for row in rows_of(moved, offsets)]
+    assert np.array_equal(np.clip(moved, 0, 0.9)[order], out)
+    assert all(
+        sorted(row) == list(range(a, b))
+        for row, (a, b) in zip(rows_of(order, offsets), itertools.pairwise(offsets), strict=True)
+    )
+    assert np.array_equal(kernels.sort_rows(moved, offsets, 0.9, np.empty(0, np.int64)), out)
+    mask = np.array([draw.draw(st.booleans()) for _ in times], bool)
+    kept = kernels.kept_offsets(mask, offsets)
+    assert np.diff(kept).tolist() == [int(mask[a:b].sum()) for a, b in itertools.pairwise(offsets)]
 
 
 @settings(max_examples=120, deadline=None, derandomize=True)
@@ -356,32 +405,67 @@ def test_nearest_ticks(x: np.ndarray) -> None:
     assert out.tolist() == [round(value) for value in x.tolist()]
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
-@given(st.data())
-def test_avalanches_against_a_plain_loop(draw: st.DataObject) -> None:
-    """Rules of a device: a chain of causes in time order, blindness, frames."""
-    n = draw.draw(st.integers(0, 25))
-    times = np.array(sorted(draw.draw(st.lists(st.integers(0, 63), min_size=n, max_size=n))), float) / 64
-    pixel = np.array(draw.draw(st.lists(st.integers(0, 2), min_size=n, max_size=n)), np.int64)
-    parent = np.array([draw.draw(st.integers(-1, i - 1)) for i in range(n)], np.int64)
-    dead = np.array(draw.draw(st.lists(st.sampled_from([0.0, 1 / 64, 0.1, 0.4]), min_size=3, max_size=3)))
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(ragged(most_rows=4, most_events=9), st.data())
+def test_avalanches_against_a_plain_loop(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None:
+    """One pass over all rows in the order of time says the same as the pass that goes row by row."""
+    times, offsets = data
+    rows = len(offsets) - 1
+    row_of = np.repeat(np.arange(rows), np.diff(offsets))
+    n = len(times)
+    # in the order of time; what is equally late in its row's order, for a parent stands before its child
+    order = sorted(range(n), key=lambda i: (times[i], i))
+    parents = np.full(n, -1, np.int64)
+    for k, i in enumerate(order):
+        # across rows a cause is truly earlier; generations, which order equals, are not part of this test
+        earlier = [j for j in order[:k] if times[j] < times[i] or row_of[j] == row_of[i]]
+        if earlier and draw.draw(st.integers(0, 2)):
+            parents[i] = draw.draw(st.sampled_from(earlier))
+    dead = np.array(draw.draw(st.lists(st.sampled_from([0.0, 1 / 64, 0.1, 0.4]), min_size=rows, max_size=rows)))
     period = draw.draw(st.sampled_from([0.0, 1 / 8, 1 / 4]))
     live = period * draw.draw(st.sampled_from([1.0, 0.5]))
-    order = np.arange(n)
-    fired: list[bool] = []
-    blind = dict.fromkeys(range(3), -math.inf)  # until when (TR), or the last frame that fired
-    for time, p, cause in zip(times.tolist(), pixel.tolist(), parent.tolist(), strict=True):
+    extends = draw.draw(st.booleans())
+    carried = draw.draw(st.sampled_from([0.0, 0.5, 1.0]))
+    needed = np.array([draw.draw(st.sampled_from([0.0, 0.05, 0.3])) for _ in range(n)])
+    fired = np.zeros(n, bool)
+    since = dict.fromkeys(range(rows), -math.inf)  # TR: when the blindness began; frames: the last frame that fired
+    awake = dict.fromkeys(range(rows), -math.inf)
+    for i in order:
+        if parents[i] >= 0 and not fired[parents[i]]:
+            continue
+        time, row = float(times[i]), int(row_of[i])
         if period:
             frame = time // period
-            happens = time - frame * period < live and frame != blind[p]
-        else:
-            frame, happens = 0.0, time - blind[p] > dead[p]
-        happens = happens and (cause < 0 or fired[cause])
-        fired.append(happens)
-        if happens:
-            blind[p] = frame if period else time
-    got = kernels.avalanches(times, pixel, parent, order, dead, period, live)
-    assert got.tolist() == fired
+            fired[i] = time - frame * period < live and frame != since[row] and time >= awake[row]
+            if fired[i]:
+                since[row] = frame
+                start = (frame + 1) * period
+                awake[row] = start + carried * max(0.0, time + dead[row] - start) if carried else -math.inf
+        elif time - since[row] <= dead[row]:
+            since[row] = time if extends else since[row]
+        elif time - since[row] - dead[row] >= needed[i]:
+            fired[i] = True
+            since[row] = time
+    got = kernels.avalanches(times, offsets, parents, dead, needed, extends, period, live, carried)
+    assert got.tolist() == fired.tolist()
+    if not np.any(parents >= 0) and not needed.any():
+        none = kernels.avalanches(times, offsets, parents[:0], dead, needed[:0], extends, period, live, carried)
+        assert none.tolist() == fired.tolist()
+
+
+def test_a_chain_of_causes_may_run_through_all_rows() -> None:
+    """Each row waits for the next one's last event: 500 rows deep, and the other way round."""
+    rows = 500
+    for step in (1, -1):
+        times = np.concatenate([[0.1, 0.9 - step * 1e-3 * row] for row in range(rows)]).astype(float)
+        offsets = np.arange(0, 2 * rows + 1, 2)
+        parents = np.full(2 * rows, -1, np.int64)
+        for row in range(rows):
+            if 0 <= row + step < rows:
+                parents[2 * row + 1] = 2 * (row + step) + 1
+        fired = kernels.avalanches(times, offsets, parents, np.zeros(rows), np.zeros(0), False, 0.0, 1.0, 0.0)
+        assert fired.all()
+        parents[1 if step == -1 else 2 * rows - 1] = -1
 
 
 # ---- arrivals and children --------------------------------------------------------------------------------
