@@ -636,6 +636,71 @@ def followers(times, offsets, within):
     return out[:found].copy()
 
 
+_OPEN, _LOST, _FIRED = np.uint8(0), np.uint8(1), np.uint8(2)  # what is known of a candidate
+
+
+@_jit
+def _fire_until(times, parents, i, goal, state, blind, needed, extends, before):
+    """Settle a row's candidates from `i` to `goal` (TR), up to the first whose parent is not settled yet.
+
+    before: when the pixel's blindness began. Returns (where it stopped, before).
+    """
+    i = np.uint64(i)
+    goal = np.uint64(goal)
+    while i < goal:
+        if parents.size:
+            parent = parents[i]
+            if parent >= 0:
+                cause = state[parent]
+                if cause == _OPEN:
+                    break
+                if cause == _LOST:
+                    state[i] = _LOST
+                    i += np.uint64(1)
+                    continue
+        time = times[i]
+        since = time - before
+        fires = since > blind
+        if fires and needed.size:
+            fires = since - blind >= needed[i]
+        state[i] = _FIRED if fires else _LOST
+        if fires or (extends and since <= blind):
+            before = time
+        i += np.uint64(1)
+    return np.int64(i), before
+
+
+@_jit
+def _fire_in_frames(times, parents, i, goal, state, blind, frame_period, frame_time, carried, before, awake):
+    """As `_fire_until` for frames: the pixel fires once in each. before: the frame in which it fired last; awake:
+    when it is live again. Returns (where it stopped, before, awake).
+    """
+    i = np.uint64(i)
+    goal = np.uint64(goal)
+    while i < goal:
+        if parents.size:
+            parent = parents[i]
+            if parent >= 0:
+                cause = state[parent]
+                if cause == _OPEN:
+                    break
+                if cause == _LOST:
+                    state[i] = _LOST
+                    i += np.uint64(1)
+                    continue
+        time = times[i]
+        frame, since = _frame_of(time, frame_period)
+        fires = (frame != before) & (since < frame_time) & (time >= awake)
+        state[i] = _FIRED if fires else _LOST
+        if fires:
+            before = frame
+            if carried > 0.0:
+                start = (frame + 1.0) * frame_period
+                awake = start + carried * max(0.0, time + blind - start)
+        i += np.uint64(1)
+    return np.int64(i), before, awake
+
+
 @_jit
 def avalanches(times, offsets, parents, blind, needed, extends, frame_period, frame_time, carried):
     """What fires: an event whose parent fired, or that has none, and that does not find its pixel blind.
@@ -653,10 +718,10 @@ def avalanches(times, offsets, parents, blind, needed, extends, frame_period, fr
     """
     rows = offsets.size - 1
     pixels = blind.size
-    fired = np.zeros(times.size, np.bool_)
+    state = np.zeros(times.size, np.uint8)
     reached = offsets[:-1].copy()
-    last = np.full(rows, -np.inf)  # TR: when the blindness began; frames: in which frame the pixel fired
-    awake = np.full(rows, -np.inf)  # frames: when it is live again
+    last = np.full(rows, -np.inf)
+    awake = np.full(rows, -np.inf)
     waiting = np.empty(64, np.int64)
     goals = np.empty(64, np.int64)
     for first in range(rows):
@@ -666,51 +731,23 @@ def avalanches(times, offsets, parents, blind, needed, extends, frame_period, fr
         while depth > 0:
             row = waiting[depth - 1]
             goal = goals[depth - 1]
-            dead = blind[row % pixels]
-            before = last[row]
             i = reached[row]
-            found = True
-            while i < goal:
-                if parents.size:
-                    parent = parents[i]
-                    if parent >= 0:
-                        if not offsets[row] <= parent < offsets[row + 1]:
-                            home = np.searchsorted(offsets, parent, side="right") - 1
-                            if parent >= reached[home]:
-                                waiting = _grown(waiting, depth, depth + 1)
-                                goals = _grown(goals, depth, depth + 1)
-                                waiting[depth] = home
-                                goals[depth] = parent + 1
-                                found = False
-                                break
-                        if not fired[parent]:
-                            i += 1
-                            continue
-                time = times[i]
-                if frame_period > 0.0:
-                    frame, since = _frame_of(time, frame_period)
-                    if frame != before and since < frame_time and time >= awake[row]:
-                        fired[i] = True
-                        before = frame
-                        if carried > 0.0:
-                            start = (frame + 1.0) * frame_period
-                            awake[row] = start + carried * max(0.0, time + dead - start)
-                else:
-                    since = time - before
-                    if since <= dead:
-                        if extends:
-                            before = time
-                    elif needed.size == 0 or since - dead >= needed[i]:
-                        fired[i] = True
-                        before = time
-                i += 1
-            reached[row] = i
-            last[row] = before
-            if found:
-                depth -= 1
+            dead = blind[row % pixels]
+            if frame_period > 0.0:
+                i, last[row], awake[row] = _fire_in_frames(
+                    times, parents, i, goal, state, dead, frame_period, frame_time, carried, last[row], awake[row]
+                )
             else:
-                depth += 1
-    return fired
+                i, last[row] = _fire_until(times, parents, i, goal, state, dead, needed, extends, last[row])
+            reached[row] = i
+            depth -= 1
+            if i < goal:
+                waiting = _grown(waiting, depth + 1, depth + 2)
+                goals = _grown(goals, depth + 1, depth + 2)
+                waiting[depth + 1] = np.searchsorted(offsets, parents[i], side="right") - 1
+                goals[depth + 1] = parents[i] + 1
+                depth += 2
+    return state == _FIRED
 
 
 # --- clocks and frames --------------------------------------------------------------------------------------------

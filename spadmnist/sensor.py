@@ -480,13 +480,12 @@ class Sensor:
     ) -> Events:
         """Those of the candidates that happen: the parent did, and the pixel was not blind."""
         carried = self._carried
-        if self.rules == "paper":
-            if frames and carried == 0:
+        if self.rules == "paper" and frames and carried == 0:
+            return events
+        if not (frames or self._soft or self._extends or len(parents)):
+            if not self.dead_times.any():
                 return events
-            plain = not frames and not self._soft and not self._extends
-            if plain and not self.dead_times.any():
-                return events
-            if plain and events.cause is None:
+            if events.cause is None:
                 kept = kernels.non_paralyzable(events.times, events.offsets, self.dead_times)
                 return Events(events.times[kept], kernels.take(events.offsets, kept), events.pixels)
         needed = _NONE if frames else self._needed(events, streams)
