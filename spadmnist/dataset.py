@@ -102,6 +102,10 @@ def expected_per_image(experiment: Experiment, level: Level, images: Images) -> 
         size += pixels * -(-frames // 8)
     if "str" in experiment.readouts:
         size += 4 * float(stamped.sum())
+    if "counts" in experiment.readouts:
+        size += 2 * pixels * experiment.conditions.count_frames
+    if experiment.causes:
+        size += 5 * float(recorded.sum() + stamped.sum())
     return float(candidates.sum()), size
 
 
@@ -135,6 +139,7 @@ def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Colu
     columns: dict[str, Column] = {}
     if recorded.tr is not None:
         columns |= _ragged(recorded.tr, "tr", "event", "since the start of the exposure", dims, shape, True)
+        columns |= _cause_columns(recorded.tr, "tr", "event")
     if recorded.frames is not None:
         f = recorded.frames
         # a line is a row of pixels: its bits lie next to each other, and a large sensor is cut between lines
@@ -155,7 +160,49 @@ def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Colu
         )
         if f.first is not None:
             columns |= _ragged(f.first, "frames", "first_event", "since the start of its frame", dims, shape, False)
+        if f.cause is not None:
+            columns |= _cause_columns(f.detections, "frames", "first_event")
+    if recorded.tally is not None:
+        columns["counts/frames"] = Column(
+            recorded.tally.reshape(-1, *shape, recorded.tally.shape[1]),
+            (*dims, "count_frame"),
+            "1",
+            "count frames of each pixel",
+            "counts",
+            _per_chunk(recorded.tally[0].nbytes * per_image),
+        )
     return columns
+
+
+def _cause_columns(events: Events, group: str, axis: str) -> dict[str, Column]:
+    """What made each detection, where that was asked for; parents count from the start of their image."""
+    if events.cause is None or events.parent is None:
+        return {}
+    starts = np.repeat(events.image_offsets[:-1], np.diff(events.image_offsets))
+    parent = np.where(events.parent >= 0, events.parent - starts, events.parent).astype(np.int32)
+    names = "a number of the manifest's list of causes"
+    about = "which detection of its image caused it; -1: none, -2: one that was not recorded"
+    return {
+        f"{group}/cause": Column(events.cause, (axis,), "1", f"what made it: {names}", "counts", store.ROWS_OF_TICKS),
+        f"{group}/parent": Column(parent, (axis,), "1", about, "counts", store.ROWS_OF_TICKS),
+    }
+
+
+def _read_causes(reader: ShardReader, group: str, start: int, stop: int, events: Events) -> None:
+    """Give the events of some images their causes, where the shard has them."""
+    if f"{group}/cause" not in reader.names:
+        return
+    if f"{group}/starts" in reader.names:
+        first, last = (int(x) for x in reader.read(f"{group}/starts")[[start, stop]])
+    else:
+        bits = reader.array_attributes("frames/bits")
+        before = reader.read("frames/bits", 0, start * bits["lines_per_image"])
+        first = int(np.bitwise_count(before).sum(dtype=np.int64))
+        last = first + len(events)
+    events.cause = reader.read(f"{group}/cause", first, last)
+    parent = reader.read(f"{group}/parent", first, last).astype(np.int64)
+    starts = np.repeat(events.image_offsets[:-1], np.diff(events.image_offsets))
+    events.parent = np.where(parent >= 0, parent + starts, parent)
 
 
 def _packed(bits: np.ndarray, frames: int, columns: int) -> np.ndarray:
@@ -255,6 +302,8 @@ def read_shard(reader: ShardReader, experiment: Experiment) -> tuple[Recorded, t
     c = experiment.conditions
     if "tr" in experiment.readouts:
         n, *shape = reader.shape("tr/counts")
+    elif "counts" in experiment.readouts:
+        n, *shape = reader.shape("counts/frames")[:-1]
     else:
         lines = reader.array_attributes("frames/bits")["lines_per_image"]
         n = reader.shape("frames/bits")[0] // lines
@@ -266,13 +315,18 @@ def read_shard(reader: ShardReader, experiment: Experiment) -> tuple[Recorded, t
     if set(experiment.readouts) & {"str", "qis"}:
         stamped = "str" in experiment.readouts
         frames = read_frames(reader, 0, n, pixels, experiment.sensor.tick, c.frames, c.frame_time, stamped)
-    return summarised(pixels, tr, frames), tuple(shape)
+    tally = None
+    if "counts" in experiment.readouts:
+        tally = reader.read("counts/frames").reshape(n * pixels, -1)
+    return summarised(pixels, tr, frames, tally), tuple(shape)
 
 
 def read_tr(reader: ShardReader, start: int, stop: int, pixels: int, tick: float) -> Events:
     """The TR stream of some images of a shard."""
     counts = reader.read("tr/counts", start, stop).reshape(-1)
-    return _read_ragged(reader, "tr", start, stop, counts, pixels, tick)
+    events = _read_ragged(reader, "tr", start, stop, counts, pixels, tick)
+    _read_causes(reader, "tr", start, stop, events)
+    return events
 
 
 def read_frames(
@@ -294,7 +348,12 @@ def read_frames(
     if stamped:
         counts = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
         first = _read_ragged(reader, "frames", start, stop, counts, pixels, tick)
-    return Frames(bits, first, frames, frame_time, pixels)
+    found = Frames(bits, first, frames, frame_time, pixels)
+    if "frames/cause" not in reader.names:
+        return found
+    made = found.detections
+    _read_causes(reader, "frames", start, stop, made)
+    return Frames(bits, first, frames, frame_time, pixels, made.cause, made.parent)
 
 
 def _read_ragged(
@@ -315,15 +374,21 @@ def _read_ragged(
     return Events(reader.read(f"{group}/times", first, last), offsets, pixels)
 
 
-def statistics(recorded: Recorded) -> dict[str, Any]:
-    """What the manifest adds up over shards: images, pixels, and per readout detections and empty pixels."""
+def statistics(recorded: Recorded, causes: Sequence[str] = ()) -> dict[str, Any]:
+    """What the manifest adds up over shards: per readout detections and empty pixels, and the number of detections
+    of each cause (in TR; where there is none, in the frames).
+    """
     out: dict[str, Any] = {}
-    for readout, column in (("tr", recorded.counts), ("frames", recorded.ones)):
+    tallied = None if recorded.tally is None else recorded.tally.sum(axis=1, dtype=np.int64)
+    for readout, column in (("tr", recorded.counts), ("frames", recorded.ones), ("counts", tallied)):
         if column is not None:
             out[readout] = {
                 "detections": int(column.sum(dtype=np.int64)),
                 "empty_pixels": int(np.count_nonzero(column == 0)),
             }
+    made = recorded.frames if recorded.tr is None else recorded.tr
+    if made is not None and made.cause is not None:
+        out["causes"] = dict(zip(causes, np.bincount(made.cause, minlength=len(causes)).tolist(), strict=True))
     return out
 
 
@@ -468,7 +533,8 @@ class Part:
     tr: `Events` of an image's pixels, row by row; qis: (frames, rows, columns) uint8; str: (frames, rows, columns)
     float64, s, the frame time where there is no detection; reconstruction: by method; images: the originals;
     labels: (n,) uint8, or None where the source has none; readouts: what was recorded; stored: read from a dataset,
-    or simulated when it is asked for. Colour adds a leading channel axis.
+    or simulated when it is asked for. Colour adds a leading channel axis. causes: what the numbers in `Events.cause`
+    mean, where the causes were asked for.
     """
 
     def __init__(
@@ -479,9 +545,11 @@ class Part:
         readouts: Sequence[str],
         methods: Sequence[str],
         shape: tuple[int, ...],
+        causes: Sequence[str] = (),
     ):
         self._length = length
         self._backend = backend
+        self.causes = tuple(causes)
         self.stored = stored
         self.readouts = tuple(readouts)
         self.shape = shape
@@ -511,6 +579,18 @@ class Part:
     def tr(self) -> Field[Events]:
         self._recorded("tr")
         return Field(self._length, partial(self._backend.recorded, what="tr"), _same)
+
+    @property
+    def counts(self) -> Field[np.ndarray]:
+        """The readout `counts`: (count frames, rows, columns) unsigned."""
+        self._recorded("counts")
+        return Field(self._length, self._tally, _first)
+
+    def _tally(self, start: int, stop: int) -> np.ndarray:
+        rows = self._backend.recorded(start, stop, "counts")
+        dense = rows.reshape(stop - start, *self.shape, rows.shape[1])
+        # behind the image (and its channel): the frames, then rows and columns
+        return np.moveaxis(dense, -1, len(self.shape) - 1)
 
     @property
     def qis(self) -> Field[np.ndarray]:
@@ -625,12 +705,15 @@ class _Stored:
         parts = [self._read(reader, a, b, what) for reader, a, b in self._pieces(self._shards, start, stop)]
         if what == "tr":
             return Events.join(parts)
-        return Frames.join(parts)
+        return _joined(parts) if what == "counts" else Frames.join(parts)
 
     def _read(self, reader: ShardReader, start: int, stop: int, what: str) -> Any:
         f = self._facts
         if what == "tr":
             return read_tr(reader, start, stop, f["pixels"], f["tick"])
+        if what == "counts":
+            found = reader.read("counts/frames", start, stop)
+            return found.reshape(-1, found.shape[-1])
         return read_frames(reader, start, stop, f["pixels"], f["tick"], f["frames"], f["frame_time"], what == "str")
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
@@ -674,9 +757,7 @@ class _Simulated:
 
     def recorded(self, start: int, stop: int, what: str) -> Any:
         made = self._make(start, stop)
-        if what == "tr":
-            return made.tr
-        return made.frames
+        return {"tr": made.tr, "counts": made.tally}.get(what, made.frames)
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
         values, _ = reconstruct.find(method).image(self._make(start, stop), self._experiment.settings)
@@ -734,7 +815,8 @@ def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset
     def part(level: Level, split: str) -> Part:
         backend = _Simulated(experiment, level, split, splits)
         length = experiment.wanted(splits[split])
-        return Part(length, backend, False, experiment.readouts, experiment.methods, shape)
+        names = experiment.sensor.causes if experiment.causes else ()
+        return Part(length, backend, False, experiment.readouts, experiment.methods, shape, names)
 
     sizes = {split: experiment.wanted(images) for split, images in splits.items()}
     return Dataset(experiment.levels, sizes, part, experiment.name)
@@ -759,7 +841,8 @@ def stored(root: Path) -> Dataset:
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
         backend = _Stored(root, manifest["config"]["output"]["format"], mine, originals, own)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
-        return Part(manifest["images"]["splits"][split]["images"], backend, True, readouts, methods, shape)
+        length = manifest["images"]["splits"][split]["images"]
+        return Part(length, backend, True, readouts, methods, shape, manifest.get("causes", ()))
 
     order = dict.fromkeys(shard.split for shard in shards)
     sizes = {split: manifest["images"]["splits"][split]["images"] for split in order}

@@ -49,7 +49,8 @@ class Experiment:
     """Everything that decides what a dataset contains, besides the images.
 
     resolved: the config with all defaults filled in and the sensor in place, as text and numbers: what a manifest
-    keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split.
+    keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split;
+    causes: say of every detection what made it.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Experiment:
     sensor: Sensor
     format: str
     limit: int | None = None
+    causes: bool = False
     notes: tuple[str, ...] = ()
     _photons: dict[str, float] = field(default_factory=dict, repr=False, compare=False)
 
@@ -142,7 +144,8 @@ class Experiment:
         # each channel is an image of its own to the sensor
         numbers = np.arange(first * channels, (first + len(pixels)) * channels, dtype=np.uint64)
         photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
-        made = self.sensor.expose(photons, self.conditions, self.streams(level, split, numbers), self.readouts)
+        streams = self.streams(level, split, numbers)
+        made = self.sensor.expose(photons, self.conditions, streams, self.readouts, causes=self.causes)
         return made.grouped(channels)
 
     @cached_property
@@ -185,6 +188,8 @@ class Experiment:
             )
         stored = pixels * self.conditions.frames / 8 if set(self.readouts) & {"qis", "str"} else 0
         stored += 4 * events * len(set(self.readouts) & {"tr", "str"})
+        if "counts" in self.readouts:
+            stored += 2 * pixels * self.conditions.count_frames
         if stored > _MOST_BYTES:
             raise InputError(
                 f"{self.name}: one image at {brightest.text} would take {stored / 2**30:.1f} GiB, more than "

@@ -842,6 +842,29 @@ def frame_readout(times, offsets, frames, frame_time, frame_period, out):
 
 
 @_jit
+def sums_of_frames(bits, each, out):
+    """Add up `each` binary frames after the other: out (rows, count frames) from bits (rows, bytes), high bit first."""
+    for row in range(out.shape[0]):
+        frame = 0
+        for m in range(out.shape[1]):
+            total = 0
+            for _ in range(each):
+                total += (bits[row, frame >> 3] >> (7 - (frame & 7))) & 1
+                frame += 1
+            out[row, m] = total
+
+
+@_jit
+def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
+    """How many events of each row fall into each frame, at most `largest`: out (rows, frames), zeros before."""
+    for row in range(offsets.size - 1):
+        for i in range(offsets[row], offsets[row + 1]):
+            frame, since = _frame_of(times[i], frame_period)
+            if since < frame_time and frame < out.shape[1] and out[row, np.int64(frame)] < largest:
+                out[row, np.int64(frame)] += 1
+
+
+@_jit
 def first_of_frames(times, offsets, frames, frame_time, frame_period):
     """Which events (events,) bool are the first of their row in a frame; the others `frame_readout` leaves out."""
     kept = np.zeros(times.size, np.bool_)

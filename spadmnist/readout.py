@@ -11,7 +11,7 @@ from . import kernels
 from .errors import SpadError
 from .events import Events
 
-READOUTS = ("tr", "str", "qis")
+READOUTS = ("tr", "str", "qis", "counts")
 
 
 def unsigned_for(largest: float, what: str) -> type[np.unsignedinteger]:
@@ -100,7 +100,7 @@ class Recorded:
 
     counts: recorded detections N; span: s from the first to the last stamp, 0 where N < 2; ones: frames with a
     detection; waited: s, the sum over all frames of the first stamp, or of the frame time where there is none.
-    Each (rows,), None where its readout was not asked for.
+    Each (rows,), None where its readout was not asked for. tally: (rows, count frames) unsigned, the readout `counts`.
     """
 
     pixels: int
@@ -110,6 +110,7 @@ class Recorded:
     frames: Frames | None = None
     ones: np.ndarray | None = None
     waited: np.ndarray | None = None
+    tally: np.ndarray | None = None
 
     def images(self, start: int, stop: int) -> Recorded:
         """The images `start` to `stop` alone."""
@@ -126,6 +127,7 @@ class Recorded:
             None if self.frames is None else self.frames.images(start, stop),
             cut(self.ones),
             cut(self.waited),
+            cut(self.tally),
         )
 
     def grouped(self, planes: int) -> Recorded:
@@ -139,7 +141,7 @@ class Recorded:
             first = None if frames.first is None else frames.first.regrouped(pixels)
             one = frames
             frames = Frames(one.bits, first, one.frames, one.frame_time, pixels, one.cause, one.parent)
-        return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited)
+        return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited, self.tally)
 
     @staticmethod
     def join(parts: list[Recorded]) -> Recorded:
@@ -153,15 +155,16 @@ class Recorded:
 
         frames = None if one.frames is None else Frames.join([p.frames for p in parts if p.frames is not None])
         tr = None if one.tr is None else Events.join([p.tr for p in parts if p.tr is not None])
-        return Recorded(one.pixels, tr, joined("counts"), joined("span"), frames, joined("ones"), joined("waited"))
+        counts, span, tally = joined("counts"), joined("span"), joined("tally")
+        return Recorded(one.pixels, tr, counts, span, frames, joined("ones"), joined("waited"), tally)
 
 
-def summarised(pixels: int, tr: Events | None, frames: Frames | None) -> Recorded:
+def summarised(pixels: int, tr: Events | None, frames: Frames | None, tally: np.ndarray | None = None) -> Recorded:
     """The streams with the sums that reconstructions need (`waited` only where STR was recorded)."""
-    recorded = Recorded(pixels)
+    recorded = Recorded(pixels, tally=tally)
     if tr is not None:
         counts, span = kernels.spans(tr.times if tr.ticks is None else tr.ticks, tr.offsets)
-        recorded = Recorded(pixels, tr, counts, span if tr.tick is None else span * tr.tick)
+        recorded = Recorded(pixels, tr, counts, span if tr.tick is None else span * tr.tick, tally=tally)
     if frames is None:
         return recorded
     ones = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int32)
@@ -171,4 +174,9 @@ def summarised(pixels: int, tr: Events | None, frames: Frames | None) -> Recorde
         total = kernels.row_totals(first.times if first.ticks is None else first.ticks, first.offsets)
         total = total if first.tick is None else total * first.tick
         waited = total + (frames.frames - ones) * frames.frame_time
-    return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited)
+    return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited, tally)
+
+
+def counts_type(largest: int) -> type[np.unsignedinteger]:
+    """The unsigned type of counts up to `largest`."""
+    return np.uint8 if largest < 2**8 else np.uint16

@@ -31,7 +31,8 @@ _WIDTH = 100  # characters of a table
 def level_rows(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One row per light level and split, in the config's order; a number that was not recorded is None.
 
-    detections, mean_per_pixel, empty_share: of TR (empty_share of the frames where there is no TR).
+    detections, mean_per_pixel: of TR, or of the count frames where there is no TR; empty_share: the same, or of the
+    frames. causes: detections of each cause, where the causes were stored.
     ones, density: frames of a pixel with a detection, and their share.
     saturated_pixels, saturated_total: by method, and their sum.
     bytes, bytes_by_kind: on disk, without the original images.
@@ -53,7 +54,7 @@ def _splits(manifest: Mapping[str, Any]) -> list[str]:
 
 def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
     """What `level_rows` says of some images, from what the manifest's `statistics` holds of them."""
-    tr, framed = facts.get("tr"), facts.get("frames")
+    tr, framed = facts.get("tr") or facts.get("counts"), facts.get("frames")
     detections = tr["detections"] if tr else None
     ones = framed["detections"] if framed else None
     pixels, by_kind = facts["pixels"], facts["bytes"]
@@ -63,6 +64,7 @@ def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
         "detections": detections,
         "mean_per_pixel": _ratio(detections, pixels),
         "empty_share": _ratio((tr or framed or {}).get("empty_pixels"), pixels),
+        **({"causes": dict(facts["causes"])} if "causes" in facts else {}),
         "ones": ones,
         "density": _ratio(ones, pixels * frames),
         "saturated_pixels": dict(facts["saturated_pixels"]),
@@ -83,10 +85,7 @@ def level_table(manifest: Mapping[str, Any], by_split: bool = False) -> str:
     At most 100 characters wide.
     """
     blocks = [_about(manifest), _levels(manifest, by_split)]
-    saturated = _saturated(manifest)
-    if saturated:
-        blocks.append(saturated)
-    blocks.append(_normalisation(manifest))
+    blocks += [_saturated(manifest), _causes(manifest), _normalisation(manifest)]
     return "\n\n".join(block for block in blocks if block)
 
 
@@ -161,6 +160,20 @@ def _saturated(manifest: Mapping[str, Any]) -> str:
         "saturated: pixels for which the formula of a method has no finite answer, so that a rule of the "
         f"method stands in ({', '.join(named)}; spadmnist methods NAME tells the rule)."
     )
+
+
+def _causes(manifest: Mapping[str, Any]) -> str:
+    """Share of the detections that each cause has, by level."""
+    if not {"tr", "str", "qis"} & set(manifest["config"]["recording"]["readouts"]) or "causes" not in manifest:
+        return ""
+    names = manifest["causes"]
+    rows = []
+    for level in manifest["levels"]:
+        facts = _summed(list(manifest["statistics"][level["text"]].values()))
+        total = sum(facts["causes"].values())
+        rows.append([level["text"], *(_percent(_ratio(facts["causes"][name], total)) for name in names)])
+    readout = "TR" if "tr" in manifest["config"]["recording"]["readouts"] else "the frames"
+    return f"causes: what made the detections of {readout}\n{_aligned(['level', *names], rows)}"
 
 
 def _normalisation(manifest: Mapping[str, Any]) -> str:
@@ -246,6 +259,7 @@ class _Shown:
     counts: detections of TR; first: s, time of the first one, infinite without one.
     bits: first frame of QIS; ones: sum of its frames.
     waited: s until the first detection of STR, or to the frame's end, mean over frames of `frame_time` s.
+    tally: first frame of the readout `counts`.
     """
 
     originals: np.ndarray
@@ -255,6 +269,7 @@ class _Shown:
     bits: np.ndarray | None = None
     ones: np.ndarray | None = None
     waited: np.ndarray | None = None
+    tally: np.ndarray | None = None
     frame_time: float = 0.0
 
     @staticmethod
@@ -263,7 +278,7 @@ class _Shown:
             values = [getattr(single, name) for single in singles]
             return None if values[0] is None else np.stack(values)
 
-        names = ("originals", "counts", "first", "bits", "ones", "waited")
+        names = ("originals", "counts", "first", "bits", "ones", "waited", "tally")
         stacks = {name: together(name) for name in names}
         fluxes = {method: np.stack([one.fluxes[method] for one in singles]) for method in singles[0].fluxes}
         return _Shown(fluxes=fluxes, frame_time=singles[0].frame_time, **stacks)
@@ -337,6 +352,8 @@ def _show_one(part: Part, index: int, medians: Mapping[str, float | None]) -> _S
             readouts["ones"] = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int64).reshape(part.shape)
         if "str" in part.readouts:
             readouts["waited"] = _mean_wait(frames).reshape(part.shape)
+    if "counts" in part.readouts:
+        readouts["tally"] = part.counts[index][..., 0, :, :]
     fluxes = {}
     for method, median in medians.items():
         fluxes[method] = part.reconstruction[method][index] / np.float32(median or 1)
@@ -425,6 +442,8 @@ def _cells_of(shown: _Shown, times: tuple[float, float] | None) -> list[_Cell]:
         caption = f"white: {units.show(shortest, 's')}" if shortest < none else "no detection"
         subtitle = f"mean wait, black: {units.show(none, 's')}"
         cells.append(_Cell("STR, first arrival", subtitle, _grey(none - shown.waited)[0], caption))
+    if shown.tally is not None:
+        cells.append(_Cell("counts, first frame", "detections of a count frame", *_grey(shown.tally)))
     for name, flux in shown.fluxes.items():
         method = reconstruct.find(name)
         needs = " ".join(method.readouts()).upper()

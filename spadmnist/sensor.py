@@ -22,7 +22,7 @@ from .effects.tdc import Tdc
 from .errors import EffectError, InputError, SpadError
 from .events import Children, Events, Layout
 from .plugins import blame, settle, source_file
-from .readout import Frames, Recorded, no_detection, summarised, unsigned_for
+from .readout import Frames, Recorded, counts_type, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
 
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
@@ -186,8 +186,8 @@ class Sensor:
         """Simulate images.
 
         photons: (images, pixels of the layout) photons/s on each pixel's active area (a colour image is one image a
-        channel); streams: of the same images; readouts: of `tr`, `str`, `qis`. Where `block` is more than 1 the
-        images are whole blocks. staged: take the staged line even where the fused one would serve. causes: say of
+        channel); streams: of the same images; readouts: of `tr`, `str`, `qis`, `counts`. Where `block` is more than 1
+        the images are whole blocks. staged: take the staged line even where the fused one would serve. causes: say of
         every event what made it (`Events.cause`, `Events.parent`); it changes no event.
 
         Raises EffectError where an effect's own code fails or returns what it must not.
@@ -198,7 +198,9 @@ class Sensor:
             raise ValueError(
                 f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
             )
-        if self.is_paper_line and not staged and not causes and (self.tick > 0 or set(readouts) == {"qis"}):
+        stamped = bool({"tr", "str"} & set(readouts))
+        counter = "counts" in readouts and conditions.counting == "counter"
+        if self.is_paper_line and not (staged or causes or counter or (stamped and self.tick == 0)):
             return self._fused(photons, conditions, streams, readouts)
         step = self.block
         if step == 1:
@@ -233,7 +235,7 @@ class Sensor:
         tick = self.tick
         none = no_detection(conditions.frame_time, tick) if tick > 0 else 1
         stamped = unsigned_for(conditions.exposure / tick, "TR stamps") if tick > 0 else np.uint32
-        framed = "str" in readouts or "qis" in readouts
+        framed = bool({"str", "qis", "counts"} & set(readouts))
         ticks, offsets, counts, span, bits, first, first_offsets, ones, waited = kernels.paper_line(
             np.ascontiguousarray(rate),
             conditions.exposure,
@@ -261,7 +263,10 @@ class Sensor:
             stamps = Events(None, first_offsets, pixels, first, tick) if "str" in readouts else None
             frames = Frames(bits, stamps, conditions.frames, conditions.frame_time, pixels)
             waits = waited if "str" in readouts else None
-            recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waits)
+            tally = self._summed(bits, conditions) if "counts" in readouts else None
+            if not {"str", "qis"} & set(readouts):
+                return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, tally=tally)
+            recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waits, tally)
         return recorded
 
     def _staged(
@@ -275,19 +280,51 @@ class Sensor:
         pixels = photons.shape[1]
         events = self._gate(self._arrivals(photons, conditions, streams, causes), conditions)
         candidates, parents = self._family(events, conditions, streams, causes)
-        tr, frames = None, None
-        if "tr" in readouts:
+        tr, frames, tally = None, None, None
+        counter = "counts" in readouts and conditions.counting == "counter"
+        if "tr" in readouts or counter:
             detected = self._fired(candidates, parents, conditions, streams, frames=False)
             detected.end = conditions.exposure
+        if counter:
+            tally = self._counted(detected, conditions)
+        if "tr" in readouts:
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
                     if hasattr(effect, "apply"):
                         detected = self._apply(effect, detected, streams)
             tr = self._narrow(detected, conditions.exposure, "TR stamps")
-        if "str" in readouts or "qis" in readouts:
+        if {"str", "qis"} & set(readouts) or ("counts" in readouts and not counter):
             detected = self._fired(candidates, parents, conditions, streams, frames=True)
             frames = self._frames(detected, conditions, streams, "str" in readouts)
-        return summarised(pixels, tr, frames)
+            if "counts" in readouts and not counter:
+                tally = self._summed(frames.bits, conditions)
+            if not {"str", "qis"} & set(readouts):
+                frames = None
+        return summarised(pixels, tr, frames, tally)
+
+    def _summed(self, bits: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """(rows, count frames) sums of binary frames."""
+        most = conditions.largest_count
+        out = np.empty((len(bits), conditions.count_frames), counts_type(most))
+        kernels.sums_of_frames(bits, most, out)
+        return self._limited(out)
+
+    def _counted(self, events: Events, conditions: Conditions) -> np.ndarray:
+        """(rows, frames) what a counter in each pixel has at the end of each frame."""
+        most = conditions.largest_count
+        out = np.zeros((len(events.offsets) - 1, conditions.frames), counts_type(most))
+        clock = conditions.frame_time, conditions.frame_period
+        kernels.counts_in_frames(events.times, events.offsets, *clock, most, out)
+        return self._limited(out)
+
+    def _limited(self, counts: np.ndarray) -> np.ndarray:
+        for effect in self.at("readout"):
+            if hasattr(effect, "limit"):
+                after = self._call(effect, "limit", counts)
+                if not isinstance(after, np.ndarray) or (after.shape, after.dtype) != (counts.shape, counts.dtype):
+                    raise _wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}")
+                counts = after
+        return counts
 
     def _arrivals(self, photons: np.ndarray, conditions: Conditions, streams: Streams, causes: bool) -> Events:
         """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""

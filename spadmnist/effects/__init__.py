@@ -62,6 +62,8 @@ class Conditions:
     """How a recording is made; every hook on rates and times gets it.
 
     exposure, frame_time, frame_period: s; frames: their number; wavelength: m, None where no light falls on the sensor.
+    bits: of the readout `counts`, 0 without it; counting: what a count is, the sum of 2^bits - 1 binary `frames`, or a
+    `counter` in each frame, which stops at 2^bits - 1.
     """
 
     exposure: float
@@ -69,6 +71,18 @@ class Conditions:
     frame_time: float
     frame_period: float
     wavelength: float | None
+    bits: int = 0
+    counting: str = "frames"
+
+    @property
+    def largest_count(self) -> int:
+        """The largest value of the readout `counts`."""
+        return (1 << self.bits) - 1
+
+    @property
+    def count_frames(self) -> int:
+        """How many frames the readout `counts` has."""
+        return self.frames if self.counting == "counter" else self.frames // max(1, self.largest_count)
 
     @property
     def dark(self) -> bool:

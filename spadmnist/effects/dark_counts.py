@@ -13,6 +13,8 @@ class DarkCounts(Effect, stage="dark"):
     Source: Suonsivu et al., Alg. 1 lines 10-12; typical 1-1000 Hz (Table 1).
     """
 
+    cause = "dark"
+
     rate = parameter(
         100.0,
         "Hz",
