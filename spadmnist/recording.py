@@ -1,0 +1,175 @@
+"""Recording: what a sensor handed out in one capture, simulated or measured, with the conditions it was made under.
+
+Simulated and measured data are the same type, so that no statistic can know which it looks at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from . import kernels
+from .effects import Conditions
+from .events import Events, Layout
+from .readout import Recorded, no_detection
+
+MODALITIES = ("tr", "str", "qis", "counts")
+_CHUNK = 16 * 2**20  # bytes of frames that are looked at together
+
+
+@dataclass(frozen=True)
+class Light:
+    """What fell on the sensor during a capture.
+
+    wavelength: m; level: irradiance in W/m^2 or lux, as `kind_of_level` ("irradiance", "lux") says, None where it is
+    not known. relative_uncertainty: standard deviation of the light's calibration, common to all captures;
+    own_uncertainty: the capture's own part. Both relative, 1. A dark capture has no wavelength.
+    """
+
+    wavelength: float | None = None
+    level: float | None = None
+    kind_of_level: str = "irradiance"
+    relative_uncertainty: float = 0.0
+    own_uncertainty: float = 0.0
+
+    @property
+    def dark(self) -> bool:
+        """No light falls on the sensor."""
+        return self.wavelength is None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One entry of a measurement: how it was made.
+
+    id: its name; modality: "tr", "str", "qis" or "counts"; conditions: exposure, frames, wavelength (SI).
+    mean: detections per pixel over the capture where that alone is known.
+    """
+
+    id: str
+    modality: str
+    light: Light
+    conditions: Conditions
+    mean: float | None = None
+
+
+class FrameSource(Protocol):
+    """Frames on disk or in memory, read in pieces."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(frames, rows, bytes per row) where bits are packed (QIS), otherwise (frames, rows, columns)."""
+        ...
+
+    def __getitem__(self, part: slice) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Data of one capture.
+
+    TR: events, one row per pixel. Frames: QIS packed along the columns, most significant bit first, (frames, rows,
+    ceil(columns / 8)) uint8; STR (frames, rows, columns) unsigned ticks since the start of the frame, `none` where
+    there is no detection; counts (frames, rows, columns) unsigned. tick: s, of the stamps, None where they are seconds.
+    dead_time: s, what the sensor's description states (its median), so that statistics know where to look; it is the
+    same for data and model.
+    """
+
+    capture: Capture
+    layout: Layout
+    events: Events | None = None
+    frames: FrameSource | None = None
+    tick: float | None = None
+    dead_time: float = 0.0
+    _kept: dict[str, object] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def modality(self) -> str:
+        return self.capture.modality
+
+    @property
+    def conditions(self) -> Conditions:
+        return self.capture.conditions
+
+    @property
+    def pixels(self) -> int:
+        return self.layout.pixels
+
+    @property
+    def none(self) -> int:
+        """The stamp that means 'no detection' (STR)."""
+        return no_detection(self.conditions.frame_time, self.tick or 1.0)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of this readout (count frames for `counts`)."""
+        return 0 if self.frames is None else self.frames.shape[0]
+
+    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """(number of the first frame, frames) piece by piece, so that a large capture never lies in memory whole."""
+        assert self.frames is not None
+        size = int(np.prod(self.frames.shape[1:])) * (1 if self.modality == "qis" else 4)
+        step = max(8, _CHUNK // max(1, size))
+        for start in range(0, self.n_frames, step):
+            yield start, np.asarray(self.frames[start : min(start + step, self.n_frames)])
+
+    def bits(self) -> Iterator[tuple[int, np.ndarray]]:
+        """(number of the first frame, (frames, rows, ceil(columns / 8)) uint8): which pixels have a detection.
+
+        For QIS and STR, and for counts (at least one).
+        """
+        for start, part in self.chunks():
+            if self.modality == "qis":
+                yield start, part
+            else:
+                yield start, np.packbits(part < self.none if self.modality == "str" else part > 0, axis=2)
+
+    @property
+    def totals(self) -> np.ndarray:
+        """(pixels,) detections of each pixel (counts of all frames for `counts`)."""
+        if "totals" not in self._kept:
+            self._kept["totals"] = self._totals()
+        return self._kept["totals"]  # type: ignore[return-value]
+
+    def _totals(self) -> np.ndarray:
+        if self.events is not None:
+            return np.asarray(self.events.counts)
+        out = np.zeros(self.pixels, np.int64)
+        if self.modality == "counts":
+            for _, part in self.chunks():
+                out += part.reshape(len(part), -1).sum(axis=0, dtype=np.int64)
+            return out
+        for _, packed in self.bits():
+            kernels.column_sums(np.ascontiguousarray(packed), self.layout.columns, out)
+        return out
+
+    def named(self, capture: Capture) -> Recording:
+        """The same data under another entry."""
+        return replace(self, capture=capture)
+
+
+def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, dead_time: float) -> Recording:
+    """One simulated image as the recording of a capture. recorded: with the readout that the capture asks for."""
+    one = recorded.images(image, image + 1)
+    if capture.modality == "tr":
+        assert one.tr is not None
+        return Recording(capture, layout, one.tr, None, one.tr.tick, dead_time)
+    rows, columns = layout.shape
+    if capture.modality == "counts":
+        assert one.tally is not None
+        return Recording(capture, layout, None, one.tally.T.reshape(-1, rows, columns), None, dead_time)
+    assert one.frames is not None
+    if capture.modality == "qis":
+        packed = kernels.frames_first(one.frames.bits, one.frames.frames, rows, columns)
+        return Recording(capture, layout, None, packed, None, dead_time)
+    first = one.frames.first
+    assert first is not None
+    if first.tick is None or first.ticks is None:
+        raise ValueError("STR without a converter cannot be a recording: stamps are whole ticks")
+    none = no_detection(capture.conditions.frame_time, first.tick)
+    stamps = np.full((layout.pixels, one.frames.frames), none, np.uint32)
+    stamps[np.unpackbits(one.frames.bits, axis=1, count=one.frames.frames).view(bool)] = first.ticks
+    return Recording(capture, layout, None, stamps.T.reshape(-1, rows, columns), first.tick, dead_time)

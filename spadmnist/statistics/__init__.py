@@ -1,0 +1,64 @@
+"""Statistics: what a recording is reduced to before it is compared with a model. A file in this folder is found by
+itself; a family of statistics stands in one file.
+
+A statistic turns a `Recording` into a `Summary`: numbers in a unit (its cells), each with the law it follows if
+nothing but the model is at work, and words for where each one looks. It cannot know whether the recording is measured
+or simulated, and it does not know the model: expectations and scatter come from recordings that the model makes, which
+are reduced in the same way (`spadmnist.criticism.compare`). Cells should not depend on the light level more than they
+must, for the level is not known exactly: what is left of it is taken out by regression on the total of the capture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ..plugins import Plugin, Registry, parameter
+from ..recording import Recording
+
+__all__ = ["LAWS", "Recording", "Statistic", "Summary", "parameter"]
+
+LAWS = ("poisson", "normal", "exponential", "exact")
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a statistic found in one recording.
+
+    values: (cells,) float64. law: how each cell scatters under the model. "poisson": counts; "normal": about its mean,
+    with a spread that the model's recordings show; "exponential": positive, its mean as large as its spread (a power
+    spectrum); "exact": it must be what the model's recordings have, always.
+    scale: (cells,) relative size of the spread of "normal" cells where it is known, for example 1/sqrt(n): then one
+    factor for all is learnt from the model's recordings, otherwise one for each cell.
+    where: cell -> what it looks at, "side neighbours, 0 to 1 ns". size: (cell, measured, expected) -> the difference in
+    physical units, as text, and as a number relative to the detections or to the rate (for `--tolerance`).
+    axis: what a picture has on its horizontal axis: (cells,) and its label; shape: (rows, columns) where the cells are a
+    map of the array.
+    """
+
+    values: np.ndarray
+    law: str
+    where: Callable[[int], str]
+    size: Callable[[int, float, float], tuple[str, float]]
+    scale: np.ndarray | None = None
+    axis: np.ndarray | None = None
+    label: str = ""
+    log: bool = False
+    shape: tuple[int, int] | None = None
+
+
+class Statistic(Plugin, abstract=True):
+    """Base of every statistic."""
+
+    registry: ClassVar[Registry] = Registry("statistic")
+    modalities: ClassVar[tuple[str, ...]] = ()  # of "tr", "str", "qis", "counts"
+    unit: ClassVar[str] = "1"  # of its values
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """The summary of a recording, or None where it has nothing to say of it. The number of cells depends on the
+        capture (its conditions and layout) alone, never on the data.
+        """
+        raise NotImplementedError
