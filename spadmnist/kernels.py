@@ -865,6 +865,58 @@ def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
 
 
 @_jit
+def column_sums(packed, columns, out):
+    """Add to out (rows * columns,) how often each pixel has a detection.
+
+    packed: (frames, rows, ceil(columns / 8)) uint8, most significant bit first.
+    """
+    frames, rows, width = packed.shape
+    # eight counters of a byte each in one word: 255 frames before one could overflow
+    spread = np.empty(256, np.uint64)
+    for byte in range(256):
+        word = np.uint64(0)
+        for bit in range(8):
+            word |= np.uint64((byte >> (7 - bit)) & 1) << np.uint64(8 * bit)
+        spread[byte] = word
+    word = np.empty(width, np.uint64)
+    for row in range(rows):
+        for start in range(0, frames, 255):
+            word[:] = np.uint64(0)
+            for f in range(start, min(frames, start + 255)):
+                for j in range(width):
+                    word[j] += spread[packed[f, row, j]]
+            for column in range(columns):
+                shift = np.uint64(8 * (column & 7))
+                out[row * columns + column] += np.int64((word[column >> 3] >> shift) & np.uint64(255))
+
+
+@_jit
+def frames_first(bits, frames, rows, columns):
+    """Turn bits pixel by pixel (rows * columns, ceil(frames / 8)) into frames (frames, rows, ceil(columns / 8))."""
+    width = (columns + 7) // 8
+    out = np.zeros((frames, rows, width), np.uint8)
+    for row in range(rows):
+        for j in range(width):
+            # 8 pixels x 8 frames at a time: a block of 64 bits turned over
+            for byte in range(bits.shape[1]):
+                block = np.uint64(0)
+                for p in range(8):
+                    column = 8 * j + p
+                    if column < columns:
+                        block |= np.uint64(bits[row * columns + column, byte]) << np.uint64(56 - 8 * p)
+                if block:
+                    t = (block ^ (block >> np.uint64(7))) & np.uint64(0x00AA00AA00AA00AA)
+                    block ^= t ^ (t << np.uint64(7))
+                    t = (block ^ (block >> np.uint64(14))) & np.uint64(0x0000CCCC0000CCCC)
+                    block ^= t ^ (t << np.uint64(14))
+                    t = (block ^ (block >> np.uint64(28))) & np.uint64(0x00000000F0F0F0F0)
+                    block ^= t ^ (t << np.uint64(28))
+                    for f in range(min(8, frames - 8 * byte)):
+                        out[8 * byte + f, row, j] = np.uint8((block >> np.uint64(56 - 8 * f)) & np.uint64(255))
+    return out
+
+
+@_jit
 def first_of_frames(times, offsets, frames, frame_time, frame_period):
     """Which events (events,) bool are the first of their row in a frame; the others `frame_readout` leaves out."""
     kept = np.zeros(times.size, np.bool_)

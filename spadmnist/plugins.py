@@ -27,7 +27,7 @@ import numpy as np
 from . import units
 from .errors import EffectError, InputError, did_you_mean
 
-PLACES = ("spadmnist.effects", "spadmnist.reconstruct")  # a package with a file each, or a module
+PLACES = ("spadmnist.effects", "spadmnist.reconstruct", "spadmnist.statistics")  # packages or modules
 ENTRY_POINTS = "spadmnist.plugins"
 PER = ("", "pixel", "row", "column", "code")  # what a parameter may have a value for each of
 

@@ -34,9 +34,9 @@ class Summary:
     scale: (cells,) relative size of the spread of "normal" cells where it is known, for example 1/sqrt(n): then one
     factor for all is learnt from the model's recordings, otherwise one for each cell.
     where: cell -> what it looks at, "side neighbours, 0 to 1 ns". size: (cell, measured, expected) -> the difference in
-    physical units, as text, and as a number relative to the detections or to the rate (for `--tolerance`).
-    axis: what a picture has on its horizontal axis: (cells,) and its label; shape: (rows, columns) where the cells are a
-    map of the array.
+    physical units, as text, and as a share of the detections or of the rate (for `--tolerance`).
+    axis: (cells,) what a picture has on its horizontal axis, and its label; log: on a logarithmic scale. shape: (rows,
+    columns) where the cells are a map of the array.
     """
 
     values: np.ndarray
