@@ -1,0 +1,27 @@
+"""Counters that are full."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import Chip, Effect, parameter
+
+
+class CountSaturation(Effect, stage="readout"):
+    """The counter of a pixel stays at its largest number, 2^bits - 1, however many more events a frame has.
+
+    Acts on the counts of frames, the same under both rules, and on no stream of stamps. It is no sum of binary frames,
+    whose counts never pile up at the top.
+    Source: counters of 1-12 bit; no published number.
+    """
+
+    counted = True
+
+    bits = parameter(8.0, "", "length of the counter", bounds=(1, 32), search=(1, 16))
+
+    def made(self, chip: Chip) -> None:
+        if self.bits != int(self.bits):
+            raise ValueError(f"bits is a whole number, not {self.bits:g}")
+
+    def limit(self, counts: np.ndarray) -> np.ndarray:
+        return np.minimum(counts, min(2 ** int(self.bits) - 1, np.iinfo(counts.dtype).max))

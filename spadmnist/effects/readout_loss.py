@@ -1,0 +1,127 @@
+"""Loss on a shared readout bus."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import kernels
+from ..events import Events
+from . import Chip, Conditions, Effect, parameter
+
+
+class ReadoutLoss(Effect, stage="readout"):
+    """All pixels share one bus, which takes a fixed time for each event; what finds its queue full is lost.
+
+    Events arrive at their stamps; those with equal stamps in the order of the pixels. The bus serves one at a time, in
+    the order of arrival. At most `queue` events are in the system, the one in service included: an event that arrives
+    while there are so many is lost, and one whose service ends at that very moment has left. The bus is empty when an
+    exposure begins, and stamps do not change. Acts on TR streams, the same under both rules.
+    Source: arbiters of event-driven arrays, for example 333 million events/s for 16 pixels (Aguenounon et al. 2021);
+    ceilings from 1e6 to 1e9 events/s for an array. The finite queue is a plain model, no published number.
+    """
+
+    counted = True
+
+    service_time = parameter(
+        10e-9,
+        "s",
+        "time for which an event occupies the bus",
+        symbol="t_bus",
+        bounds=(0, None),
+        off=0.0,
+        search=(1e-9, 1e-6),
+    )
+    queue = parameter(16.0, "", "events that wait or are in service, at most", bounds=(1, None), search=(1, 256))
+
+    def made(self, chip: Chip) -> None:
+        if self.queue != int(self.queue):
+            raise ValueError(f"queue is a whole number of events, not {self.queue:g}")
+
+    def apply(self, events: Events, rng: object) -> Events:
+        if self.service_time == 0:
+            return events
+        return events.keep(_served(events.times, events.image_offsets, self.service_time, self.queue))
+
+    def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """A bound, nearly reached far below and far above the bus's capacity: an image has no more than that."""
+        with np.errstate(divide="ignore"):
+            return rate * np.minimum(1.0, 1 / (self.service_time * rate.sum(axis=-1, keepdims=True)))
+
+
+_CROWD = 64  # events in a bucket from which on it is sorted by merging
+
+
+@kernels.jit
+def _served(times, image_offsets, service_time, queue):  # type: ignore[no-untyped-def]
+    """(events,) bool: does the bus take it?"""
+    taken = np.empty(times.size, np.bool_)
+    most = 1
+    for i in range(image_offsets.size - 1):
+        most = max(most, image_offsets[i + 1] - image_offsets[i])
+    room = np.int64(min(queue, np.float64(most)))
+    leaves = np.empty(room)  # when each of the last ones taken leaves, in a ring
+    begin = np.empty(most + 2, np.int32)
+    index = np.empty(most, np.int32)
+    moment = np.empty(most)
+    for i in range(image_offsets.size - 1):
+        start = image_offsets[i]
+        count = image_offsets[i + 1] - start
+        _in_time_order(times[start : start + count], begin, index, moment)
+        leaves[:] = -np.inf
+        last = -np.inf
+        oldest = 0
+        for j in range(count):
+            time = moment[j]
+            free = leaves[oldest] <= time
+            taken[start + index[j]] = free
+            if free:
+                last = max(time, last) + service_time
+                leaves[oldest] = last
+                oldest += 1
+                if oldest == room:
+                    oldest = 0
+    return taken
+
+
+@kernels.jit
+def _in_time_order(times, begin, index, moment):  # type: ignore[no-untyped-def]
+    """Fill `moment` with the times in ascending order and `index` with their places, equal ones in theirs.
+
+    A bucket for each event: times spread over an exposure fill them evenly, and little is left to sort within one.
+    """
+    count = times.size
+    if count == 0:
+        return
+    low = times.min()
+    extent = times.max() - low
+    scale = (count - 1) / extent if extent > 1e-30 else 0.0  # no division that overflows
+    begin[: count + 1] = 0
+    for j in range(count):
+        begin[int((times[j] - low) * scale) + 1] += 1
+    for b in range(count):
+        begin[b + 1] += begin[b]
+    for j in range(count):
+        b = int((times[j] - low) * scale)
+        moment[begin[b]] = times[j]
+        index[begin[b]] = j
+        begin[b] += 1
+    # now begin[b] is where bucket b ends
+    start = 0
+    for b in range(count):
+        end = begin[b]
+        if end - start > _CROWD:
+            order = np.argsort(moment[start:end], kind="mergesort")
+            moment[start:end] = moment[start:end][order]
+            index[start:end] = index[start:end][order]
+        start = end
+    for j in range(1, count):
+        time = moment[j]
+        if moment[j - 1] > time:
+            from_where = index[j]
+            place = j
+            while place > 0 and moment[place - 1] > time:
+                moment[place] = moment[place - 1]
+                index[place] = index[place - 1]
+                place -= 1
+            moment[place] = time
+            index[place] = from_where
