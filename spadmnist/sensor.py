@@ -162,8 +162,15 @@ class Sensor:
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
-        rate, _ = self.rates(photons, conditions)
-        for stage in ("arrival", "gate", "correlated"):
+        rate, light = self.rates(photons, conditions)
+        dark = rate - light
+        for effect in self.at("arrival"):
+            if effect.acts_on == "light":
+                light = effect.expected_rate(light, conditions)
+            else:
+                dark = effect.expected_rate(dark, conditions)
+        rate = light + dark if self.at("arrival") else rate
+        for stage in ("gate", "correlated"):
             for effect in self.at(stage):
                 rate = effect.expected_rate(rate, conditions)
         candidates = rate
@@ -204,11 +211,11 @@ class Sensor:
             return self._fused(photons, conditions, streams, readouts)
         step = self.block
         if step == 1:
-            brightest = float(photons.mean()) * conditions.exposure * photons.shape[1]
+            brightest = float(photons.mean()) * conditions.exposure * photons.shape[1] if photons.size else 0.0
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + photons.shape[1]))))
         parts = [
             self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts, causes)
-            for i in range(0, len(photons), step)
+            for i in range(0, max(1, len(photons)), step)
         ]
         return Recorded.join(parts)
 

@@ -27,7 +27,7 @@ the class, a `spadmnist.streams.Draws` for the counter-based kernels.
 
 Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
 it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
-of its mean.
+of its mean; an arrival effect gets the part of the rate that it acts on.
 """
 
 from __future__ import annotations

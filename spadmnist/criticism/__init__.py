@@ -1,0 +1,1 @@
+"""Criticism: a model set beside measurements. Where does it fail, and by how much?"""

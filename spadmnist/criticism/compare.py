@@ -1,0 +1,490 @@
+"""Compare: where does a model fail, and by how much?
+
+Every statistic of every capture is a check. The model simulates each capture many times (`nulls`), at a light level
+that gives as many detections as were measured; a check fails where the measured summary lies outside the model's own
+scatter, p-values being corrected for the number of checks (Holm), so that a right model is called wrong once in a
+hundred comparisons. Whether those light levels themselves agree with what the measurement states, within its
+uncertainty, is a check of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from scipy import stats
+
+from .. import __version__, light, plugins
+from ..errors import InputError
+from ..measurement import Measurement
+from ..recording import Capture, Recording, of_image
+from ..sensor import Sensor
+from ..statistics import Statistic, Summary
+from ..streams import BLOCK, Streams
+from .nulls import Judgement, Null, learn
+
+FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
+REPLICATES = 96
+_SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
+_LEAST_SPREAD = 0.01
+_EVENTS_AT_ONCE = 4_000_000
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """A quantity that the measurement does not know exactly: its fitted value, 95 % interval, and pull in sigmas."""
+
+    capture: str | None
+    name: str
+    value: float
+    low: float
+    high: float
+    pull: float
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statistic of one capture. misfit: mean squared standardized residual, 1 being the model's own.
+
+    summary, judgement: what was measured and what the model expects, for pictures; None for checks of totals.
+    """
+
+    statistic: str
+    capture: str | None
+    misfit: float
+    p_value: float
+    where: str
+    size: str
+    relative: float
+    passes: bool = True
+    material: bool = False
+    summary: Summary | None = field(default=None, repr=False)
+    judgement: Judgement | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What `compare` found. verdict: "adequate" or "fails"."""
+
+    sensor: str
+    measurement: str
+    verdict: str
+    misfit: float
+    misfit_null_95: float
+    nuisances: tuple[Nuisance, ...]
+    checks: tuple[Check, ...]
+    replicates: int
+    tolerance: float | None = None
+    false_alarm_rate: float = FALSE_ALARM
+
+    @property
+    def failing(self) -> list[Check]:
+        """Failing checks, the clearest first."""
+        return sorted((c for c in self.checks if not c.passes), key=lambda c: (c.p_value, -c.misfit))
+
+    def as_data(self) -> dict[str, Any]:
+        """As `formats`: spadmnist-comparison/1."""
+        return {
+            "format": "spadmnist-comparison/1",
+            "verdict": self.verdict,
+            "misfit": _plain(self.misfit),
+            "misfit_null_95": _plain(self.misfit_null_95),
+            "false_alarm_rate": self.false_alarm_rate,
+            "replicates": self.replicates,
+            "tolerance": self.tolerance,
+            "nuisances": [
+                {
+                    "capture": n.capture,
+                    "name": n.name,
+                    **{k: _plain(getattr(n, k)) for k in ("value", "low", "high", "pull")},
+                }
+                for n in self.nuisances
+            ],
+            "checks": [
+                {
+                    "statistic": c.statistic,
+                    "capture": c.capture,
+                    "misfit": _plain(c.misfit),
+                    "p_value": _plain(c.p_value),
+                    "passes": c.passes,
+                    "material": c.material,
+                    "where": c.where,
+                    "size": c.size,
+                }
+                for c in self.checks
+            ],
+        }
+
+
+def _plain(value: float) -> float:
+    """A finite number of six digits."""
+    return float(f"{min(max(value, -1e300), 1e300):.6g}")
+
+
+# --- the model's recordings -------------------------------------------------------------------------------------
+
+
+def statistics_for(modality: str) -> list[Statistic]:
+    """Every registered statistic that makes sense for a modality."""
+    kinds = [Statistic.registry.find(name) for name in Statistic.registry]
+    return [kind() for kind in kinds if modality in kind.modalities]
+
+
+def photons_at(sensor: Sensor, capture: Capture) -> float | None:
+    """Photons/s on the active area of a pixel as the capture states its light; 0 in the dark, None where it is free."""
+    if capture.light.dark:
+        return 0.0
+    if capture.light.level is None:
+        return None
+    assert capture.light.wavelength is not None
+    convert = light.photons_from_lux if capture.light.kind_of_level == "lux" else light.photons_from_irradiance
+    return convert(capture.light.level, sensor.layout.active_area, capture.light.wavelength)
+
+
+def simulated(
+    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
+) -> Iterator[Recording]:
+    """The capture as the model makes it, once for each of `numbers`, with so many photons/s (n,) on each pixel.
+
+    Yielded one by one; only a few of them are in memory together.
+    """
+    expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
+    step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
+    if sensor.block > 1:
+        step = -(-step // BLOCK) * BLOCK
+    dead_time = sensor.nominal_dead_time
+    for start in range(0, len(numbers), step):
+        some = slice(start, start + step)
+        streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
+        shone = np.repeat(photons[some, None], sensor.layout.pixels, axis=1)
+        made = sensor.expose(shone, capture.conditions, streams, (capture.modality,))
+        for i in range(len(shone)):
+            yield of_image(made, i, capture, sensor.layout, dead_time)
+
+
+@dataclass(frozen=True)
+class CaptureNull:
+    """What the model makes of a capture: the null of each statistic, and how the total follows the light.
+
+    factors, totals: (recordings,) light relative to `photons` and the detections it gave; shapes: cells by statistic.
+    """
+
+    photons: float
+    factors: np.ndarray
+    totals: np.ndarray
+    nulls: Mapping[str, Null]
+
+    def factor_of(self, total: float) -> tuple[float, float, float]:
+        """(light relative to `photons` that gives this total, its standard error, elasticity of the total)."""
+        x, y = np.log(self.factors), np.log(np.maximum(self.totals, 0.5))
+        if np.ptp(x) == 0:
+            return 1.0, 0.0, 0.0
+        coefficients = np.polyfit(x, y, 2)
+        scatter = float(np.std(y - np.polyval(coefficients, x), ddof=3))
+        target = math.log(max(total, 0.5))
+        found = 0.0
+        for _ in range(50):
+            slope = 2 * coefficients[0] * found + coefficients[1]
+            if not slope > 1e-3:
+                break
+            found += float(np.clip((target - np.polyval(coefficients, found)) / slope, -0.5, 0.5))
+        slope = float(2 * coefficients[0] * found + coefficients[1])
+        error = scatter * math.sqrt(1 + 3 / len(x)) / max(slope, 1e-3)
+        return math.exp(found), error, slope
+
+
+def _reduced(
+    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
+) -> tuple[list[int], dict[str, list[Summary]]]:
+    """(totals, summaries by statistic) of some of the model's recordings: the task of a worker."""
+    totals: list[int] = []
+    found: dict[str, list[Summary]] = {}
+    known = statistics_for(capture.modality)
+    for recording in simulated(sensor, capture, photons, numbers, seed):
+        totals.append(int(recording.totals.sum()))
+        for statistic in known:
+            summary = reduced(statistic, recording)
+            if summary is not None:
+                # words and functions stay behind: numbers travel between processes
+                bare = Summary(summary.values, summary.law, str, _no_size, summary.scale)
+                found.setdefault(statistic.name, []).append(bare)
+    return totals, found
+
+
+def _no_size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+    return "", 0.0
+
+
+def reduced(statistic: Statistic, recording: Recording) -> Summary | None:
+    """A statistic's summary; an error of a user's own statistic is told with its file and line."""
+    try:
+        return statistic.reduce(recording)
+    except Exception as error:
+        if type(statistic).__module__.startswith(f"{__package__.partition('.')[0]}."):
+            raise
+        raise plugins.blame(statistic, error) from error
+
+
+def model_of(
+    sensor: Sensor,
+    capture: Capture,
+    total: float,
+    seed: int,
+    replicates: int,
+    parallel: Parallel,
+    told: Callable[[int], None],
+) -> CaptureNull:
+    """Simulate a capture many times and learn its nulls. total: detections measured, to find a level that is free."""
+    stated = photons_at(sensor, capture)
+    centre = 0.0 if capture.light.dark else _level_for(sensor, capture, total, stated)
+    half = 0.0
+    if not capture.light.dark:
+        uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
+        half = max(_LEAST_SPREAD, _SPREAD * uncertainty)
+        if stated is not None and abs(math.log(centre / stated)) < half:
+            centre = stated  # the same recordings then serve every measurement of this model
+        else:
+            half = _LEAST_SPREAD * 3
+    numbers = np.arange(replicates, dtype=np.uint64)
+    # evenly spread, in an order that has nothing to do with the number
+    order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
+    factors = np.exp(half * np.linspace(-1, 1, replicates)[order])
+    tasks = np.array_split(numbers, max(1, min(replicates // 4, 24))) if sensor.block == 1 else [numbers]
+    results = parallel(
+        delayed(_reduced)(sensor, capture, centre * factors[part.astype(int)], part, seed) for part in tasks
+    )
+    totals: list[int] = []
+    found: dict[str, list[Summary]] = {}
+    for part_totals, part_found in results:
+        totals += part_totals
+        for name, summaries in part_found.items():
+            found.setdefault(name, []).extend(summaries)
+        told(len(part_totals))
+    array = np.array(totals, float)
+    nulls = {name: learn(summaries, array) for name, summaries in found.items() if len(summaries) == replicates}
+    return CaptureNull(centre, factors, array, nulls)
+
+
+def _level_for(sensor: Sensor, capture: Capture, total: float, stated: float | None) -> float:
+    """Photons/s on a pixel at which the model's closed form expects so many detections."""
+    low, high = 1e-3, 1e12
+    framed = capture.modality != "tr"
+
+    def detections(photons: float) -> float:
+        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), photons), capture.conditions)
+        if not framed:
+            return float(recorded.sum())
+        frames = capture.conditions.frames
+        live = capture.conditions.frame_time / capture.conditions.frame_period
+        return float((frames * -np.expm1(-candidates * live / frames)).sum())
+
+    for _ in range(100):
+        middle = math.sqrt(low * high)
+        if detections(middle) < total:
+            low = middle
+        else:
+            high = middle
+    found = math.sqrt(low * high)
+    if not 1e-2 < found < 1e11:
+        return stated or 1.0
+    return found
+
+
+# --- the comparison ---------------------------------------------------------------------------------------------
+
+
+def compare(
+    sensor: Sensor,
+    measurement: Measurement,
+    seed: int = 0,
+    tolerance: float | None = None,
+    jobs: int = 2,
+    replicates: int = REPLICATES,
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """Set a model beside a measurement.
+
+    tolerance: a failing check whose size is smaller passes, as not material. progress: told (what, share done).
+    Raises InputError where sensor and measurement do not belong together.
+    """
+    sensor = sensor.settled()
+    if (sensor.layout.rows, sensor.layout.columns) != (measurement.rows, measurement.columns):
+        raise InputError(
+            f"the sensor has {sensor.layout.rows} x {sensor.layout.columns} pixels, the measurement "
+            f"{measurement.rows} x {measurement.columns}; they must be the same array"
+        )
+    say = progress or (lambda what, share: None)
+    checks: list[Check] = []
+    judged: list[tuple[Judgement, Null]] = []
+    levels: list[tuple[Capture, float, float, float]] = []  # capture, log of the light factor, its error, elasticity
+    captures = list(measurement.captures)
+    with Parallel(n_jobs=jobs, return_as="generator") as parallel:
+        for k, capture in enumerate(captures):
+            say(capture.id, k / len(captures))
+            recording = None if capture.mean is not None else measurement.recording(capture.id, sensor)
+            total = float(capture.mean * sensor.layout.pixels) if recording is None else float(recording.totals.sum())
+            seen = capture if recording is None else recording.capture
+            shown = _Share(say, capture.id, k, len(captures), replicates)
+            made = model_of(sensor, seen, total, seed, replicates, parallel, shown)
+            checks += _level_checks(sensor, capture, total, made, levels)
+            if recording is None:
+                continue
+            for statistic in statistics_for(recording.modality):
+                null = made.nulls.get(statistic.name)
+                summary = reduced(statistic, recording)
+                if null is None or summary is None:
+                    continue
+                judgement = null.judge(summary.values, total)
+                text, relative = summary.size(
+                    judgement.worst,
+                    float(summary.values[judgement.worst]),
+                    float(judgement.expected[judgement.worst]),
+                )
+                checks.append(
+                    Check(
+                        statistic.name,
+                        capture.id,
+                        judgement.misfit,
+                        judgement.p_value,
+                        summary.where(judgement.worst),
+                        text,
+                        relative,
+                        summary=summary,
+                        judgement=judgement,
+                    )
+                )
+                if null.law != "exact":
+                    judged.append((judgement, null))
+    nuisances, common = _light(levels, captures)
+    checks += common
+    checks = _verdicts(checks, tolerance)
+    misfit = float(np.mean([j.misfit for j, _ in judged])) if judged else 1.0
+    own = np.mean([null.own / max(null.own.mean(), 1e-30) for _, null in judged], axis=0) if judged else np.ones(1)
+    verdict = "adequate" if all(c.passes for c in checks) else "fails"
+    return Comparison(
+        sensor.name,
+        measurement.name,
+        verdict,
+        misfit,
+        float(np.quantile(own, 0.95)),
+        tuple(nuisances),
+        tuple(checks),
+        replicates,
+        tolerance,
+    )
+
+
+@dataclass
+class _Share:
+    """Says how far the model's recordings are."""
+
+    say: Callable[[str, float], None]
+    capture: str
+    number: int
+    captures: int
+    replicates: int
+    done: int = 0
+
+    def __call__(self, more: int) -> None:
+        self.done += more
+        self.say(self.capture, (self.number + self.done / self.replicates) / self.captures)
+
+
+def _level_checks(
+    sensor: Sensor,
+    capture: Capture,
+    total: float,
+    made: CaptureNull,
+    levels: list[tuple[Capture, float, float, float]],
+) -> list[Check]:
+    """The total of a dark capture against the model's; that of a lit one becomes a light level."""
+    if capture.light.dark:
+        mean, scatter = float(made.totals.mean()), float(made.totals.std(ddof=1))
+        scatter = max(scatter, math.sqrt(max(mean, 1.0)) * 0.5) * math.sqrt(1 + 1 / len(made.totals))
+        z = (total - mean) / scatter
+        per = sensor.layout.pixels * capture.conditions.exposure
+        size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
+        relative = (total - mean) / max(mean, 1.0)
+        return [
+            Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels, no light", size, relative)
+        ]
+    stated = photons_at(sensor, capture)
+    factor, error, elasticity = made.factor_of(total)
+    if stated is not None and elasticity > 0.01:
+        levels.append((capture, math.log(factor * made.photons / stated), error, elasticity))
+    return []
+
+
+def _light(
+    levels: Sequence[tuple[Capture, float, float, float]], captures: Sequence[Capture]
+) -> tuple[list[Nuisance], list[Check]]:
+    """The common light factor, each capture's own, and whether they are as the measurement states."""
+    if not levels:
+        return [], []
+    x = np.array([log for _, log, _, _ in levels])
+    error = np.array([math.hypot(e, c.light.own_uncertainty) for c, _, e, _ in levels])
+    error = np.maximum(error, 1e-6)
+    common = max(c.light.relative_uncertainty for c, _, _, _ in levels)
+    weight = 1 / error**2
+    total_weight = weight.sum() + (1 / common**2 if common > 0 else 1e18)
+    best = float((weight * x).sum() / total_weight)
+    spread = 1 / math.sqrt(total_weight)
+    own = float((weight * x).sum() / weight.sum())  # what the captures alone say
+    own_error = 1 / math.sqrt(weight.sum())
+    pull = own / math.hypot(common, own_error)
+    name = "light"
+    nuisances = [
+        Nuisance(None, name, math.exp(best), math.exp(best - 1.96 * spread), math.exp(best + 1.96 * spread), pull)
+    ]
+    checks = [
+        Check(
+            name,
+            None,
+            pull**2,
+            float(2 * stats.norm.sf(abs(pull))),
+            "all lit captures",
+            f"light {math.expm1(own):+.2%} of what is stated, uncertain by {common:.2%}",
+            math.expm1(own),
+        )
+    ]
+    for (capture, log, _, elasticity), e in zip(levels, error, strict=True):
+        # the others tell the common factor; without others, or where it is known, what is stated does
+        others = weight.sum() - 1 / e**2 + (1 / common**2 if common > 0 else 1e18)
+        mean = (float((weight * x).sum()) - log / e**2) / others
+        z = (log - mean) / math.sqrt(e**2 + 1 / others)
+        if capture.light.own_uncertainty > 0:
+            nuisances.append(
+                Nuisance(capture.id, name, math.exp(log), math.exp(log - 1.96 * e), math.exp(log + 1.96 * e), z)
+            )
+        change = math.expm1((log - mean) * elasticity)
+        size = f"{change:+.2%} detections beside the other captures"
+        checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))
+    return nuisances, checks
+
+
+def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
+    """Holm's correction: which checks fail so clearly that a right model shows one only once in a hundred times."""
+    order = sorted(range(len(checks)), key=lambda i: checks[i].p_value)
+    failing: set[int] = set()
+    for rank, i in enumerate(order):
+        if checks[i].p_value > FALSE_ALARM / (len(checks) - rank):
+            break
+        failing.add(i)
+    out = []
+    for i, check in enumerate(checks):
+        material = i in failing and (tolerance is None or not abs(check.relative) < tolerance)
+        out.append(replace(check, passes=not material, material=material))
+    return out
+
+
+def canonical(comparison: Comparison) -> str:
+    """The answer as JSON."""
+    return json.dumps(comparison.as_data(), indent=1, allow_nan=False)
+
+
+__all__ = ["Check", "Comparison", "Nuisance", "__version__", "compare"]

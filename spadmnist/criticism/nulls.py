@@ -1,0 +1,203 @@
+"""What the statistics of a capture look like if the model is right: learnt from recordings that the model makes.
+
+A capture is simulated many times, its light level varied a little about the stated one. Every statistic is reduced for
+each of these recordings, and every cell is regressed on the capture's total number of detections: what the light level
+does to a cell is thereby told apart from what is wrong with the model. `Null.judge` then says how far a measured
+summary is from the model's own scatter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special, stats
+
+from ..statistics import Summary
+
+_LEAST = 1e-300
+_MANY = 200.0  # expected counts beyond which a root of them is normal enough
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How a measured summary lies within the model's scatter.
+
+    p_value: of the check; misfit: mean squared standardized residual relative to the model's own (1 is usual);
+    residuals, expected: (cells,); worst: the cell that stands out most.
+    """
+
+    p_value: float
+    misfit: float
+    residuals: np.ndarray
+    expected: np.ndarray
+    spread: np.ndarray
+    worst: int
+
+
+@dataclass(frozen=True)
+class Null:
+    """A statistic of one capture under the model.
+
+    law: as in `Summary`. coefficients: (terms, cells) of the regression on x, the total relative to `middle`, less 1;
+    inverse: (terms, terms) of its normal equations; spread: (cells,) standard deviation of "normal" cells; factor:
+    by which standardized residuals are too large, learnt from the model; tail: the same for the largest ones;
+    own: (recordings,) mean squared standardized residual of each of the model's recordings.
+    """
+
+    law: str
+    middle: float
+    coefficients: np.ndarray
+    inverse: np.ndarray
+    spread: np.ndarray
+    recordings: int
+    factor: float
+    tail: float
+    own: np.ndarray
+    scaled: bool
+
+    def expected(self, total: float) -> tuple[np.ndarray, float]:
+        """((cells,) expectation for a capture with so many detections, relative variance of that expectation)."""
+        terms = _terms(np.array([total / self.middle - 1.0]), len(self.coefficients))
+        return (terms @ self.coefficients)[0], float((terms @ self.inverse @ terms.T)[0, 0])
+
+    def judge(self, values: np.ndarray, total: float) -> Judgement:
+        """values: (cells,) of the measured summary; total: detections of its capture."""
+        expected, leverage = self.expected(total)
+        z = _standardized(self.law, values, expected, self.spread, leverage, self.recordings, self.scaled)
+        z = z / self.factor
+        spread = self._spread(expected)
+        if self.law == "exact":
+            wrong = values != expected
+            worst = int(np.argmax(wrong))
+            p = 1e-12 if wrong.any() else 1.0
+            return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
+        square = float(np.mean(z**2))
+        mean, variance = float(self.own.mean()), float(self.own.var(ddof=1))
+        shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
+        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape)) if mean > 0 else 1.0
+        worst = int(np.argmax(np.abs(z)))
+        largest = abs(float(z[worst])) / self.tail
+        p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
+        p = min(1.0, 2 * min(p_sum, p_cell))
+        return Judgement(p, square / mean if mean > 0 else 0.0, z, expected, spread, worst)
+
+    def _spread(self, expected: np.ndarray) -> np.ndarray:
+        if self.law == "poisson":
+            return np.asarray(np.sqrt(np.maximum(expected, 0.0)) * self.factor)
+        if self.law == "exponential":
+            return np.maximum(expected, 0.0)
+        return self.spread * self.factor
+
+
+def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
+    """The null of one statistic from the summaries of the model's recordings, and their totals of detections."""
+    first = summaries[0]
+    law = first.law
+    values = np.stack([s.values for s in summaries]).astype(np.float64)
+    n = len(values)
+    middle = float(totals.mean()) or 1.0
+    x = totals / middle - 1.0
+    terms = 1 if law in ("exponential", "exact") or np.ptp(x) == 0 else (3 if np.std(x) > 0.01 else 2)
+    design = _terms(x, terms)
+    inverse = np.linalg.pinv(design.T @ design)
+    if law == "exact":
+        coefficients = np.median(values, axis=0, keepdims=True)
+        own = np.zeros(n)
+        return Null(law, middle, coefficients, inverse, np.zeros(values.shape[1]), n, 1.0, 1.0, own, False)
+    coefficients = inverse @ design.T @ values
+    fitted = design @ coefficients
+    hat = np.einsum("ij,jk,ik->i", design, inverse, design)
+    scaled = first.scale is not None
+    scale = np.ones(values.shape[1])
+    if law == "normal":
+        freedom = max(1, n - terms)
+        sample = np.sqrt(np.sum((values - fitted) ** 2, axis=0) / freedom)
+        if scaled:
+            scale = np.mean([s.scale for s in summaries if s.scale is not None], axis=0)
+        else:
+            # a cell that never moves has no scatter to compare with: the rounding of its value stands in
+            scale = np.maximum(sample, 1e-12 * np.maximum(np.abs(fitted).max(axis=0), 1e-30))
+    # the residuals of a fit to these very recordings are too small: by the share of each that it explains
+    z = _standardized(law, values, fitted, scale, -hat[:, None], n, scaled)
+    factor = 1.0
+    if law == "poisson":
+        factor = max(float(np.sqrt(np.mean(z**2))), 1.0)  # scores of few counts spread less than 1, in their middle
+    elif law == "normal" and scaled:
+        factor = max(float(np.sqrt(np.mean(z**2))), 1e-6)
+    z = z / factor
+    return Null(law, middle, coefficients, inverse, scale, n, factor, _tail(z), np.mean(z**2, axis=1), scaled)
+
+
+def _terms(x: np.ndarray, terms: int) -> np.ndarray:
+    return np.stack([x**k for k in range(terms)], axis=1)
+
+
+def _tail(z: np.ndarray) -> float:
+    """By how much the largest residuals exceed those of a normal law; never less than 1."""
+    magnitudes = np.sort(np.abs(z).ravel())
+    beyond = 10 if magnitudes.size > 1000 else 3
+    place = magnitudes[-beyond]
+    usual = -float(special.ndtri((beyond - 0.5) / magnitudes.size / 2))
+    return max(1.0, float(place) / usual)
+
+
+def _standardized(
+    law: str,
+    values: np.ndarray,
+    expected: np.ndarray,
+    spread: np.ndarray,
+    leverage: float | np.ndarray,
+    recordings: int,
+    scaled: bool,
+) -> np.ndarray:
+    """Residuals that are standard normal if the model is right.
+
+    leverage: relative variance of the expectation (negative: of residuals of the fit itself).
+    """
+    widened = np.sqrt(np.maximum(1.0 + np.asarray(leverage), 1e-6))
+    if law == "poisson":
+        return np.asarray(_poisson_scores(values, np.maximum(expected, 1e-9)) / widened)
+    if law == "exponential":
+        ratio = values / np.maximum(expected, _LEAST)
+        # the mean is known from so many recordings only
+        log_tail = -recordings * np.log1p(np.maximum(ratio, 0.0) / recordings)
+        return _score_of_tail(log_tail)
+    z = (values - expected) / np.where(spread > 0, spread, 1.0) / widened
+    if scaled:
+        return np.asarray(z)
+    return _normal_of_t(z, max(1, recordings - 3))
+
+
+def _poisson_scores(n: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Normal scores of counts: of the mid-p value where they are few, Anscombe's residual where they are many."""
+    n, mean = np.broadcast_arrays(np.asarray(n, np.float64), np.asarray(mean, np.float64))
+    # E n^(2/3) is m^(2/3) - m^(-1/3) / 9, its spread 2/3 m^(1/6)
+    root = np.cbrt(mean)
+    out = np.array(1.5 * (np.cbrt(np.maximum(n, 0.0)) ** 2 - root**2 + 1 / (9 * root)) / np.sqrt(root))
+    few = mean <= _MANY
+    if few.any():
+        k, m = np.maximum(n[few], 0.0), mean[few]
+        half = 0.5 * np.exp(special.xlogy(k, m) - m - special.gammaln(k + 1))
+        above = special.gammainc(k + 1, m) + half
+        below = special.gammaincc(k + 1, m) - half
+        tail = np.clip(np.where(k > m, above, below), _LEAST, 1.0)
+        out[few] = np.where(k > m, -1.0, 1.0) * special.ndtri(tail)
+    return out
+
+
+def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:
+    """The normal score whose upper tail has this logarithm."""
+    tail = np.exp(np.maximum(log_tail, -700.0))
+    score = -special.ndtri(np.clip(tail, _LEAST, 1 - 1e-16))
+    # further out than a double can say: the tail of the normal law itself
+    far = log_tail < -690
+    return np.asarray(np.where(far, np.sqrt(np.maximum(-2 * log_tail - math.log(2 * math.pi), 0.0)), score))
+
+
+def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
+    """The normal score of a Student's t."""
+    log_tail = stats.t.logsf(np.abs(t), freedom)
+    return np.asarray(np.sign(t) * _score_of_tail(log_tail))

@@ -1,0 +1,62 @@
+"""Flicker."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .. import kernels
+from . import Conditions, Effect, parameter
+
+# Taylor coefficients of the sine, x^1 to x^19: up to a quarter of a turn the rest is below 1e-15
+_TERMS = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(10))
+
+
+@kernels.jit
+def sine(times: np.ndarray, frequency: float, start: float) -> np.ndarray:
+    """The sine of `frequency * times + start` turns: the same bits on every machine, from -1 to 1."""
+    out = np.empty(times.size)
+    for i in range(times.size):
+        turns = frequency * times[i] + start
+        turns -= np.floor(turns + 0.5)
+        # a sine looks the same backwards from its peak: only the first quarter of a turn is left
+        x = 2 * math.pi * (0.25 - abs(0.25 - abs(turns)))
+        square = x * x
+        value = _TERMS[9]
+        for k in range(8, -1, -1):
+            value = _TERMS[k] + square * value
+        out[i] = math.copysign(min(x * value, 1.0), turns)
+    return out
+
+
+class Flicker(Effect, stage="arrival"):
+    """The lamp's light swings at the frequency of the mains, or of its driver.
+
+    The light is multiplied by 1 + amplitude sin(2 pi frequency t + phase), t from the start of the exposure, under
+    both rules and for all pixels alike; dark counts stay as they are.
+    Source: no published number; 100 or 120 Hz and their harmonics, 0.01-10 %, are realistic.
+    """
+
+    amplitude = parameter(
+        0.05, "", "largest relative change of the light", symbol="m", bounds=(0, 1), off=0.0, search=(1e-4, 0.5)
+    )
+    frequency = parameter(
+        100.0, "Hz", "frequency of the light's power", symbol="f", bounds=(0, None), open_bounds=True, search=(10, 1e5)
+    )
+    phase = parameter(0.0, "rad", "phase at the start of the exposure", search=(0, 2 * math.pi))
+
+    def factor(self, t: np.ndarray, conditions: Conditions) -> np.ndarray:
+        start = math.fmod(self.phase / (2 * math.pi), 1.0)
+        return 1 + self.amplitude * sine(np.ravel(t), self.frequency, start).reshape(np.shape(t))
+
+    def maximum(self, conditions: Conditions) -> float:
+        return 1 + self.amplitude
+
+    def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        if conditions.dark:
+            return rate
+        swept = 2 * math.pi * self.frequency * conditions.exposure
+        # (cos(phase) - cos(phase + swept)) / swept, which must not lose its digits in slow flicker
+        mean = math.sin(self.phase + swept / 2) * math.sin(swept / 2) / (swept / 2)
+        return rate * (1 + self.amplitude * mean)
