@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from .. import kernels
-from ..events import Children, Events
-from ..streams import Draws
-from . import Conditions, Effect, parameter
+from . import parameter
+from ._traps import Traps
 
 
-class Afterpulsing(Effect, stage="correlated"):
+class Afterpulsing(Traps):
     """An avalanche fills a trap, and its release fires the same pixel again: at most once, an exponential time later.
 
     The time counts from the end of the dead time. By the paper's rules every event may have an afterpulse, also one
@@ -19,7 +15,19 @@ class Afterpulsing(Effect, stage="correlated"):
     of ns.
     """
 
-    counted = True
+    cause = "afterpulse"
+    moves = (
+        "intervals",
+        "edge",
+        "fano",
+        "level",
+        "dark_level",
+        "autocorrelation",
+        "first",
+        "frames_lag",
+        "map",
+        "saturation",
+    )
 
     probability = parameter(
         0.005,
@@ -40,16 +48,3 @@ class Afterpulsing(Effect, stage="correlated"):
         open_bounds=True,
         search=(5e-9, 500e-9),
     )
-
-    def hazards(self, pixels: int) -> np.ndarray:
-        """(pixels,) -ln(1 - probability): the same chance, as the stretch of a unit-rate Poisson process."""
-        with np.errstate(divide="ignore"):
-            return np.ascontiguousarray(np.broadcast_to(-np.log1p(-np.asarray(self.probability)), pixels))
-
-    def spawn(self, events: Events, rng: Draws) -> Children:
-        # the release alone: the sensor, which knows the rules, adds the dead time
-        parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key)
-        return Children(parent, self.lifetime * delay)
-
-    def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        return rate * (1 + np.asarray(self.probability))

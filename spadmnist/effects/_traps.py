@@ -1,0 +1,36 @@
+"""The law of a population of traps, which the afterpulsing effects share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .. import kernels
+from ..events import Children, Events
+from ..streams import Draws
+from . import Conditions, Effect
+
+
+class Traps(Effect, stage="correlated", abstract=True):
+    """An avalanche fills a trap, and its release fires the same pixel again: at most once, an exponential time later.
+
+    A subclass declares the parameters `probability` and `lifetime`.
+    """
+
+    counted = True
+    probability: Any
+    lifetime: Any
+
+    def hazards(self, pixels: int) -> np.ndarray:
+        """(pixels,) -ln(1 - probability): the same chance, as the stretch of a unit-rate Poisson process."""
+        with np.errstate(divide="ignore"):
+            return np.ascontiguousarray(np.broadcast_to(-np.log1p(-np.asarray(self.probability)), pixels))
+
+    def spawn(self, events: Events, rng: Draws) -> Children:
+        """The releases alone: the sensor, which knows the rules, adds the dead time."""
+        parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key)
+        return Children(parent, self.lifetime * delay)
+
+    def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        return rate * (1 + np.asarray(self.probability))
