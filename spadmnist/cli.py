@@ -115,6 +115,7 @@ def _json(command: F) -> F:
     default=None,
     help="Another format than the config's.",
 )
+@click.option("--causes", is_flag=True, help="Store of every detection what made it, and its parent.")
 @click.option("--dry-run", is_flag=True, help="Say photons, bytes, memory and time, and make nothing.")
 @_plugin
 @_json
@@ -127,14 +128,15 @@ def generate(
     jobs: int | None,
     seed: int | None,
     format_: str | None,
+    causes: bool,
     dry_run: bool,
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
     """Make the dataset that CONFIG describes.
 
-    The same command again goes on where an interrupted run stopped. --lux, --limit and --jobs change no drawn value
-    of what is made.
+    The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
+    drawn value of what is made.
 
     \b
     spadmnist generate configs/quick.yaml -o out
@@ -145,7 +147,7 @@ def generate(
     from . import factory
 
     _load(plugin_files)
-    experiment = configs.read(config, seed, format_, levels, limit)
+    experiment = configs.read(config, seed, format_, levels, limit, causes)
     for note in experiment.notes:
         _say(f"Note: {note}")
     images = experiment.load_images(images_dir)
@@ -322,42 +324,80 @@ def _count(damage: Any) -> str:
     return f"{n} file is" if n == 1 else f"{n} files are"
 
 
-def _reference(kind: str) -> click.Command:
-    """`effects` and `methods`: the reference, made from the classes."""
+@cli.command("effects", short_help="List physical effects, describe one, or begin one of your own.")
+@click.argument("name", required=False)
+@click.option("--new", metavar="NAME", help="Write NAME.py here: an effect of your own that works at once.")
+@click.option("--stage", metavar="STAGE", help="For --new: where on the line it acts.  [default: dark]")
+@_plugin
+@_json
+def effects_(
+    name: str | None, new: str | None, stage: str | None, plugin_files: tuple[Path, ...], as_json: bool
+) -> None:
+    """List the physical effects, or describe NAME with its parameters and the YAML to paste.
 
-    @click.argument("name", required=False)
-    @_plugin
-    @_json
-    def command(name: str | None, plugin_files: tuple[Path, ...], as_json: bool) -> None:
-        from . import reference
-        from .errors import SpadError
+    \b
+    spadmnist effects
+    spadmnist effects dead_time
+    spadmnist effects --new light_leak --stage dark
+    """
+    from .errors import SpadError
 
-        _load(plugin_files)
-        try:
-            if as_json:
-                click.echo(json.dumps(reference.as_data(kind, name)))
-            elif kind == "effect":
-                click.echo(reference.effect_page(name) if name else reference.effect_list())
-            else:
-                click.echo(reference.method_page(name) if name else reference.method_list())
-        except KeyError as error:
-            raise SpadError(str(error.args[0])) from None
-
-    command.__doc__ = {
-        "effect": "List the physical effects, or describe NAME with its parameters and the YAML to paste.\n\n"
-        "\b\nspadmnist effects\nspadmnist effects dead_time",
-        "method": "List the flux reconstructions, or describe NAME with its formula and rules.\n\n"
-        "\b\nspadmnist methods\nspadmnist methods inter_photon",
-    }[kind]
-    short = {
-        "effect": "List physical effects, or describe one.",
-        "method": "List flux reconstructions, or describe one.",
-    }
-    return cli.command(f"{kind}s", short_help=short[kind])(command)
+    if new is None and stage is not None:
+        raise SpadError("--stage: belongs to --new NAME, which writes an effect of that stage")
+    if new is not None and name is not None:
+        raise SpadError(f"--new: give either {name}, to read about it, or --new {new}")
+    _load(plugin_files)
+    if new is not None:
+        _begin_effect(new, stage, as_json)
+    else:
+        _describe("effect", name, as_json)
 
 
-_reference("effect")
-_reference("method")
+def _begin_effect(name: str, stage: str | None, as_json: bool) -> None:
+    from . import plugins, reference, template
+    from .effects import Effect
+
+    path = template.create(name, template.STAGE if stage is None else stage, Path())
+    plugins.load_file(path)
+    cls = Effect.registry.find(name)
+    if as_json:
+        click.echo(json.dumps({"file": str(path), "effect": name, "stage": cls.stage}))
+        return
+    lines = [f"Wrote {path}, an effect of the stage {cls.stage} that works as it is. Read about it:", ""]
+    lines += [f"  spadmnist effects {name} --plugin {path}", "", "Put it into a config, say my.yaml:", ""]
+    lines += [*reference.effect_yaml(cls), "", "And simulate it:", ""]
+    click.echo("\n".join([*lines, f"  spadmnist generate my.yaml -o out --plugin {path}"]))
+
+
+@cli.command("methods", short_help="List flux reconstructions, or describe one.")
+@click.argument("name", required=False)
+@_plugin
+@_json
+def methods_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool) -> None:
+    """List the flux reconstructions, or describe NAME with its formula and rules.
+
+    \b
+    spadmnist methods
+    spadmnist methods inter_photon
+    """
+    _load(plugin_files)
+    _describe("method", name, as_json)
+
+
+def _describe(kind: str, name: str | None, as_json: bool) -> None:
+    """The reference, made from the classes."""
+    from . import reference
+    from .errors import SpadError
+
+    try:
+        if as_json:
+            click.echo(json.dumps(reference.as_data(kind, name)))
+        elif kind == "effect":
+            click.echo(reference.effect_page(name) if name else reference.effect_list())
+        else:
+            click.echo(reference.method_page(name) if name else reference.method_list())
+    except KeyError as error:
+        raise SpadError(str(error.args[0])) from None
 
 
 # --- talking to people --------------------------------------------------------------------------------------------

@@ -7,11 +7,17 @@ allowed and what to do.
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from . import document, plugins, reconstruct, units
@@ -76,7 +82,9 @@ class _Recording(_Model):
     frames: int | None = Field(default=None, ge=1, le=10**9)
     frame_time: _Time | None = None
     frame_period: _Time | None = None
-    readouts: list[Literal["tr", "str", "qis"]] = Field(default=["tr", "str", "qis"], min_length=1)
+    readouts: list[Literal["tr", "str", "qis", "counts"]] = Field(default=["tr", "str", "qis"], min_length=1)
+    bits: int | None = Field(default=None, ge=1, le=12)
+    counting: Literal["frames", "counter"] | None = None
 
 
 class _Output(_Model):
@@ -84,8 +92,9 @@ class _Output(_Model):
 
 
 class _Layout(_Model):
-    rows: int = Field(ge=1, le=100_000)
-    columns: int = Field(ge=1, le=100_000)
+    rows: int | None = Field(default=None, ge=1, le=100_000)
+    columns: int | None = Field(default=None, ge=1, le=100_000)
+    positions: str | None = None  # a CSV file, instead of rows and columns
     pixel_area: _Area
     fill_factor: _Share = Field(default="1")  # type: ignore[assignment]
 
@@ -102,13 +111,14 @@ class _Sensor(_Model):
 _SECTIONS: dict[str, Any] = {
     "seed": Annotated[int, Field(ge=0, lt=2**63)],
     "limit": Annotated[int | None, Field(ge=1)],
+    "causes": bool,
     "scene": _Scene,
     "recording": _Recording,
     "reconstruct": list[str] | None,
     "sensor": Any,
     "output": _Output,
 }
-_DEFAULTS: dict[str, Any] = {"limit": None, "reconstruct": None, "output": {}}
+_DEFAULTS: dict[str, Any] = {"limit": None, "causes": False, "reconstruct": None, "output": {}}
 _EXAMPLES = {
     "seed": "seed: 1",
     "scene": "scene: {images: {source: digits}, lux: [5 mlux]}",
@@ -130,13 +140,14 @@ def read(
     format: str | None = None,
     lux: tuple[str, ...] = (),
     limit: int | None = None,
+    causes: bool = False,
 ) -> Experiment:
-    """Read a config file. `seed`, `format`, `lux` and `limit` stand in for the file's own.
+    """Read a config file. `seed`, `format`, `lux`, `limit` and `causes` stand in for the file's own.
 
     Raises ConfigError with every mistake, or InputError where a file cannot be read.
     """
     source = document.read(Path(path))
-    experiment = build(source, Path(path).resolve().parent, seed, format, limit)
+    experiment = build(source, Path(path).resolve().parent, seed, format, limit, causes)
     if lux:
         try:
             return experiment.with_levels(lux)
@@ -151,6 +162,7 @@ def build(
     seed: int | None = None,
     format: str | None = None,
     limit: int | None = None,
+    causes: bool = False,
 ) -> Experiment:
     """An Experiment from a parsed config; see `read`. base: the folder that relative paths in it refer to."""
     if not isinstance(source.value, Mapping):
@@ -162,6 +174,8 @@ def build(
         raw["seed"] = seed
     if limit is not None:
         raw["limit"] = limit
+    if causes:
+        raw["causes"] = True
     if format is not None:
         output = raw.get("output")
         raw["output"] = {**(output if isinstance(output, Mapping) else {}), "format": format}
@@ -179,7 +193,7 @@ def build(
         raise ConfigError(reader.problems)
     return Experiment(
         name=source.name,
-        resolved=_resolved(parts, described, methods, conditions),
+        resolved=_resolved(parts, described, methods, conditions, base),
         base=base,
         seed=parts["seed"],
         levels=levels,
@@ -190,6 +204,7 @@ def build(
         sensor=described.settled,
         format=parts["output"].format,
         limit=parts["limit"],
+        causes=parts["causes"],
         notes=_notes(scene, source),
     )
 
@@ -299,7 +314,7 @@ class _Reader:
         for i, name in enumerate(r.readouts):
             if name in r.readouts[:i]:
                 self.say(("recording", "readouts", i), f"{name} is listed twice; keep one")
-        framed = sorted({"str", "qis"} & set(r.readouts))
+        framed = sorted({"str", "qis", "counts"} & set(r.readouts))
         if framed and (r.frames is None or r.frame_time is None):
             missing = " and ".join(k for k in ("frames", "frame_time") if getattr(r, k) is None)
             self.say(("recording",), f"{' and '.join(framed)} need{'s' * (len(framed) == 1)} {missing}")
@@ -320,7 +335,31 @@ class _Reader:
                 f"{units.show(frames * period, 's')}, but {r.exposure} is written; correct one of them",
             )
         wavelength = float(scene.wavelength) if scene else None
-        return Conditions(float(r.exposure), frames, frame_time, period, wavelength)
+        bits, counting = self.counting(r, frames)
+        return Conditions(float(r.exposure), frames, frame_time, period, wavelength, bits, counting)
+
+    def counting(self, recording: _Recording, frames: int) -> tuple[int, str]:
+        """(bits, what a count is) of the readout `counts`."""
+        r = recording
+        counting = r.counting or "frames"
+        if "counts" not in r.readouts:
+            for name in ("bits", "counting"):
+                if getattr(r, name) is not None:
+                    self.say(("recording", name), "belongs to the readout counts; add it to readouts, or take this out")
+            return 0, counting
+        if r.bits is None:
+            self.say(("recording",), "counts needs bits; write for example bits: 8")
+            return 0, counting
+        each = 2**r.bits - 1
+        if counting == "frames" and frames % each:
+            below, above = frames // each * each, -(-frames // each) * each
+            near = " or ".join(str(n) for n in (below, above) if n)
+            self.say(
+                ("recording", "frames"),
+                f"{frames} binary frames do not fill whole count frames of {r.bits} bits, each the sum of {each} of "
+                f"them; take {near}, or counting: counter",
+            )
+        return r.bits, counting
 
     def methods(self, names: list[str] | None, recording: _Recording) -> tuple[str, ...]:
         recorded = set(recording.readouts)
@@ -370,6 +409,7 @@ class _Reader:
             self.say(path, f"{_brief(raw)} is neither a sensor file's name nor a sensor")
             return None
         model = self.valid(_Sensor, raw, path)
+        whole = self.check_array(raw.get("layout"), (*path, "layout"))
         listed = raw.get("effects")
         effects = []
         for name, values in listed.items() if isinstance(listed, Mapping) else ():
@@ -377,13 +417,40 @@ class _Reader:
             if effect is not None:
                 effects.append(effect)
                 self.check_tables(effect, wavelength, (*path, "effects", name))
-        if model is None:
+        layout = self.layout(model.layout, (*path, "layout")) if model is not None and whole else None
+        if model is None or layout is None:
             return None
-        area, share = float(model.layout.pixel_area), float(model.layout.fill_factor)
-        layout = Layout(model.layout.rows, model.layout.columns, area, share)
         sensor = Sensor(layout, in_order(effects), model.rules, model.chip_seed, model.name)
         settled = self.settled(sensor, path)
         return _Described(sensor, settled, model, dict(listed or {}), self, path)
+
+    def check_array(self, raw: Any, path: Path_) -> bool:
+        """Does a layout say once where its pixels are: by rows and columns, or by positions?"""
+        if not isinstance(raw, Mapping):
+            return False
+        lacking = [name for name in ("rows", "columns") if raw.get(name) is None]
+        if raw.get("positions") is not None:
+            if len(lacking) < 2:
+                self.say(path, "positions stand instead of rows and columns; keep the one or the other")
+            return len(lacking) == 2
+        if len(lacking) == 2:
+            example = f"{_EXAMPLES['rows']}, {_EXAMPLES['columns']}, or positions: FILE.csv (x, y in um)"
+            self.say(path, f"rows is missing, and so is columns; write for example {example}")
+        elif lacking:
+            self.say(path, f"{lacking[0]} is missing; write for example {_EXAMPLES[lacking[0]]}")
+        return not lacking
+
+    def layout(self, model: _Layout, path: Path_) -> Layout | None:
+        area, share = float(model.pixel_area), float(model.fill_factor)
+        if model.positions is None:
+            assert model.rows is not None and model.columns is not None
+            return Layout(model.rows, model.columns, area, share)
+        try:
+            positions = read_positions((self.base / model.positions).resolve())
+        except InputError as error:
+            self.say((*path, "positions"), str(error))
+            return None
+        return Layout(1, len(positions), area, share, positions)
 
     def effect(self, name: Any, values: Any, path: Path_) -> Effect | None:
         try:
@@ -406,8 +473,10 @@ class _Reader:
                 )
                 continue
 
-            def problem(below: Path_, sentence: str, key: Any = key) -> None:
-                self.say((*path, key, *below), sentence)
+            meant = did_you_mean(str(raw), declared.choices)
+
+            def problem(below: Path_, sentence: str, key: Any = key, meant: str = meant) -> None:
+                self.say((*path, key, *below), f"{sentence}.{meant}" if meant else sentence)
 
             read[key] = plugins.read_value(declared, raw, self.base, problem)
         for key, declared in kind.parameters.items():
@@ -433,7 +502,13 @@ class _Reader:
                     sensor.settle(effect, key)
                 except InputError as error:
                     self.say((*path, "effects", effect.name, key), str(error))
-        return sensor.settled() if len(self.problems) == before else None
+        if len(self.problems) > before:
+            return None
+        try:
+            return sensor.settled()
+        except SpadError as error:  # of an effect that looks at what it was given, as its chip is made
+            self.say((*path, "effects"), str(error))
+            return None
 
 
 @dataclass
@@ -456,7 +531,12 @@ class _Described:
             if self.settled and self.settled.nominal_pdp(conditions.wavelength) <= 0:
                 pdp = (*self.path, "effects", "detection", "pdp")
                 self.reader.say(pdp, "is 0, so that no flux can be estimated; it must be more than 0")
-        tick = self.sensor.tick
+        try:
+            tick = (self.settled or self.sensor).tick
+        except SpadError:
+            if self.settled:
+                raise
+            return  # what keeps the sensor from being settled has been told
         if tick <= 0:
             return
         converter = self.sensor.at("timing")[-1]
@@ -530,11 +610,96 @@ def _literals(kind: Any, location: list[Any]) -> list[str]:
     return list(get_args(current))
 
 
+# --- positions ----------------------------------------------------------------------------------------------------
+
+_HEADERS = (["x", "y"], ["x(um)", "y(um)"])
+_MOST_PIXELS = 100_000
+_LARGEST_POSITIONS = 1 << 24  # bytes
+_FARTHEST = 1.0  # m
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
+
+
+def read_positions(path: Path) -> np.ndarray:
+    """(pixels, 2) m, the centres of pixels, from a CSV file of x and y in um below a line `x,y`.
+
+    Raises InputError with the line.
+    """
+    rows = csv.reader(io.StringIO(_text_of(path), newline=""), strict=True)
+    found: list[tuple[float, float]] = []
+    first_of: dict[tuple[int, int], int] = {}
+    headed = False
+    try:
+        for cells in rows:
+            place = f"{path}:{rows.line_num}"
+            if not any(cell.strip() for cell in cells):
+                continue
+            if not headed:
+                if [re.sub(r"\s", "", cell).lower() for cell in cells] not in _HEADERS:
+                    raise InputError(f"{place}: {_brief(','.join(cells))} is no header; the first line is x,y (in um)")
+                headed = True
+                continue
+            if len(cells) != 2:
+                many = f"{len(cells)} column{'s' * (len(cells) != 1)}"
+                raise InputError(f"{place}: has {many}; a line is the x and the y of one pixel, as in 23.0,-11.5")
+            x, y = (_micrometres(cell.strip(), place) for cell in cells)
+            # two pixels do not lie within a nanometre of each other
+            line = first_of.setdefault((round(x * 1e9), round(y * 1e9)), rows.line_num)
+            if line != rows.line_num:
+                raise InputError(f"{place}: the pixel of line {line} lies at the same place; keep one of the two")
+            found.append((x, y))
+            if len(found) > _MOST_PIXELS:
+                raise InputError(f"{place}: there are more than {_MOST_PIXELS} pixels; give fewer, or rows and columns")
+    except csv.Error as error:
+        raise InputError(
+            f"{path}:{rows.line_num}: is not well-formed CSV ({error}); write lines such as 23.0,-11.5"
+        ) from None
+    if not found:
+        raise InputError(f"{path}: names no pixel; write x,y in the first line, and below it a line for each pixel")
+    return np.array(found)
+
+
+def _text_of(path: Path) -> str:
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no file; positions is the name of a CSV file")
+        with open(path, "rb") as file:
+            raw = file.read(_LARGEST_POSITIONS + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; the positions of the pixels are read from there") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if len(raw) > _LARGEST_POSITIONS:
+        raise InputError(f"{path}: is larger than {_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_PIXELS} pixels")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); write a CSV file with x,y in um") from None
+
+
+def _micrometres(text: str, place: str) -> float:
+    """m; exact decimal arithmetic, so that `positions_text` comes back to the same double."""
+    if not _NUMBER.fullmatch(text) or len(text) > 60:
+        with contextlib.suppress(ValueError):
+            if not np.isfinite(float(text)):
+                raise InputError(f"{place}: {_brief(text)} is not possible; every pixel needs a finite place")
+        raise InputError(f"{place}: {_brief(text)} is not a number; write x and y in um, as in 23.0,-11.5")
+    value = float(Decimal(text).scaleb(-6)) + 0.0
+    if abs(value) > _FARTHEST:
+        raise InputError(f"{place}: {text} um is not possible; a pixel lies within {_FARTHEST:g} m of the middle")
+    return value
+
+
+def positions_text(positions: np.ndarray) -> str:
+    """The CSV file of (pixels, 2) m: the same text for the same numbers, and `read_positions` gives them back."""
+    lines = [",".join(format(Decimal(repr(float(v))).scaleb(6).normalize(), "f") for v in row) for row in positions]
+    return "\n".join(["x (um),y (um)", *lines]) + "\n"
+
+
 # --- the config with nothing left open ----------------------------------------------------------------------------
 
 
 def _resolved(
-    parts: Mapping[str, Any], described: _Described, methods: tuple[str, ...], conditions: Conditions
+    parts: Mapping[str, Any], described: _Described, methods: tuple[str, ...], conditions: Conditions, base: Path
 ) -> dict[str, Any]:
     """All defaults filled in and the sensor in place, in a fixed order; numbers stay as they were written."""
     scene, recording, model = parts["scene"], parts["recording"], described.model
@@ -544,12 +709,17 @@ def _resolved(
     for effect in described.sensor.effects:
         given = described.written.get(effect.name) or {}
         effects[effect.name] = {
-            name: given[name] if name in given else _default_text(declared)
+            name: _from(base, described.reader.base, given[name]) if name in given else _default_text(declared)
             for name, declared in effect.parameters.items()
+            if name in given or declared.default is not None
         }
+    layout: dict[str, Any] = {"rows": model.layout.rows, "columns": model.layout.columns}
+    if model.layout.positions is not None:
+        layout = {"positions": _reached(base, described.reader.base, model.layout.positions)}
     return {
         "seed": parts["seed"],
         **({"limit": parts["limit"]} if parts["limit"] is not None else {}),
+        **({"causes": True} if parts["causes"] else {}),
         "scene": {
             "images": scene.images.model_dump(exclude_none=True),
             "wavelength": scene.wavelength.text,
@@ -561,6 +731,7 @@ def _resolved(
             "frame_time": time,
             "frame_period": recording.frame_period.text if recording.frame_period else time,
             "readouts": [r for r in READOUTS if r in recording.readouts],
+            **({"bits": conditions.bits, "counting": conditions.counting} if conditions.bits else {}),
         },
         "reconstruct": list(methods),
         "sensor": {
@@ -568,8 +739,7 @@ def _resolved(
             "rules": model.rules,
             "chip_seed": model.chip_seed,
             "layout": {
-                "rows": model.layout.rows,
-                "columns": model.layout.columns,
+                **layout,
                 "pixel_area": model.layout.pixel_area.text,
                 "fill_factor": _plain(model.layout.fill_factor),
             },
@@ -584,8 +754,22 @@ def _plain(value: units.Quantity) -> Any:
     return value.text if "%" in value.text else float(value)
 
 
+def _from(base: Path, folder: Path, given: Any) -> Any:
+    """A parameter as it was written in a sensor file in `folder`; a map's file is named as from `base`."""
+    if isinstance(given, Mapping) and set(given) == {"file"}:
+        return {"file": _reached(base, folder, given["file"])}
+    return given
+
+
+def _reached(base: Path, folder: Path, file: str) -> str:
+    """A file's name, relative to `folder`, as from `base`: a sensor file may lie in another folder than its config."""
+    if Path(file).is_absolute() or folder.resolve() == base.resolve():
+        return file
+    return Path(os.path.relpath(folder.resolve() / file, base.resolve())).as_posix()
+
+
 def _default_text(declared: plugins.Parameter) -> Any:
     value = declared.default
-    if declared.unit in ("", "bool") or isinstance(value, bool):
+    if declared.unit in ("", "bool") or isinstance(value, (bool, str)):
         return value
     return units.show(value, declared.unit, 12)

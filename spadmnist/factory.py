@@ -38,6 +38,7 @@ from .images import Images
 from .reconstruct import median_of_nonzero
 from .store import ShardReader
 
+POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
 _VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
@@ -112,7 +113,7 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     return columns, {
         **attributes,
         "level": shard.level,
-        "statistics": json.dumps(dataset.statistics(recorded)),
+        "statistics": json.dumps(dataset.statistics(recorded, experiment.sensor.causes)),
     }
 
 
@@ -319,7 +320,7 @@ def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, 
                 for split, images in splits.items()
             },
         },
-        "maps": {name: hashlib.sha256(data).hexdigest() for name, data in portable(experiment)[1].items()},
+        "maps": {name: _known_by(name, data) for name, data in portable(experiment)[1].items()},
         "plugins": plugin_sources(experiment),
         "versions": versions(),
     }
@@ -340,18 +341,31 @@ def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:
 
 
 def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """(config, map files) that stand on their own: maps from files become files of the dataset."""
+    """(config, map files) that stand on their own: maps and positions from files become files of the dataset."""
     resolved = json.loads(json.dumps(experiment.resolved))
+    layout = experiment.sensor.layout
     maps: dict[str, bytes] = {}
+    if layout.positions is not None:
+        maps[POSITIONS] = config.positions_text(layout.positions).encode()
+        resolved["sensor"]["layout"]["positions"] = POSITIONS
     for name, values in resolved["sensor"]["effects"].items():
         for key, raw in values.items():
             if isinstance(raw, dict) and set(raw) == {"file"}:
                 effect = experiment.sensor.effect(name)
+                array = np.asarray(getattr(effect, key))
+                if effect is not None and effect.parameters[key].per_pixel:
+                    array = array.reshape(layout.shape)
                 buffer = io.BytesIO()
-                np.save(buffer, np.asarray(getattr(effect, key)).reshape(experiment.sensor.layout.shape))
+                np.save(buffer, array)
                 maps[f"maps/{name}.{key}.npy"] = buffer.getvalue()
                 values[key] = {"file": f"maps/{name}.{key}.npy"}
     return resolved, maps
+
+
+def _known_by(name: str, data: bytes) -> dict[str, str] | str:
+    """What a manifest keeps of a map: its digest; of the positions, which are small, also the text itself."""
+    digest = hashlib.sha256(data).hexdigest()
+    return {"sha256": digest, "text": data.decode()} if name == POSITIONS else digest
 
 
 def _difference(ours: Any, theirs: Any, path: str = "") -> list[str]:
@@ -716,6 +730,7 @@ def finish(
         "settings": settings,
         "shards": [asdict(shard) for shard in shards],
         "normalisation": normalisation,
+        **({"causes": list(experiment.sensor.causes)} if experiment.causes else {}),
         "statistics": _statistics(experiment, root, shards, wanted, files),
         "files": files,
     }

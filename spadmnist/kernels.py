@@ -488,56 +488,59 @@ def row_totals(values, offsets):
 
 @_jit
 def merge(times, offsets, extra, extra_rows):
-    """Sort further events into their rows.
+    """Sort a few further events into their rows.
 
     extra: (m,) s, ascending within a row; extra_rows: (m,) int64, ascending. What is equally late comes behind.
-    Returns (times, offsets, origin): `origin` says where each event came from, i for `times[i]` and len(times) + j
-    for `extra[j]`.
+    Returns (times, offsets, before): `before` (m,) is how many of `times` stand before each of `extra`, so that
+    extra[j] is now at before[j] + j.
     """
-    total = times.size + extra.size
-    merged = np.empty(total)
-    origin = np.empty(total, np.int64)
-    new_offsets = np.empty_like(offsets)
-    new_offsets[0] = 0
-    k = 0
+    merged = np.empty(times.size + extra.size)
+    before = np.empty(extra.size, np.int64)
+    done = 0
+    for j in range(extra.size):
+        # the first event of the row that is later
+        low = max(offsets[extra_rows[j]], done)
+        high = offsets[extra_rows[j] + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if times[middle] <= extra[j]:
+                low = middle + 1
+            else:
+                high = middle
+        for i in range(done, low):
+            merged[i + j] = times[i]
+        merged[low + j] = extra[j]
+        before[j] = low
+        done = low
+    for i in range(done, times.size):
+        merged[i + extra.size] = times[i]
+    new_offsets = offsets.copy()
     j = 0
     for row in range(offsets.size - 1):
-        i = offsets[row]
-        stop = offsets[row + 1]
         while j < extra.size and extra_rows[j] == row:
-            while i < stop and times[i] <= extra[j]:
-                merged[k] = times[i]
-                origin[k] = i
-                k += 1
-                i += 1
-            merged[k] = extra[j]
-            origin[k] = times.size + j
-            k += 1
             j += 1
-        while i < stop:
-            merged[k] = times[i]
-            origin[k] = i
-            k += 1
-            i += 1
-        new_offsets[row + 1] = k
-    return merged, new_offsets, origin
+        new_offsets[row + 1] += j
+    return merged, new_offsets, before
 
 
 @_jit
-def relinked(origin, known, order, parents):
+def relinked(known, before, order, parents):
     """Where the parents of merged children stand.
 
-    origin: of `merge`; known: how many events there were before; order: (m,) which child each of the merged `extra`
-    was; parents: (m,) of each child, i for the event i, known + c for the child c.
+    known: how many events there were; before: of `merge`; order: (m,) which child each of the merged `extra` was;
+    parents: (m,) of each child, i for the event i, known + c for the child c.
     Returns (events,) int64: the parent's place among the merged events, -1 where there is none.
     """
-    place = np.empty(origin.size, np.int64)
-    for k in range(origin.size):
-        one = origin[k]
-        place[one if one < known else known + order[one - known]] = k
-    out = np.full(origin.size, -1, np.int64)
+    place = np.empty(order.size, np.int64)
+    for j in range(order.size):
+        place[order[j]] = before[j] + j
+    out = np.full(known + order.size, -1, np.int64)
     for child in range(order.size):
-        out[place[known + child]] = place[parents[child]]
+        parent = parents[child]
+        if parent < known:
+            out[place[child]] = parent + np.searchsorted(before, parent, side="right")
+        else:
+            out[place[child]] = place[parent - known]
     return out
 
 

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from . import units
+from . import effects, units
 from .effects import STAGES, Effect
 from .plugins import Parameter, Plugin, source_file
 from .readout import READOUTS
@@ -32,9 +32,41 @@ def effect_page(name: str) -> str:
     facts = [f"stage: {cls.stage}"]
     if cls.after is not None:
         facts.append(f"comes after {cls.after}")
-    values = ", ".join(f"{key}: {_yaml(declared)}" for key, declared in cls.parameters.items())
-    yaml = ["  sensor:", "    effects:", f"      {cls.name}: {{{values}}}"]
-    return _page(cls, facts, ["In a config or a sensor file:", "", *yaml])
+    acts = [line for way in hooks(cls.stage, cls) for line in textwrap.wrap(" ".join(way), _WIDTH)]
+    law = mean_law(cls)
+    mean = textwrap.wrap(f"Mean rate behind it: {law}", _WIDTH) if law else []
+    return _page(cls, facts, ["In a config or a sensor file:", "", *effect_yaml(cls)], acts, mean)
+
+
+def effect_yaml(cls: type[Effect]) -> list[str]:
+    """What to paste into a config: the effect with its default values."""
+    listed = {key: p for key, p in cls.parameters.items() if p.required or p.default is not None}
+    values = ", ".join(f"{key}: {_yaml(declared)}" for key, declared in listed.items())
+    return ["  sensor:", "    effects:", f"      {cls.name}: {{{values}}}"]
+
+
+def hooks(stage: str, cls: type[Effect]) -> list[tuple[str, str]]:
+    """(hook, what it receives and returns): those of a stage that a class has, from the table of stages."""
+    found, current = [], ""
+    for line in (effects.__doc__ or "").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) != 3 or not line.startswith("|"):
+            continue
+        current = cells[0] or current
+        names = re.findall(r"(\w+)\(", cells[1])
+        if current == stage and all(hasattr(cls, name) for name in names):
+            colon = "" if cells[2].startswith("->") else ":"
+            found.append((cells[1].removeprefix("or ") + colon, cells[2]))
+    return found
+
+
+def mean_law(cls: type[Effect]) -> str:
+    """The closed form of the mean: what the effect's own `expected_rate` says of itself first, or ""."""
+    for owner in cls.__mro__:
+        own = vars(owner).get("expected_rate")
+        if own is not None:
+            return "" if owner is Effect else " ".join((own.__doc__ or "").split("\n\n")[0].split())
+    return ""
 
 
 def method_list() -> str:
@@ -65,20 +97,23 @@ def as_data(kind: str, name: str | None = None) -> list[dict[str, Any]] | dict[s
 def _data(cls: type[Plugin]) -> dict[str, Any]:
     out: dict[str, Any] = {"name": cls.name, "about": inspect.getdoc(cls)}
     if issubclass(cls, Effect):
-        out |= {"stage": cls.stage}
+        out |= {"stage": cls.stage, "expected_rate": mean_law(cls) or None}
     if issubclass(cls, Method):
         out |= {"readouts": list(cls.readouts()), "unit": cls.unit, "normalised": cls.normalised}
-    facts = ("unit", "about", "symbol", "default", "bounds", "off", "search", "per_pixel", "by_wavelength")
-    out["parameters"] = {key: {f: getattr(p, f) for f in facts} for key, p in cls.parameters.items()}
+    facts = ("unit", "about", "symbol", "default", "choices", "bounds", "off", "search")
+    ways = ("per", "per_pixel", "by_wavelength", "required")
+    out["parameters"] = {key: {f: getattr(p, f) for f in facts + ways} for key, p in cls.parameters.items()}
     return out
 
 
-def _page(cls: type[Plugin], facts: Sequence[str], paste: Sequence[str]) -> str:
-    """Name and facts, the file if it is a user's, docstring, parameters, YAML."""
-    head = [cls.name, "; ".join(facts)]
+def _page(
+    cls: type[Plugin], facts: Sequence[str], paste: Sequence[str], acts: Sequence[str] = (), mean: Sequence[str] = ()
+) -> str:
+    """Name, facts and hooks, the file if it is a user's, docstring, law of the mean, parameters, YAML."""
+    head = [cls.name, "; ".join(facts), *acts]
     if cls.__module__.partition(".")[0] != __package__:
         head.append(f"file: {source_file(cls)}")
-    blocks = [head, _docstring(cls), _parameters(list(cls.parameters.values())), paste]
+    blocks = [head, _docstring(cls), mean, _parameters(list(cls.parameters.values())), paste]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
@@ -108,6 +143,8 @@ def _parameters(declared: Sequence[Parameter]) -> list[str]:
 def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
     """(unit, default, allowed, off, search)."""
     unit = declared.unit or "1"
+    if declared.choices:
+        return "-", _value(declared, declared.default), declared.allowed(), _value(declared, declared.off), "-"
     if declared.unit == "bool":
         return "-", _value(declared, declared.default), "true or false", _value(declared, declared.off), "-"
     search = "-"
@@ -118,7 +155,7 @@ def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
 
 
 def _varies(declared: Parameter) -> str:
-    ways = {"pixel": declared.per_pixel, "wavelength": declared.by_wavelength}
+    ways = {declared.per: bool(declared.per), "wavelength": declared.by_wavelength}
     return " or ".join(way for way, can in ways.items() if can) or "-"
 
 
@@ -127,6 +164,8 @@ def _value(declared: Parameter, value: Any) -> str:
         return "-"
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, str):
+        return value
     return units.show(value, declared.unit, 12)
 
 
@@ -134,7 +173,7 @@ def _yaml(declared: Parameter) -> str:
     """The default as a config writes it; where there is none, something of the right form."""
     if declared.default is not None:
         return _value(declared, declared.default)
-    if declared.per_pixel:
+    if declared.per:
         return f"{{file: {declared.name}.npy}}"
     return "true" if declared.unit == "bool" else units.example(declared.unit).removesuffix(" %")
 

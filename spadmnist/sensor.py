@@ -511,11 +511,11 @@ class Sensor:
         times, rows, parents, generations, made_by = (np.concatenate(column) for column in zip(*children, strict=True))
         # what is equally late: the parent first
         order = np.lexsort((generations, times, rows))
-        merged, offsets, origin = kernels.merge(events.times, events.offsets, times[order], rows[order])
+        merged, offsets, before = kernels.merge(events.times, events.offsets, times[order], rows[order])
         out = Events(merged, offsets, events.pixels, end=conditions.exposure)
-        linked = kernels.relinked(origin, len(events), order, parents) if cascade or causes else _NOBODY
+        linked = kernels.relinked(len(events), before, order, parents) if cascade or causes else _NOBODY
         if causes and events.cause is not None:
-            out.cause = np.concatenate([events.cause, made_by[order].astype(np.uint8)])[origin]
+            out.cause = np.insert(events.cause, before, made_by[order].astype(np.uint8))
             out.parent = linked
         return out, linked if cascade else _NOBODY
 

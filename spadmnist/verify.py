@@ -21,7 +21,7 @@ from .dataset import CONFIG, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
-from .factory import Progress
+from .factory import POSITIONS, Progress
 from .images import Images
 from .store import ShardReader
 
@@ -132,7 +132,8 @@ def repair(
             f"{root}: {MANIFEST} and {CONFIG} are both lost, so that nothing says what was here; "
             "generate the dataset anew from its config, in another folder"
         )
-    experiment = _experiment(root, manifest, damage)
+    did: list[str] = []
+    experiment = _experiment(root, manifest, damage, did)
     if manifest is not None and manifest["versions"] != factory.versions():
         wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions().get(k) != v)
         raise SpadError(f"{root}: was made with {wanted}; install these versions to make the same bytes again")
@@ -146,8 +147,7 @@ def repair(
                 "give the same images (--images-dir) and plug-ins (--plugin)"
             )
     shards = dataset.shards_of(experiment, splits)
-    bad = {*damage.changed, *damage.missing}
-    did: list[str] = []
+    bad = {*damage.changed, *damage.missing} - {POSITIONS}
     with factory.locked(root):
         if manifest is None:
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
@@ -177,14 +177,20 @@ def repair(
     return did
 
 
-def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage) -> Experiment:
-    """From the manifest where it is intact, else from the config file."""
+def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did: list[str]) -> Experiment:
+    """From the manifest where it is intact, else from the config file. did: where lines on what was done go."""
     if manifest is None:
         return config.read(root / CONFIG)
     text = factory.config_text(manifest["config"])
     lost = [name for name in manifest["maps"] if name in {*damage.changed, *damage.missing}]
-    if lost:
-        raise SpadError(f"{root / lost[0]}: the sensor's map is lost, and it cannot be made again; put it back")
+    beyond = [name for name in lost if name != POSITIONS]
+    if beyond:
+        raise SpadError(f"{root / beyond[0]}: the sensor's map is lost, and it cannot be made again; put it back")
+    if lost:  # of the positions the manifest keeps the text, which the sensor is read from
+        with factory.locked(root):
+            did += _clear_way(root, POSITIONS)
+            disk.commit_file(root / POSITIONS, manifest["maps"][POSITIONS]["text"].encode(), disk.temporary(root))
+            did.append(f"made again: {POSITIONS}")
     return config.build(config.document.parse(text, str(root / CONFIG)), root)
 
 
@@ -195,7 +201,10 @@ def _images(
     damage: Damage,
     images_dir: Path | None,
 ) -> Mapping[str, Images]:
-    """The dataset's own copies where all of them are intact and whole blocks, else the config's source."""
+    """The dataset's own copies where all of them are intact and whole blocks, else the config's source.
+
+    Repetitions of one image are known by the image alone: they come from the source, too.
+    """
     bad = {*damage.changed, *damage.missing}
     if manifest is not None and images_dir is None and experiment.sensor.block == 1:
         own = [s for s in dataset.shards_in(manifest) if s.level is None]
@@ -207,7 +216,8 @@ def _images(
                 labelled = "labels" in readers[0].names
                 labels = np.concatenate([r.read("labels") for r in readers]) if labelled else None
                 splits[split] = Images(pixels, labels, manifest["images"]["white"])
-            return splits
+            if all(splits[s].sha256 == facts["sha256"] for s, facts in manifest["images"]["splits"].items()):
+                return splits
     return experiment.load_images(images_dir)
 
 

@@ -265,6 +265,101 @@ def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
     assert result.stdout == ""
 
 
+# --- an effect of one's own ---------------------------------------------------------------------------------------
+
+
+def test_a_new_effect_by_the_commands_that_are_told(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """What is printed is typed, one after the other."""
+    told = run("effects", "--new", "light_leak", cwd=tmp_path)
+    assert told.returncode == 0 and told.stderr == "" and sorted(tree(tmp_path)) == ["light_leak.py"]
+    lines = told.stdout.splitlines()
+    read, generate = [line.split()[1:] for line in lines if line.startswith("  spadmnist ")]
+    page = run(*read, cwd=tmp_path)
+    assert page.returncode == 0 and page.stdout.startswith("light_leak\nstage: dark\n")
+    (entry,) = [line for line in lines if line.strip().startswith("light_leak:")]
+    assert lines[lines.index(entry) - 2 : lines.index(entry)] == ["  sensor:", "    effects:"] and entry in page.stdout
+    (tmp_path / "my.yaml").write_text(made[0].read_text().replace("  effects:\n", f"  effects:\n{entry[2:]}\n"))
+    result = run(*generate, "--limit", 2, "--jobs", 1, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["config"]["sensor"]["effects"]["light_leak"] == {"rate": "50 Hz"}
+    assert manifest["plugins"][0]["file"] == "light_leak.py"
+
+
+def test_a_new_effect_as_json_and_at_another_stage(tmp_path: Path) -> None:
+    result = run("effects", "--new", "haze", "--stage", "light", "--json", cwd=tmp_path)
+    assert json.loads(result.stdout) == {"file": "haze.py", "effect": "haze", "stage": "light"}
+    assert 'stage="light"' in (tmp_path / "haze.py").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--new", "LightLeak"], ["LightLeak", "light_leak"]),
+        (["--new", "../leak"], ["../leak"]),
+        (["--new", "dead_time"], ["dead_time", "already"]),
+        (["--new", "there"], ["there.py", "already"]),
+        (["--new", "leak", "--stage", "drak"], ["'drak'", "Did you mean dark?", "correlated"]),
+        (["--stage", "dark"], ["--stage", "--new"]),
+        (["dead_time", "--new", "leak"], ["--new", "dead_time"]),
+        (["--new", "leak", "--plugin", "broken.py"], ["broken.py:3", "ValueError: no good"]),
+    ],
+)
+def test_a_new_effect_that_cannot_be(arguments: list[str], words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "there.py").write_text("mine = 1\n")
+    (tmp_path / "broken.py").write_text("import spadmnist\n\nraise ValueError('no good')\n")
+    before = tree(tmp_path)
+    result = run("effects", *arguments, cwd=tmp_path)
+    assert_sentence(result, *words)
+    assert len(result.stderr.splitlines()) == 1 and result.stdout == "", result
+    assert_same(tmp_path, before)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("import spadmnist\n\nx = 1 / 0\n", ["mine.py:3", "ZeroDivisionError"]),
+        ("def f(:\n    pass\n", ["mine.py:1", "SyntaxError"]),
+        ("import no_such_module\n", ["mine.py:1", "no_such_module"]),
+        (
+            "from spadmnist import Effect\n\n\nclass Mine(Effect, stage='dark'):\n    pass\n",
+            ["mine.py:4", "Mine", "apply"],
+        ),
+        (
+            "from spadmnist import Effect\n\n\nclass DeadTime(Effect, stage='dark'):\n"
+            "    def apply(self, rate, conditions):\n        return rate\n",
+            ["mine.py", "dead_time", "already there"],
+        ),
+    ],
+)
+@pytest.mark.parametrize("verb", ["generate", "effects"])
+def test_a_plug_in_that_cannot_be_loaded(
+    verb: str, text: str, words: list[str], made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "mine.py").write_text(text)
+    arguments = [made[0], "-o", "out"] if verb == "generate" else []
+    result = run(verb, *arguments, "--plugin", "mine.py", cwd=tmp_path)
+    assert_sentence(result, *words)
+    assert len(result.stderr.splitlines()) == 1 and result.stdout == "", result
+    assert sorted(tree(tmp_path)) == ["mine.py"]
+
+
+def test_positions_that_cannot_be(made: tuple[Path, Path], tmp_path: Path) -> None:
+    text = made[0].read_text().replace("layout: {rows: 8, columns: 8,", "layout: {positions: places.csv,")
+    assert "places.csv" in text
+    (tmp_path / "c.yaml").write_text(text)
+    for places, words in (
+        (None, ["no such file"]),
+        ("x,y\n0,0\n5,0\n0,0\n", ["places.csv:4", "line 2"]),
+        ("x,y\n0,0\n5,0\n", ["1 x 2", "8 x 8"]),
+    ):
+        if places:
+            (tmp_path / "places.csv").write_text(places)
+        result = run("generate", "c.yaml", "-o", "out", cwd=tmp_path)
+        assert_sentence(result, *words)
+        assert len(result.stderr.splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
 def test_every_mistake_of_a_config_on_a_line_of_its_own(made: tuple[Path, Path], tmp_path: Path) -> None:
     text = made[0].read_text()
     for old, new in (

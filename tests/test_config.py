@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import re
+import shutil
 import tokenize
 import warnings
 from collections.abc import Iterator
@@ -15,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spadmnist import config, document
+from spadmnist import config, document, factory, plugins, reference
+from spadmnist.effects import Effect
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.light import photons_from_irradiance, photons_from_lux
 
@@ -186,6 +188,9 @@ MISTAKES = [
     ("pdp: 0.5", "pdp: {500 nm: 0.1, 600 nm: 2}", "SE.detection.pdp.600 nm", "2|between 0 and 1"),
     ("pdp: 0.5", "pdp: {500 nm: .nan, 600 nm: 0.2}", "SE.detection.pdp.500 nm", "nan|number"),
     ("10 ps", "20 us", "SE.tdc.resolution", "20 us|10 us|STR"),
+    ("10 ps}", "10 ps, rounding: flor}", "SE.tdc.rounding", "'flor'|nearest or floor. Did you mean floor?"),
+    ("10 ps}", "10 ps, rounding: 1}", "SE.tdc.rounding", "1 is|nearest or floor"),
+    ("10 ps}", "10 ps, rounding: {file: a.npy}}", "SE.tdc.rounding", "nearest or floor"),
     ("10 ps", "1e-30 s", "SE.tdc.resolution", "ticks|coarser"),
     (RATE, "rate: {}", "DC.rate", "forms|{file: map.npy}|normal|lognormal|mixture"),
     (RATE, "rate: {fil: a.npy}", "DC.rate", "fil|forms|{file: map.npy}"),
@@ -453,6 +458,153 @@ def test_a_map_of_another_array_is_refused(maps: Path) -> None:
     assert "(14, 56)" in problem
 
 
+PER = '''
+from spadmnist import Effect, parameter
+
+
+class Weights(Effect, stage="light"):
+    """A weight for each of what there is."""
+
+    rows = parameter(1.0, "", "of a row", per="row", bounds=(0, None), off=1.0)
+    columns = parameter(1.0, "", "of a column", per="column", bounds=(0, None), off=1.0)
+    codes = parameter(1.0, "", "of a code", per="code", bounds=(0, None), off=1.0)
+    period = parameter(8, "", "codes", bounds=(1, None))
+    pixels = parameter(1.0, "", "of a pixel", per="pixel", bounds=(0, None), off=1.0)
+    extra = parameter(None, "", "may be left out", per="pixel")
+
+    def apply(self, rate, conditions):
+        return rate * self.pixels
+'''
+WEIGHTS = BASE.replace("rows: 28", "rows: 4").replace("columns: 28", "columns: 6")
+WEIGHTS = WEIGHTS.replace("    detection:", "    weights: {VALUES}\n    detection:")
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A folder, and an effect with a map for each of what a map can be for."""
+    (tmp_path / "weights.py").write_text(PER)
+    plugins.load_file(tmp_path / "weights.py")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "says"),
+    [
+        ("rows", (6,), "each row: (4,)"),
+        ("columns", (4,), "each column: (6,)"),
+        ("columns", (4, 6), "each column: (6,)"),
+        ("codes", (4, 6), "each code: (8,) or (n,) or (24, n)"),
+        ("codes", (0,), "each code: (8,)"),
+        ("pixels", (6, 4), "each pixel: (4, 6) or (24,)"),
+    ],
+)
+def test_a_map_of_the_wrong_shape_is_told(key: str, shape: tuple[int, ...], says: str, weights: Path) -> None:
+    np.save(weights / "map.npy", np.ones(shape))
+    (problem,) = mistakes(WEIGHTS.replace("VALUES", f"{key}: {{file: map.npy}}"), weights)
+    assert problem.startswith(f"lab.yaml:23: sensor.effects.weights.{key}: {weights / 'map.npy'}: is float64 of shape")
+    assert str(shape) in problem and says in problem
+
+
+def test_what_has_no_default_stays_left_out(weights: Path) -> None:
+    first = build(WEIGHTS.replace("VALUES", "pixels: 0.5"), weights)
+    assert "extra" not in first.resolved["sensor"]["effects"]["weights"]
+    again = build(document.dump(first.resolved), weights).sensor.effect("weights")
+    assert getattr(again, "extra") is None and getattr(again, "pixels") == 0.5  # noqa: B009
+    assert "extra:" not in reference.effect_page("weights")
+
+
+def test_maps_of_all_kinds_travel(weights: Path, tmp_path: Path) -> None:
+    """The files of a dataset hold each map in its own shape, and its config reads them back."""
+    shapes = {"rows": (4,), "columns": (6,), "codes": (24, 3), "pixels": (24,)}
+    for key, shape in shapes.items():
+        np.save(weights / f"{key}.npy", np.arange(1.0, np.prod(shape) + 1).reshape(shape))
+    listed = ", ".join(f"{key}: {{file: {key}.npy}}" for key in shapes)
+    first = build(WEIGHTS.replace("VALUES", listed), weights)
+    resolved, files = factory.portable(first)
+    assert sorted(files) == sorted(f"maps/weights.{key}.npy" for key in shapes)
+    (tmp_path / "apart" / "maps").mkdir(parents=True)
+    for name, data in files.items():
+        (tmp_path / "apart" / name).write_bytes(data)
+    again = config.build(document.parse(document.dump(resolved), "again.yaml"), tmp_path / "apart")
+    one, other = first.sensor.effect("weights"), again.sensor.effect("weights")
+    for key, shape in shapes.items():
+        assert getattr(one, key).shape == shape and np.array_equal(getattr(one, key), getattr(other, key))
+    assert np.load(tmp_path / "apart" / "maps" / "weights.pixels.npy").shape == (4, 6)
+    assert factory.portable(again)[1] == files
+
+
+# --- every effect that there is --------------------------------------------------------------------------------------
+
+
+def declared() -> Iterator[tuple[str, str, plugins.Parameter]]:
+    for name in Effect.registry:
+        for key, parameter in Effect.registry.find(name).parameters.items():
+            yield name, key, parameter
+
+
+def beyond(parameter: plugins.Parameter) -> Iterator[float]:
+    """Values that are not possible, in SI."""
+    low, high = parameter.bounds
+    if low is not None:
+        yield float(low - max(abs(low), 1.0))
+        if parameter.open_bounds:
+            yield float(low)
+    if high is not None:
+        yield float(high + max(abs(high), 1.0))
+
+
+OUTSIDE = [
+    (name, key, f"{value!r} {p.unit}" if p.unit else repr(value))
+    for name, key, p in declared()
+    if p.unit != "bool" and not p.choices
+    for value in beyond(p)
+]
+ALONE = BASE[: BASE.index("    detection:")] + "    NAME: {KEY: VALUE}\n"
+
+
+@pytest.mark.parametrize(("name", "key", "value"), OUTSIDE)
+def test_a_value_that_is_not_possible_names_effect_parameter_and_line(name: str, key: str, value: str) -> None:
+    """A probability above 1, a lifetime of nothing, ...: whatever the effects declare."""
+    text = ALONE.replace("NAME", name).replace("KEY", key).replace("VALUE", value)
+    found = [p for p in mistakes(text) if p.startswith(f"lab.yaml:23: sensor.effects.{name}.{key}: {value} is not")]
+    assert len(found) == 1 and f"{key} is " in found[0]
+
+
+def test_there_are_such_values() -> None:
+    assert len(OUTSIDE) > 5 and any(value.startswith("2.0") for _, _, value in OUTSIDE)
+
+
+@pytest.mark.parametrize(("name", "key"), [(name, key) for name, key, p in declared() if p.per])
+def test_a_map_of_no_shape_at_all_names_effect_parameter_and_file(name: str, key: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "map.npy", np.ones((3, 5, 7)))
+    text = ALONE.replace("NAME", name).replace("KEY", key).replace("VALUE", "{file: map.npy}")
+    found = [p for p in mistakes(text, tmp_path) if f"sensor.effects.{name}.{key}: {tmp_path / 'map.npy'}" in p]
+    assert len(found) == 1 and "(3, 5, 7)" in found[0]
+
+
+@pytest.mark.parametrize(("name", "key", "word"), [(n, k, w) for n, k, p in declared() for w in p.choices])
+def test_words_are_read_and_resolved(name: str, key: str, word: str) -> None:
+    text = ALONE.replace("NAME", name).replace("KEY", key)
+    experiment = build(text.replace("VALUE", word))
+    assert experiment.resolved["sensor"]["effects"][name][key] == word
+    again = build(document.dump(experiment.resolved))
+    assert getattr(again.sensor.effect(name), key) == word
+    (problem,) = mistakes(text.replace("VALUE", word[:-1] + "_"))
+    assert problem.endswith(f"Did you mean {word}?") and f"sensor.effects.{name}.{key}: " in problem
+
+
+@pytest.mark.parametrize("name", list(Effect.registry))
+def test_the_defaults_of_an_effect_are_resolved_to_what_they_are(name: str) -> None:
+    kind = Effect.registry.find(name)
+    if any(p.required for p in kind.parameters.values()):
+        pytest.skip("it has values without a default")
+    first = build(ALONE.replace("{KEY: VALUE}", "{}").replace("NAME", name))
+    again = build(document.dump(first.resolved))
+    for key, parameter in kind.parameters.items():
+        assert getattr(again.sensor.effect(name), key) == parameter.default
+    assert again.resolved == first.resolved
+
+
 def test_several_bad_maps_are_told_at_once(maps: Path) -> None:
     text = BASE.replace(RATE, "rate: {file: nan.npy}").replace("50 ns}", "{file: missing.npy}}")
     assert len(mistakes(text, maps)) == 2
@@ -651,12 +803,16 @@ def without_base(experiment: config.Experiment) -> dict[str, Any]:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_resolved_config_is_the_same_experiment(name: str, tmp_path: Path) -> None:
     first = config.read(ROOT / "configs" / name)
+    for file in (ROOT / "configs").glob("*.csv"):
+        shutil.copy(file, tmp_path)  # of positions
     text = document.dump(first.resolved)
     again = config.build(document.parse(text, "again.yaml"), tmp_path)
     assert again.resolved == first.resolved and document.dump(again.resolved) == text
     assert without_base(again) == without_base(first)
     one, other = first.sensor, again.sensor
     assert (one.layout, one.rules, one.chip_seed, one.name) == (other.layout, other.rules, other.chip_seed, other.name)
+    assert np.array_equal(one.layout.places, other.layout.places)
+    assert np.array_equal(one.layout.places, other.layout.places)
     assert [type(e) for e in one.effects] == [type(e) for e in other.effects]
     for mine, theirs in zip(one.effects, other.effects, strict=True):
         for key in mine.parameters:
@@ -685,8 +841,8 @@ def test_quick_is_the_sensor_of_the_paper_and_stands_in_one_file() -> None:
         "detection": {"pdp": 0.5, "relative": 1.0},
         "dark_counts": {"rate": "100 Hz"},
         "afterpulsing": {"probability": "0.5 %", "lifetime": "25 ns"},
-        "dead_time": {"duration": "50 ns"},
-        "tdc": {"resolution": "10 ps"},
+        "dead_time": {"duration": "50 ns", "paralyzable": False},
+        "tdc": {"resolution": "10 ps", "rounding": "nearest"},
     }
 
 

@@ -266,20 +266,21 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
     extra_rows = np.array(sorted(draw.draw(st.lists(st.integers(0, rows - 1), max_size=15))), np.int64)
     extra = np.array([draw.draw(st.sampled_from([0.0, 0.25, 0.5, 0.7, 0.99])) for _ in extra_rows], float)
     extra = extra[np.lexsort((extra, extra_rows))]
-    merged, new_offsets, origin = kernels.merge(times, offsets, extra, extra_rows)
+    merged, new_offsets, ahead = kernels.merge(times, offsets, extra, extra_rows)
     before = rows_of(times, offsets)
     assert rows_of(merged, new_offsets) == [
         sorted(before[row] + extra[extra_rows == row].tolist()) for row in range(rows)
     ]
-    assert sorted(origin.tolist()) == list(range(len(times) + len(extra)))
+    origin = np.insert(np.arange(len(times)), ahead, len(times) + np.arange(len(extra)))
+    assert np.array_equal(np.flatnonzero(origin >= len(times)), ahead + np.arange(len(extra)))
     assert np.array_equal(np.concatenate([times, extra])[origin], merged)
-    same = np.diff(merged) == 0
+    same = (np.diff(merged) == 0) & (np.diff(np.repeat(np.arange(rows), np.diff(new_offsets))) == 0)
     assert np.all(origin[1:][same] > origin[:-1][same])  # of equally late ones the further events come behind
     # the parents, told by who they were, are found where they are now
     order = np.array(draw.draw(st.permutations(range(len(extra)))), np.int64)
     total = len(times) + len(extra)
     parents = np.array([draw.draw(st.integers(0, total - 1)) for _ in extra], np.int64)
-    linked = kernels.relinked(origin, len(times), order, parents)
+    linked = kernels.relinked(len(times), ahead, order, parents)
     who = np.where(origin < len(times), origin, 0)
     who[origin >= len(times)] = len(times) + order[origin[origin >= len(times)] - len(times)]
     for k, one in enumerate(who.tolist()):

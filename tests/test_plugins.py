@@ -76,7 +76,7 @@ def refused(path: Path) -> str:
 
 def test_every_file_of_the_folder_is_an_effect() -> None:
     folder = Path(plugins.__file__).parent / "effects"
-    files = {p.stem for p in folder.glob("*.py")} - {"__init__"}
+    files = {p.stem for p in folder.glob("[!_]*.py")}
     assert files == {n for n in Effect.registry if Effect.registry.find(n).__module__.startswith("spadmnist.")}
     assert len(files) >= 5
 
@@ -89,7 +89,7 @@ def test_every_effect_says_what_it_is(name: str) -> None:
     for key, declared in cls.parameters.items():
         assert declared.name == key and declared.about
         for value in (declared.default, declared.off, *(declared.search or ())):
-            if value is not None and not isinstance(value, bool):
+            if value is not None and not isinstance(value, bool) and not declared.choices:
                 declared.check(value)
 
 
@@ -120,7 +120,7 @@ def test_a_class_in_a_file_is_an_effect(tmp_path: Path) -> None:
     cls: Any = Effect.registry.find("half_light")
     assert plugins.source_file(cls) == str(path) and cls.summary() == "Half of the light is lost on the way."
     assert cls.parameters["share"] == Parameter(
-        0.5, "", "share that passes", bounds=(0, 1), off=1.0, per_pixel=True, name="share"
+        0.5, "", "share that passes", bounds=(0, 1), off=1.0, per="pixel", name="share"
     )
     assert cls().share == 0.5 and cls(share=0.25).apply(np.array([4.0]), None) == [1.0]
     with pytest.raises(TypeError, match=r"half_light has no parameter shar\. Did you mean share\?"):
@@ -229,7 +229,7 @@ def read(declared: Parameter, raw: Any, base: Path = Path()) -> Any:
     return found if found else value
 
 
-BOUNDED = Parameter(1e-9, "s", "", bounds=(0, 1e-6), name="width", per_pixel=True)
+BOUNDED = Parameter(1e-9, "s", "", bounds=(0, 1e-6), name="width", per="pixel")
 OPEN = Parameter(1e-9, "s", "", bounds=(0, None), open_bounds=True, name="width")
 CAPPED = Parameter(0.0, "", "", bounds=(None, 3.0), name="width")
 
@@ -273,6 +273,90 @@ def test_a_value_out_of_bounds_is_told_what_is_allowed(declared: Parameter, raw:
     assert says in sentence
 
 
+WORD = Parameter("nearest", "", "", choices=("nearest", "floor"), name="rounding")
+
+
+@pytest.mark.parametrize("word", ["nearest", "floor"])
+def test_a_word_is_read(word: str) -> None:
+    assert read(WORD, word) == word and WORD.allowed() == "nearest or floor"
+
+
+@pytest.mark.parametrize("raw", ["Nearest", "ceil", "", 0, True, None, ["floor"], {"file": "a.npy"}])
+def test_a_word_that_is_none_of_the_choices(raw: Any) -> None:
+    (((), sentence),) = read(WORD, raw)
+    assert sentence == f"{raw!r} is not possible; rounding is nearest or floor"
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"choices": ("a", "b")}, "'c' is none of the choices a, b"),
+        ({"per": "frame"}, "'frame' is none of '', 'pixel', 'row', 'column', 'code'"),
+    ],
+)
+def test_a_parameter_that_cannot_be_declared(values: dict[str, Any], says: str) -> None:
+    with pytest.raises(TypeError, match=says):
+        plugins.parameter("c" if "choices" in values else 1.0, "", "about", **values)
+
+
+# --- maps: one value for each pixel, row, column or code -------------------------------------------------------------
+
+# per -> (shapes that a map may have, shapes that fit, shapes that do not) on 4 rows of 6 columns, with 5 codes
+SHAPES: dict[str, tuple[Any, Any, Any]] = {
+    "pixel": (((4, 6), (24,)), [(4, 6), (24,)], [(6, 4), (23,), (4, 6, 1), (2, 12), (), (0,)]),
+    "row": (((4,),), [(4,)], [(6,), (5,), (4, 6), (4, 1), (24,), ()]),
+    "column": (((6,),), [(6,)], [(4,), (7,), (4, 6), (1, 6), (24,), ()]),
+    "code": (((5,), (-1,), (24, -1)), [(5,), (9,), (1,), (24, 5), (24, 1)], [(0,), (24, 0), (4, 6, 5), (23, 5), ()]),
+}
+ALL = [(per, i, shape) for per, (_, *kinds) in SHAPES.items() for i, kind in enumerate(kinds) for shape in kind]
+
+
+@pytest.mark.parametrize(("per", "wrong", "shape"), ALL)
+def test_a_map_fits_what_it_is_per(per: str, wrong: int, shape: tuple[int, ...], tmp_path: Path) -> None:
+    gain = Parameter(1.0, "", "", bounds=(0, None), name="gain", per=per)
+    values = np.arange(1.0, np.prod(shape) + 1).reshape(shape)
+    np.save(tmp_path / "gain.npy", values)
+    found = read(gain, {"file": "gain.npy"}, tmp_path)
+    shapes = SHAPES[per][0]
+    if not wrong:
+        settled = plugins.settle(gain, found, shapes, "k")
+        assert np.array_equal(settled, values.ravel() if per == "pixel" else values) and settled.dtype == np.float64
+        return
+    with pytest.raises(InputError) as caught:
+        plugins.settle(gain, found, shapes, "k")
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'gain.npy'}: is float64 of shape {shape}, but gain needs one number for")
+    wanted = message.partition("one number for ")[2]
+    assert wanted.startswith(f"each {per}: {shapes[0]}") and "-" not in wanted
+
+
+@pytest.mark.parametrize("per", SHAPES)
+def test_a_map_with_a_value_that_cannot_be(per: str, tmp_path: Path) -> None:
+    gain = Parameter(1.0, "", "", bounds=(0, 2), name="gain", per=per)
+    shape = SHAPES[per][0][0]
+    for value, says in ((-0.5, "-0.5 is not possible; gain is between 0 and 2"), (np.nan, f"every {per} needs")):
+        values = np.ones(int(np.prod(shape)))
+        values[3] = value
+        np.save(tmp_path / "gain.npy", values.reshape(shape))
+        with pytest.raises(InputError, match=f"entry 3 of the map.*{says}"):
+            plugins.settle(gain, MapFile(tmp_path / "gain.npy"), SHAPES[per][0], "k")
+
+
+@pytest.mark.parametrize("per", SHAPES)
+def test_a_distribution_has_a_value_for_each(per: str) -> None:
+    gain = Parameter(1.0, "", "", name="gain", per=per)
+    found = read(gain, {"normal": {"mean": 1, "sigma": 0.1}})
+    drawn = plugins.settle(gain, found, SHAPES[per][0], "k")
+    assert drawn.shape == (int(np.prod(SHAPES[per][0][0])),) and len(np.unique(drawn)) == drawn.size
+
+
+def test_what_is_one_number_takes_no_map() -> None:
+    gain = Parameter(1.0, "", "", name="gain")
+    for raw in ({"file": "a.npy"}, {"normal": {"mean": 1, "sigma": 1}}):
+        ((_, sentence),) = read(gain, raw)
+        assert "one number for the whole array" in sentence
+
+
 def test_a_table_ends_at_its_ends() -> None:
     table = ByWavelength((500e-9, 700e-9), (0.4, 0.2))
     assert table.at(500e-9) == 0.4 and table.at(700e-9) == 0.2 and table.at(600e-9) == pytest.approx(0.3)
@@ -284,18 +368,18 @@ def test_a_table_ends_at_its_ends() -> None:
 def test_a_distribution_is_drawn_by_its_law() -> None:
     """Means and spreads of 100,000 draws, 5 standard errors wide (false-alarm rate 1e-6)."""
     n = 100_000
-    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), (1, n), "k")
+    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), ((1, n),), "k")
     assert abs(normal.mean() - 5e-7) < 5 * 1e-8 / np.sqrt(n) and abs(normal.std() / 1e-8 - 1) < 5 / np.sqrt(2 * n)
-    wide = Parameter(1.0, "Hz", "", bounds=(0, None), per_pixel=True)
-    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), (1, n), "k") / 20.0)
+    wide = Parameter(1.0, "Hz", "", bounds=(0, None), per="pixel")
+    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), ((1, n),), "k") / 20.0)
     assert abs(logs.mean()) < 5 * 2.27 / np.sqrt(n) and abs(logs.std() / 2.27 - 1) < 5 / np.sqrt(2 * n)
     few = Distribution(
         "mixture", (), ((0.97, Distribution("normal", (1.0, 0.0))), (0.03, Distribution("normal", (9.0, 0.0))))
     )
-    mixed = plugins.settle(wide, few, (1, n), "k")
+    mixed = plugins.settle(wide, few, ((1, n),), "k")
     assert set(np.unique(mixed)) == {1.0, 9.0}
     assert abs((mixed == 9).mean() - 0.03) < 5 * np.sqrt(0.03 * 0.97 / n)
-    assert not np.array_equal(plugins.settle(wide, few, (1, n), "other"), mixed)
+    assert not np.array_equal(plugins.settle(wide, few, ((1, n),), "other"), mixed)
 
 
 # --- entry points --------------------------------------------------------------------------------------------------
