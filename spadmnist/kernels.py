@@ -67,6 +67,7 @@ _SQRT_HALF_BITS = np.uint64(0x3FE6A09E00000000)
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
 _MAGIC_BITS = np.uint64(0x4330000000000000)  # 2^52: adding it leaves an integer in the low bits of the mantissa
 _MAGIC = 4503599627370496.0
+_EIGHT_TO_BYTE = np.uint64(0x8040201008040201)
 
 
 @_inline
@@ -580,42 +581,40 @@ def nearest_ticks(times, tick, out):
 
 
 @_inline
-def _row_frames(frame, first, start, stop, bits, row, out, used):
+def _row_frames(frame, first, start, stop, between, marks, eights, bits, row, out, used):
     """One row's frames from the frame number (from 1 on; 0: in none) and the stamp of each of its events.
 
     Sets the row's bits (most significant first) and appends the first stamp of each frame that has an event.
     Without a branch on 'is it the first of its frame', which is a coin toss at bright light: what is not the first
-    is overwritten by the next. Returns (sum of the appended stamps, used).
+    is overwritten by the next, and a frame's mark is set by each of its events. `between`: some event of these rows
+    is in no frame; `marks`: see `_no_marks`. Returns (sum of the appended stamps, used).
     """
+    if between:
+        for i in range(np.uint64(start) + np.uint64(1), np.uint64(stop)):
+            frame[i] = max(frame[i], frame[i - np.uint64(1)])
     waited = first[start] - first[start]  # zero of the stamps' own type: the sum of integer ticks is exact
     last = np.uint64(0)
-    word = np.uint64(0)
-    word_number = np.uint64(0)
     for i in range(np.uint64(start), np.uint64(stop)):
+        f = np.uint64(frame[i])
         stamp = first[i]
-        f = max(np.uint64(frame[i]), last)
+        new = np.uint64(f != last)
         out[used] = stamp
-        number = (f + np.uint64(63)) >> np.uint64(6)
-        if number != word_number:
-            _flush(word, word_number, bits, row)
-            word = np.uint64(0)
-            word_number = number
-        word |= np.uint64(1) << ((np.uint64(0) - f) & np.uint64(63))
-        new = f != last
-        waited += stamp if new else stamp - stamp
-        used += np.uint64(new)
+        marks[f + np.uint64(7)] = 1
+        used += new
+        waited += stamp * new
         last = f
-    _flush(word, word_number, bits, row)
+    for byte in range(np.uint64(bits.shape[1])):
+        # the product's upper byte is made of the eight marks
+        bits[row, byte] = (eights[byte + np.uint64(1)] * _EIGHT_TO_BYTE) >> np.uint64(56)
+        eights[byte + np.uint64(1)] = 0
     return waited, used
 
 
 @_inline
-def _flush(word, number, bits, row):
-    """Write 64 frames' bits, the `number`-th such word from 1 on (0: there is none yet)."""
-    if number > 0:
-        base = np.uint64(8) * (number - np.uint64(1))
-        for byte in range(min(np.uint64(8), np.uint64(bits.shape[1]) - base)):
-            bits[row, base + byte] = np.uint8(word >> (np.uint64(56) - np.uint64(8) * byte))
+def _no_marks(bits):
+    """Room for a row's marks, by eights and each: a byte for each frame, from index 8 on; before is for no frame."""
+    eights = np.zeros(bits.shape[1] + 1, np.uint64)
+    return eights, eights.view(np.uint8)
 
 
 @_jit
@@ -633,13 +632,14 @@ def frame_readout(times, offsets, frames, frame_time, frame_period, out):
         longest = max(longest, offsets[row + 1] - offsets[row])
     frame = np.empty(longest, np.uint32)
     first = np.empty(longest)
+    eights, marks = _no_marks(bits)
     used = np.uint64(0)
     for row in range(rows):
         start = offsets[row]
         count = offsets[row + 1] - start
         if count:
-            _stamps(times, start, count, frames, frame_time, frame_period, 0.0, 0, frame, first)
-            _, used = _row_frames(frame, first, 0, count, bits, row, out, used)
+            between = _stamps(times, start, count, frames, frame_time, frame_period, 0.0, 0, frame, first)
+            _, used = _row_frames(frame, first, 0, count, between, marks, eights, bits, row, out, used)
         first_offsets[row + 1] = used
     return bits, first_offsets
 
@@ -653,20 +653,29 @@ def _waited(stamps, ones, frames, frame_time, tick):
 
 @_jit
 def _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first):
-    """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on."""
+    """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on.
+
+    Returns whether any of them is between frames.
+    """
     last_frame = np.float64(frames)
+    between = np.uint64(0)
     if tick > 0.0:
         most = np.float64(none - 1)
         for i in range(np.uint64(count)):
             f, since = _frame_of(times[np.uint64(start) + i], frame_period)
             # the very last moment may round up to a frame that does not exist
-            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            inside = (since < frame_time) & (f < last_frame)
+            frame[i] = _nearest(f + 1.0 if inside else 0.0)
+            between |= np.uint64(not inside)
             first[i] = _nearest(min(since / tick, most))
     else:
         for i in range(np.uint64(count)):
             f, since = _frame_of(times[np.uint64(start) + i], frame_period)
-            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            inside = (since < frame_time) & (f < last_frame)
+            frame[i] = _nearest(f + 1.0 if inside else 0.0)
+            between |= np.uint64(not inside)
             first[i] = since
+    return between > 0
 
 
 # --- the paper's line, image by image -----------------------------------------------------------------------------
@@ -722,6 +731,7 @@ def paper_line(
     distances = np.empty(2)
     times = np.empty(1)
     frame = np.empty(1, np.uint32)
+    eights, marks = _no_marks(bits)
     parents = np.empty(1, np.int64)
     delays = np.empty(1)
     used = 0
@@ -778,10 +788,13 @@ def paper_line(
                 firsts = _grown(firsts, first_used, first_used + total + 1)
                 # in place, too: the first stamps of frames move up over the others
                 first = firsts[first_used:]
-                _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
+                between = _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
                 behind = _tile_frames(
                     frame,
                     first,
+                    between,
+                    marks,
+                    eights,
                     tile,
                     row,
                     frames,
@@ -828,6 +841,9 @@ def _tile_tr(times, tile_offsets, dead_times, tick, ticks, used, first_row, offs
 def _tile_frames(
     frame,
     first,
+    between,
+    marks,
+    eights,
     tile_offsets,
     first_row,
     frames,
@@ -849,7 +865,7 @@ def _tile_frames(
         stop = tile_offsets[p + np.uint64(1)]
         if stop > start:
             before = used
-            w, used = _row_frames(frame, first, start, stop, bits, row, firsts, used)
+            w, used = _row_frames(frame, first, start, stop, between, marks, eights, bits, row, firsts, used)
             ones[row] = used - before
             waited[row] = _waited(w, np.int64(used - before), frames, frame_time, tick)
             start = stop
