@@ -165,7 +165,20 @@ def logarithm(x):
 
 
 @_inline
-def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, delays, found):
+def _child_draws(block, drawn_from, drawn, image, key0, key1, word):
+    """A block's (distance, delay) out of a batch, which is drawn where the block is not in it, and its first block.
+
+    The same numbers as drawn one by one, but made by the SIMD unit.
+    """
+    if np.uint64(block) - np.uint64(drawn_from) >= np.uint64(BATCH // 2):
+        _exponentials(block, image, key0, key1, word, drawn)
+        drawn_from = block
+    place = np.uint64(block) - np.uint64(drawn_from)
+    return drawn[place], drawn[place + np.uint64(BATCH // 2)], drawn_from
+
+
+@_inline
+def _row_parents(count, hazard, left, block, drawn_from, drawn, image, key0, key1, word, parents, delays, found):
     """Which of a row's `count` events have a child.
 
     Each has one with probability 1 - exp(-hazard), independently. Instead of a draw for each event, a unit-rate
@@ -173,10 +186,9 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
     exact: an event is hit where a point falls into its stretch of length `hazard`, and the process starts afresh
     behind it. Block k of the stream gives the k-th distance and the k-th child's delay (in units of its mean).
 
-    Fills `parents` (indices within the row) and `delays` from `found` on. Returns (left, block, found).
+    Fills `parents` (indices within the row) and `delays` from `found` on. Returns (left, block, drawn_from, found).
     """
     first = 0
-    _, delay = _philox(block, image, key0, key1, word)
     while first < count:
         stretch = (count - first) * hazard
         if left >= stretch:
@@ -184,13 +196,12 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
             break
         index = min(first + int(left / hazard), count - 1)
         parents[found] = index
-        delays[found] = _exponential(delay)
+        _, delays[found], drawn_from = _child_draws(block, drawn_from, drawn, image, key0, key1, word)
         found += 1
         first = index + 1
-        block += 1
-        distance, delay = _philox(block, image, key0, key1, word)
-        left = _exponential(distance)
-    return left, block, found
+        block += np.uint64(1)
+        left, _, drawn_from = _child_draws(block, drawn_from, drawn, image, key0, key1, word)
+    return left, block, drawn_from, found
 
 
 @_jit
@@ -243,6 +254,8 @@ def _candidates(
     block = places[0]
     draw = places[1]
     child_block = places[2]
+    child_draws = np.empty(BATCH + 1)
+    drawn_from = child_block - np.uint64(BATCH)  # none are drawn yet
     position = distances[0]
     left = distances[1]
     k = np.uint64(0)
@@ -280,11 +293,13 @@ def _candidates(
                 else:
                     if count > child_room or np.int64(k) + count > room:
                         return -1
-                    left, child_block, found = _row_parents(
+                    left, child_block, drawn_from, found = _row_parents(
                         count,
                         hazard,
                         left,
                         child_block,
+                        drawn_from,
+                        child_draws,
                         image,
                         child_key[0],
                         child_key[1],
@@ -398,9 +413,11 @@ def children(offsets, hazards, images, key):
     pixels = hazards.size
     parents = np.empty(256, np.int64)
     delays = np.empty(256)
+    drawn = np.empty(BATCH + 1)
     found = 0
     for i in range(images.size):
         block = np.uint64(0)
+        drawn_from = block - np.uint64(BATCH)  # none are drawn yet
         a, _ = _philox(block, images[i], key[0], key[1], key[2])
         left = _exponential(a)
         for p in range(pixels):
@@ -414,8 +431,20 @@ def children(offsets, hazards, images, key):
                 parents = _grown(parents, found, found + count)
                 delays = _grown(delays, found, found + count)
                 before = found
-                left, block, found = _row_parents(
-                    count, hazards[p], left, block, images[i], key[0], key[1], key[2], parents, delays, found
+                left, block, drawn_from, found = _row_parents(
+                    count,
+                    hazards[p],
+                    left,
+                    block,
+                    drawn_from,
+                    drawn,
+                    images[i],
+                    key[0],
+                    key[1],
+                    key[2],
+                    parents,
+                    delays,
+                    found,
                 )
                 for child in range(before, found):
                     parents[child] += offsets[row]
