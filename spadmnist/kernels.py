@@ -957,8 +957,8 @@ def spans(times, offsets):
 
 @_jit
 def lookup(table, indices):
-    """`table[indices]`, float32; every index is known to lie inside."""
-    out = np.empty(indices.size, np.float32)
+    """`table[indices]`; every index is known to lie inside."""
+    out = np.empty(indices.size, table.dtype)
     for i in range(np.uint64(indices.size)):
         out[i] = table[np.uint64(indices[i])]
     return out
