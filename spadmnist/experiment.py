@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import light, units
+from . import kernels, light, units
 from .effects import Conditions
 from .errors import InputError, did_you_mean
 from .images import Images, check_size
@@ -85,7 +85,7 @@ class Experiment:
         flat = pixels.reshape(len(pixels), -1)
         if flat.dtype == np.uint8:
             # a table is the same arithmetic, once for each of the 256 grey levels
-            return (np.arange(256) / white * self.white(level))[flat]
+            return kernels.lookup(np.arange(256) / white * self.white(level), flat.ravel()).reshape(flat.shape)
         return flat / white * self.white(level)
 
     def level(self, text: str) -> Level:

@@ -67,6 +67,7 @@ _SQRT_HALF_BITS = np.uint64(0x3FE6A09E00000000)
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
 _MAGIC_BITS = np.uint64(0x4330000000000000)  # 2^52: adding it leaves an integer in the low bits of the mantissa
 _MAGIC = 4503599627370496.0
+_EIGHT_TO_BYTE = np.uint64(0x8040201008040201)
 
 
 @_inline
@@ -142,6 +143,25 @@ def _exponentials(block, image, key0, key1, word, out):
     out[BATCH] = np.inf
 
 
+@_inline
+def _running_sums(draws, sums):
+    """The sums of a batch's first 1, 2, ... draws, never descending; +inf behind them, a stop for two vectors.
+
+    By fours, so that not every addition waits for the one before.
+    """
+    total = 0.0
+    for i in range(BATCH // 4):
+        two = draws[4 * i] + draws[4 * i + 1]
+        third = draws[4 * i + 2]
+        four = two + (third + draws[4 * i + 3])
+        sums[4 * i] = total + draws[4 * i]
+        sums[4 * i + 1] = total + two
+        sums[4 * i + 2] = total + (two + third)
+        total += four
+        sums[4 * i + 3] = total
+    sums[BATCH:] = np.inf
+
+
 @_jit
 def exponentials(count, image, key):
     """The first `count` standard exponentials of a stream (float64), as the arrivals of an image use them."""
@@ -169,7 +189,20 @@ def logarithm(x):
 
 
 @_inline
-def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, delays, found):
+def _child_draws(block, drawn_from, drawn, image, key0, key1, word):
+    """A block's (distance, delay) out of a batch, which is drawn where the block is not in it, and its first block.
+
+    The same numbers as drawn one by one, but made by the SIMD unit.
+    """
+    if np.uint64(block) - np.uint64(drawn_from) >= np.uint64(BATCH // 2):
+        _exponentials(block, image, key0, key1, word, drawn)
+        drawn_from = block
+    place = np.uint64(block) - np.uint64(drawn_from)
+    return drawn[place], drawn[place + np.uint64(BATCH // 2)], drawn_from
+
+
+@_inline
+def _row_parents(count, hazard, left, block, drawn_from, drawn, image, key0, key1, word, parents, delays, found):
     """Which of a row's `count` events have a child.
 
     Each has one with probability 1 - exp(-hazard), independently. Instead of a draw for each event, a unit-rate
@@ -177,10 +210,9 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
     exact: an event is hit where a point falls into its stretch of length `hazard`, and the process starts afresh
     behind it. Block k of the stream gives the k-th distance and the k-th child's delay (in units of its mean).
 
-    Fills `parents` (indices within the row) and `delays` from `found` on. Returns (left, block, found).
+    Fills `parents` (indices within the row) and `delays` from `found` on. Returns (left, block, drawn_from, found).
     """
     first = 0
-    _, delay = _philox(block, image, key0, key1, word)
     while first < count:
         stretch = (count - first) * hazard
         if left >= stretch:
@@ -188,21 +220,23 @@ def _row_parents(count, hazard, left, block, image, key0, key1, word, parents, d
             break
         index = min(first + int(left / hazard), count - 1)
         parents[found] = index
-        delays[found] = _exponential(delay)
+        _, delays[found], drawn_from = _child_draws(block, drawn_from, drawn, image, key0, key1, word)
         found += 1
         first = index + 1
-        block += 1
-        distance, delay = _philox(block, image, key0, key1, word)
-        left = _exponential(distance)
-    return left, block, found
+        block += np.uint64(1)
+        left, _, drawn_from = _child_draws(block, drawn_from, drawn, image, key0, key1, word)
+    return left, block, drawn_from, found
 
 
 @_jit
 def _begin_image(image, key, child_key, buffer, places, distances):
-    """Where the draws of an image start. places: (block, draw, child block); distances: to the next event, child."""
+    """Where the draws of an image start.
+
+    places: (block, the next event's draw in it, child block); distances: to the next event, child.
+    """
     _exponentials(np.uint64(0), image, key[0], key[1], key[2], buffer)
     places[0] = 0
-    places[1] = 1
+    places[1] = 0
     places[2] = 0
     distances[0] = buffer[0]
     a, _ = _philox(np.uint64(0), image, child_key[0], child_key[1], child_key[2])
@@ -231,7 +265,8 @@ def _candidates(
 
     One unit-rate Poisson process runs along the image, pixel after pixel, each pixel being `rate * exposure` long:
     one exponential an event and none for an empty pixel. The distance is counted from each pixel's own start, so
-    that no precision is lost in a large image.
+    that no precision is lost in a large image. Within a pixel an event's place is a difference of the batch's running
+    sums, which is exact to 2^-46 of the mean distance: no event waits for the one before to be known.
 
     Afterpulses (paper, Alg. 1, lines 14-18): each event has one with probability 1 - exp(-hazard), at dead time +
     lifetime * Exp(1) after it; what would fall at or after the exposure's end does not exist.
@@ -242,13 +277,19 @@ def _candidates(
     draws stand (see `_begin_image`) and are moved on.
     """
     last_moment = np.nextafter(exposure, 0.0)
-    room = np.int64(times.size) - BATCH - 1
+    if times.size < 2 * BATCH:
+        return -1
+    room = np.int64(times.size) - BATCH - 33
     child_room = np.int64(parents.size)
     block = places[0]
     draw = places[1]
     child_block = places[2]
+    child_draws = np.empty(BATCH + 1)
+    drawn_from = child_block - np.uint64(BATCH)  # none are drawn yet
     position = distances[0]
     left = distances[1]
+    sums = np.empty(BATCH + 32)
+    _running_sums(buffer, sums)
     k = np.uint64(0)
     offsets[0] = 0
     for pixel in range(np.uint64(rates.size)):
@@ -257,24 +298,34 @@ def _candidates(
         if position < length:
             start = k
             period = 1.0 / rate
-            before = position
-            while True:
-                while position < length:
+            while position < length:
+                # this event and those behind it that lie before the pixel's end, as far as the batch goes
+                shift = position - sums[draw]
+                stop = draw + np.uint64(1)
+                while sums[stop + np.uint64(16)] + shift < length:
+                    stop += np.uint64(16)
+                more = np.uint64(0)
+                for i in range(np.uint64(16)):
+                    more += np.uint64(sums[stop + i] + shift < length)
+                stop += more
+                # in whole vectors: what is too much will be overwritten
+                for i in range((stop - draw + np.uint64(31)) & ~np.uint64(31)):
                     # rounding must not push an event to the very end, which does not belong to the exposure
-                    times[k] = min(position * period, last_moment)
-                    k += np.uint64(1)
-                    before = position
-                    position += buffer[draw]
-                    draw += np.uint64(1)
-                if position != np.inf:
+                    times[k + i] = min((sums[draw + i] + shift) * period, last_moment)
+                k += stop - draw
+                draw = stop
+                if draw < BATCH:
+                    position = sums[draw] + shift
                     break
-                # the stop behind the buffer: draw on. Between two stops at most BATCH events are written
+                # between two of these at most BATCH events are written, and less than 32 too many
                 if np.int64(k) > room:
                     return -1
+                position = sums[BATCH - 1] + shift
                 block += np.uint64(BATCH // 2)
                 _exponentials(block, image, key[0], key[1], key[2], buffer)
-                position = before + buffer[0]
-                draw = np.uint64(1)
+                _running_sums(buffer, sums)
+                position += sums[0]
+                draw = np.uint64(0)
             hazard = hazards[pixel]
             if hazard > 0.0:
                 count = np.int64(k - start)
@@ -284,11 +335,13 @@ def _candidates(
                 else:
                     if count > child_room or np.int64(k) + count > room:
                         return -1
-                    left, child_block, found = _row_parents(
+                    left, child_block, drawn_from, found = _row_parents(
                         count,
                         hazard,
                         left,
                         child_block,
+                        drawn_from,
+                        child_draws,
                         image,
                         child_key[0],
                         child_key[1],
@@ -402,9 +455,11 @@ def children(offsets, hazards, images, key):
     pixels = hazards.size
     parents = np.empty(256, np.int64)
     delays = np.empty(256)
+    drawn = np.empty(BATCH + 1)
     found = 0
     for i in range(images.size):
         block = np.uint64(0)
+        drawn_from = block - np.uint64(BATCH)  # none are drawn yet
         a, _ = _philox(block, images[i], key[0], key[1], key[2])
         left = _exponential(a)
         for p in range(pixels):
@@ -418,8 +473,20 @@ def children(offsets, hazards, images, key):
                 parents = _grown(parents, found, found + count)
                 delays = _grown(delays, found, found + count)
                 before = found
-                left, block, found = _row_parents(
-                    count, hazards[p], left, block, images[i], key[0], key[1], key[2], parents, delays, found
+                left, block, drawn_from, found = _row_parents(
+                    count,
+                    hazards[p],
+                    left,
+                    block,
+                    drawn_from,
+                    drawn,
+                    images[i],
+                    key[0],
+                    key[1],
+                    key[2],
+                    parents,
+                    delays,
+                    found,
                 )
                 for child in range(before, found):
                     parents[child] += offsets[row]
@@ -780,42 +847,40 @@ def nearest_ticks(times, tick, out):
 
 
 @_inline
-def _row_frames(frame, first, start, stop, bits, row, out, used):
+def _row_frames(frame, first, start, stop, between, marks, eights, bits, row, out, used):
     """One row's frames from the frame number (from 1 on; 0: in none) and the stamp of each of its events.
 
     Sets the row's bits (most significant first) and appends the first stamp of each frame that has an event.
     Without a branch on 'is it the first of its frame', which is a coin toss at bright light: what is not the first
-    is overwritten by the next. Returns (sum of the appended stamps, used).
+    is overwritten by the next, and a frame's mark is set by each of its events. `between`: some event of these rows
+    is in no frame; `marks`: see `_no_marks`. Returns (sum of the appended stamps, used).
     """
+    if between:
+        for i in range(np.uint64(start) + np.uint64(1), np.uint64(stop)):
+            frame[i] = max(frame[i], frame[i - np.uint64(1)])
     waited = first[start] - first[start]  # zero of the stamps' own type: the sum of integer ticks is exact
     last = np.uint64(0)
-    word = np.uint64(0)
-    word_number = np.uint64(0)
     for i in range(np.uint64(start), np.uint64(stop)):
+        f = np.uint64(frame[i])
         stamp = first[i]
-        f = max(np.uint64(frame[i]), last)
+        new = np.uint64(f != last)
         out[used] = stamp
-        number = (f + np.uint64(63)) >> np.uint64(6)
-        if number != word_number:
-            _flush(word, word_number, bits, row)
-            word = np.uint64(0)
-            word_number = number
-        word |= np.uint64(1) << ((np.uint64(0) - f) & np.uint64(63))
-        new = f != last
-        waited += stamp if new else stamp - stamp
-        used += np.uint64(new)
+        marks[f + np.uint64(7)] = 1
+        used += new
+        waited += stamp * new
         last = f
-    _flush(word, word_number, bits, row)
+    for byte in range(np.uint64(bits.shape[1])):
+        # the product's upper byte is made of the eight marks
+        bits[row, byte] = (eights[byte + np.uint64(1)] * _EIGHT_TO_BYTE) >> np.uint64(56)
+        eights[byte + np.uint64(1)] = 0
     return waited, used
 
 
 @_inline
-def _flush(word, number, bits, row):
-    """Write 64 frames' bits, the `number`-th such word from 1 on (0: there is none yet)."""
-    if number > 0:
-        base = np.uint64(8) * (number - np.uint64(1))
-        for byte in range(min(np.uint64(8), np.uint64(bits.shape[1]) - base)):
-            bits[row, base + byte] = np.uint8(word >> (np.uint64(56) - np.uint64(8) * byte))
+def _no_marks(bits):
+    """Room for a row's marks, by eights and each: a byte for each frame, from index 8 on; before is for no frame."""
+    eights = np.zeros(bits.shape[1] + 1, np.uint64)
+    return eights, eights.view(np.uint8)
 
 
 @_jit
@@ -833,13 +898,14 @@ def frame_readout(times, offsets, frames, frame_time, frame_period, out):
         longest = max(longest, offsets[row + 1] - offsets[row])
     frame = np.empty(longest, np.uint32)
     first = np.empty(longest)
+    eights, marks = _no_marks(bits)
     used = np.uint64(0)
     for row in range(rows):
         start = offsets[row]
         count = offsets[row + 1] - start
         if count:
-            _stamps(times, start, count, frames, frame_time, frame_period, 0.0, 0, frame, first)
-            _, used = _row_frames(frame, first, 0, count, bits, row, out, used)
+            between = _stamps(times, start, count, frames, frame_time, frame_period, 0.0, 0, frame, first)
+            _, used = _row_frames(frame, first, 0, count, between, marks, eights, bits, row, out, used)
         first_offsets[row + 1] = used
     return bits, first_offsets
 
@@ -942,20 +1008,29 @@ def _waited(stamps, ones, frames, frame_time, tick):
 
 @_jit
 def _stamps(times, start, count, frames, frame_time, frame_period, tick, none, frame, first):
-    """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on."""
+    """Frame number (from 1 on; 0: between frames) and stamp of `count` events from `start` on.
+
+    Returns whether any of them is between frames.
+    """
     last_frame = np.float64(frames)
+    between = np.uint64(0)
     if tick > 0.0:
         most = np.float64(none - 1)
         for i in range(np.uint64(count)):
             f, since = _frame_of(times[np.uint64(start) + i], frame_period)
             # the very last moment may round up to a frame that does not exist
-            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            inside = (since < frame_time) & (f < last_frame)
+            frame[i] = _nearest(f + 1.0 if inside else 0.0)
+            between |= np.uint64(not inside)
             first[i] = _nearest(min(since / tick, most))
     else:
         for i in range(np.uint64(count)):
             f, since = _frame_of(times[np.uint64(start) + i], frame_period)
-            frame[i] = _nearest(f + 1.0 if (since < frame_time) & (f < last_frame) else 0.0)
+            inside = (since < frame_time) & (f < last_frame)
+            frame[i] = _nearest(f + 1.0 if inside else 0.0)
+            between |= np.uint64(not inside)
             first[i] = since
+    return between > 0
 
 
 # --- the paper's line, image by image -----------------------------------------------------------------------------
@@ -1011,6 +1086,7 @@ def paper_line(
     distances = np.empty(2)
     times = np.empty(1)
     frame = np.empty(1, np.uint32)
+    eights, marks = _no_marks(bits)
     parents = np.empty(1, np.int64)
     delays = np.empty(1)
     used = 0
@@ -1067,10 +1143,13 @@ def paper_line(
                 firsts = _grown(firsts, first_used, first_used + total + 1)
                 # in place, too: the first stamps of frames move up over the others
                 first = firsts[first_used:]
-                _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
+                between = _stamps(times, 0, total, frames, frame_time, frame_period, tick, none, frame, first)
                 behind = _tile_frames(
                     frame,
                     first,
+                    between,
+                    marks,
+                    eights,
                     tile,
                     row,
                     frames,
@@ -1117,6 +1196,9 @@ def _tile_tr(times, tile_offsets, dead_times, tick, ticks, used, first_row, offs
 def _tile_frames(
     frame,
     first,
+    between,
+    marks,
+    eights,
     tile_offsets,
     first_row,
     frames,
@@ -1138,7 +1220,7 @@ def _tile_frames(
         stop = tile_offsets[p + np.uint64(1)]
         if stop > start:
             before = used
-            w, used = _row_frames(frame, first, start, stop, bits, row, firsts, used)
+            w, used = _row_frames(frame, first, start, stop, between, marks, eights, bits, row, firsts, used)
             ones[row] = used - before
             waited[row] = _waited(w, np.int64(used - before), frames, frame_time, tick)
             start = stop
@@ -1164,8 +1246,8 @@ def spans(times, offsets):
 
 @_jit
 def lookup(table, indices):
-    """`table[indices]`, float32; every index is known to lie inside."""
-    out = np.empty(indices.size, np.float32)
+    """`table[indices]`; every index is known to lie inside."""
+    out = np.empty(indices.size, table.dtype)
     for i in range(np.uint64(indices.size)):
         out[i] = table[np.uint64(indices[i])]
     return out

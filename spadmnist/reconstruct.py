@@ -72,9 +72,10 @@ class Method(Plugin, abstract=True):
         values, saturated = np.empty(columns[0].shape, np.float32), 0
         if len(columns) == 1 and columns[0].dtype.kind in "iu":
             # a function of one small integer is worked out once for each value that occurs
-            table = self._finite(settings, np.arange(int(columns[0].max(initial=0)) + 1))
-            values = kernels.lookup(table.astype(np.float32), columns[0])
-            return values, self.saturated(settings, *columns)
+            whole = np.arange(int(columns[0].max(initial=0)) + 1)
+            values = kernels.lookup(self._finite(settings, whole).astype(np.float32), columns[0])
+            # where no value is saturated no pixel need be looked at again
+            return values, self.saturated(settings, *columns) if self.saturated(settings, whole) else 0
         for start in range(0, len(values), _ROWS_AT_ONCE):
             part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
             values[start : start + _ROWS_AT_ONCE], bounded = self._worked_out(settings, *part)

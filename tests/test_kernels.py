@@ -473,17 +473,40 @@ def test_a_chain_of_causes_may_run_through_all_rows() -> None:
 
 
 def plain_arrivals(rates: np.ndarray, exposure: float, image: int, key: np.ndarray) -> list[list[float]]:
-    """One unit-rate Poisson process runs along the image; each pixel is rate x exposure long."""
+    """One unit-rate Poisson process runs along the image; each pixel is rate x exposure long.
+
+    Within a batch of draws an event's place is the difference of running sums, which are summed by fours.
+    """
     lengths = (rates * exposure).tolist()
-    draws = iter(kernels.exponentials(int(2 * sum(lengths)) + 1000, np.uint64(image), key).tolist())
-    position = next(draws)
+    draws = kernels.exponentials(int(2 * sum(lengths)) + 10 * kernels.BATCH, np.uint64(image), key).tolist()
+    batches = []
+    for start in range(0, len(draws), kernels.BATCH):
+        sums = [0.0]
+        for i in range(start, min(start + kernels.BATCH, len(draws)) - 3, 4):
+            a, b, c, d = draws[i : i + 4]
+            sums += [sums[-1] + part for part in (a, a + b, (a + b) + c, (a + b) + (c + d))]
+        batches.append(sums[1:])
+    batch, draw, position, walked = 0, 0, batches[0][0], 0.0
     out = []
     for rate, length in zip(rates.tolist(), lengths, strict=True):
         row = []
         while position < length:
-            row.append(min(position * (1 / rate), math.nextafter(exposure, 0.0)))
-            position += next(draws)
+            shift = position - batches[batch][draw]
+            last = draw + 1
+            while last < kernels.BATCH and batches[batch][last] + shift < length:
+                last += 1
+            places = [s + shift for s in batches[batch][draw:last]]
+            row += [min(place * (1 / rate), math.nextafter(exposure, 0.0)) for place in places]
+            position, draw = places[-1], last
+            if draw < kernels.BATCH:
+                position = batches[batch][draw] + shift
+                break
+            batch, draw = batch + 1, 0
+            position += batches[batch][0]
+        # the plain sum of the draws, but for rounding
+        assert walked + position == pytest.approx(sum(draws[: batch * kernels.BATCH + draw + 1]), rel=1e-11)
         position -= length
+        walked += length
         out.append(row)
     return out
 
