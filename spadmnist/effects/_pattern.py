@@ -21,6 +21,7 @@ class Pattern(Effect, stage="light", abstract=True):
         self._factor = gain[self.line(chip)] if gain.ndim else gain
 
     def apply(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate * gain."""
         return rate * self._factor
 
     expected_rate = apply

@@ -33,4 +33,5 @@ class Traps(Effect, stage="correlated", abstract=True):
         return Children(parent, self.lifetime * delay)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate (1 + probability)."""
         return rate * (1 + np.asarray(self.probability))

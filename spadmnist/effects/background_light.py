@@ -25,6 +25,7 @@ class BackgroundLight(Effect, stage="dark"):
     )
 
     def apply(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate + background, where light is let in."""
         return rate if conditions.dark else rate + self.rate
 
     expected_rate = apply

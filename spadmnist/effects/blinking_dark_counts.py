@@ -92,4 +92,5 @@ class BlinkingDarkCounts(Effect, stage="arrival"):
         return is_on(events.times, events.offsets, events.pixels, self._hit, rng.images, rng.key, rate, self.on)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate + amplitude rate_on / (rate_on + rate_off) in a pixel that blinks."""
         return rate + self._added * self.on

@@ -94,6 +94,7 @@ class Crosstalk(Effect, stage="correlated"):
         return Children(parent, self.delay * delay, row)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate (1 + probabilities of all neighbours), averaged over the array."""
         # averaged over the array: a pixel at its edge has fewer neighbours
         return rate * (1 + self._hits)
 

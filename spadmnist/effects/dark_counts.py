@@ -27,6 +27,7 @@ class DarkCounts(Effect, stage="dark"):
     )
 
     def apply(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate + DCR."""
         return rate + self.rate
 
     expected_rate = apply

@@ -53,5 +53,6 @@ class DeadTime(Effect, stage="dead_time"):
         return np.asarray(self.duration)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate / (1 + rate tau_d); paralyzable: rate exp(-rate tau_d)."""
         expected = rate * self.blind_time()
         return rate * np.exp(-expected) if self.extends else rate / (1 + expected)

@@ -43,6 +43,7 @@ class Detection(Effect, stage="detection"):
         return np.asarray(self.pdp)
 
     def apply(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate * PDP."""
         return rate * np.minimum(self.pdp_at(conditions.wavelength) * self.relative, 1.0)
 
     expected_rate = apply

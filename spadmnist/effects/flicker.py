@@ -54,6 +54,7 @@ class Flicker(Effect, stage="arrival"):
         return 1 + self.amplitude
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate (1 + m (cos(phase) - cos(phase + s)) / s), s = 2 pi f exposure."""
         if conditions.dark:
             return rate
         swept = 2 * math.pi * self.frequency * conditions.exposure

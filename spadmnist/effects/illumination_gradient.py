@@ -50,6 +50,7 @@ class IlluminationGradient(Effect, stage="light"):
         self._factor = slopes * (1 - self.vignette * (squared / farthest))
 
     def apply(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate (1 + x u + y v) (1 - vignette r^2), u and v from -1/2 to 1/2, r from 0 to 1."""
         return rate * self._factor
 
     expected_rate = apply

@@ -49,6 +49,7 @@ class ShortGate(Effect, stage="gate"):
         return min(self.offset + self.fraction * conditions.frame_time, conditions.frame_time)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate * live time of a frame / frame period."""
         if self.fraction == 1 and self.offset == 0:
             return rate
         return rate * (max(self._end(conditions) - self.offset, 0.0) / conditions.frame_period)

@@ -41,4 +41,5 @@ class SlowRecovery(Effect, stage="dead_time"):
         return -self.time_constant * kernels.logarithm(1 - chance)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """rate / (1 + rate tau_r): first order, and a lower bound."""
         return rate / (1 + rate * self.time_constant)
