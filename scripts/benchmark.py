@@ -31,7 +31,12 @@ import plain_numpy  # noqa: E402
 
 import spadmnist  # noqa: E402
 from spadmnist import config, dataset, factory, reconstruct, store  # noqa: E402
+from spadmnist.effects import Conditions, Effect  # noqa: E402
 from spadmnist.errors import SpadError  # noqa: E402
+from spadmnist.events import Layout  # noqa: E402
+from spadmnist.plugins import Distribution  # noqa: E402
+from spadmnist.sensor import Sensor  # noqa: E402
+from spadmnist.streams import Streams  # noqa: E402
 
 Row = tuple[str, str, str]
 
@@ -131,6 +136,47 @@ def simulation(images_dir: Path | None, rounds: int) -> list[Row]:
         ),
         ("the staged line (serves every sensor) against the fused one", "<= 6x", f"{1 / to_staged:.1f}x"),
     ]
+
+
+def effects(rounds: int) -> list[Row]:
+    """What each registered effect adds to a TR and QIS recording, one core, at its default values."""
+    layout = Layout(28, 28, 25e-12, 1.0)
+    conditions = Conditions(1e-3, 100, 1e-5, 1e-5, 555e-9, bits=2)
+    photons = np.full((32, layout.pixels), 2.6e5)
+    streams = Streams(1, "benchmark", "train", np.arange(len(photons), dtype=np.uint64))
+    usual = {"detection": {"pdp": 0.5}, "dark_counts": {"rate": 100.0}, "dead_time": {}, "tdc": {"resolution": 1e-10}}
+
+    def shot(settings: dict[str, dict[str, object]], rules: str) -> Callable[[], int]:
+        made = [Effect.registry.find(name)(**values) for name, values in settings.items()]
+        sensor = Sensor(layout, made, rules).settled()
+        readouts = ("tr", "qis", "counts")
+        return lambda: len(sensor.expose(photons, conditions, streams, readouts, staged=True).tr or ())
+
+    def present(kind: type[Effect]) -> dict[str, object]:
+        """Its defaults; what is off by default is set to something."""
+        values: dict[str, object] = {}
+        for name, p in kind.parameters.items():
+            if p.default == p.off and p.off is not None and p.per:
+                values[name] = Distribution("normal", (float(p.off), 0.2))
+            elif p.default == p.off and p.search is not None:
+                low, high = p.search
+                values[name] = math.sqrt(low * high) if low > 0 else high / 2
+        return values
+
+    rows = []
+    for name in Effect.registry:
+        with_it = {**usual, name: {**usual.get(name, {}), **present(Effect.registry.find(name))}}
+        without = {key: value for key, value in usual.items() if key != name}
+        worst = -math.inf
+        for rules in ("paper", "device"):
+            one, other = shot(without, rules), shot(with_it, rules)
+            events = max(one(), other())
+            pairs = [(seconds(other), seconds(one)) for _ in range(rounds)]
+            worst = max(worst, (min(a for a, _ in pairs) - min(b for _, b in pairs)) / events)
+        rows.append(
+            (f"effect {name}: what it adds, per event (the slower of both rules)", "<= 15 ns", f"{worst * 1e9:.1f} ns")
+        )
+    return rows
 
 
 def reading(images_dir: Path | None, folder: Path) -> list[Row]:
@@ -292,6 +338,7 @@ def main() -> None:
         rows = simulation(arguments.images_dir, rounds)
         rows += whole_runs(arguments.images_dir, folder, arguments.quick)
         rows += reading(arguments.images_dir, folder)
+        rows += effects(rounds)
         run([sys.executable, "-m", "spadmnist.cli", "--help"])
         starts = [run([sys.executable, "-m", "spadmnist.cli", "--help"])[0] for _ in range(rounds)]
         rows.append(("`spadmnist --help`", "< 0.1 s", f"{statistics.median(starts):.3f} s"))

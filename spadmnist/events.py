@@ -188,8 +188,8 @@ class Events:
             parent[known] = np.where(mask[parent[known]], running[parent[known]] - 1, -2)
         offsets = kernels.kept_offsets(mask, self.offsets)
         images = None if self._image_offsets is None else kernels.kept_offsets(mask, self._image_offsets)
-        ticks = None if self.ticks is None else self.ticks[mask]
-        times = None if ticks is not None else self.times[mask]
+        ticks = None if self.ticks is None else kernels.kept(self.ticks, mask)
+        times = None if ticks is not None else kernels.kept(self.times, mask)
         return Events(times, offsets, self.pixels, ticks, self.tick, self.row_pixel, self.end, cause, parent, images)
 
     def moved(self, times: np.ndarray) -> Events:

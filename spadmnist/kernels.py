@@ -530,7 +530,7 @@ def thinned(rates, offsets, drawn, image_offsets, images, key):
     rates: (events,) 1/s, what the rate is at each; drawn: (rows,) 1/s. Returns (events,) bool.
     """
     kept = np.empty(rates.size, np.bool_)
-    pixels = (offsets.size - 1) // images.size
+    pixels = (offsets.size - 1) // max(1, images.size)
     for row in range(offsets.size - 1):
         image = row // pixels
         begin = image_offsets[image]
@@ -609,6 +609,20 @@ def relinked(known, before, order, parents):
         else:
             out[place[child]] = place[parent - known]
     return out
+
+
+@_jit
+def kept(values, mask):
+    """`values[mask]`, without a branch on what is hard to foresee."""
+    count = 0
+    for i in range(mask.size):
+        count += np.int64(mask[i])
+    out = np.empty(count + 1, values.dtype)  # one more, which what is not kept may overwrite
+    k = np.uint64(0)
+    for i in range(np.uint64(mask.size)):
+        out[k] = values[i]
+        k += np.uint64(mask[i])
+    return out[:count]
 
 
 @_jit

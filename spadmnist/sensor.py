@@ -369,7 +369,7 @@ class Sensor:
             key = streams.key("thinning")
             kept = kernels.thinned(now, offsets, drawn.ravel(), events.image_offsets, streams.images, key)
             events = events.keep(kept)
-            factors = {kind: factor[kept] for kind, factor in factors.items()}
+            factors = {kind: factor[kept] for kind, factor in factors.items()} if causes else {}
         if causes:
             events.cause = self._attributed(events, photons, parts, factors, conditions, streams)
             events.parent = np.full(len(events), -1, np.int64)

@@ -16,18 +16,7 @@ class Afterpulsing(Traps):
     """
 
     cause = "afterpulse"
-    moves = (
-        "intervals",
-        "edge",
-        "fano",
-        "level",
-        "dark_level",
-        "autocorrelation",
-        "first",
-        "frames_lag",
-        "map",
-        "saturation",
-    )
+    moves = ("intervals", "edge", "fano", "frames_lag", "level", "dark_level", "first")
 
     probability = parameter(
         0.005,

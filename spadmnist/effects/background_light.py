@@ -15,6 +15,8 @@ class BackgroundLight(Effect, stage="dark"):
     Source: no published number; up to 20 % of the signal is realistic.
     """
 
+    moves = ("linearity", "level")
+
     rate = parameter(
         100.0,
         "Hz",

@@ -60,6 +60,7 @@ class BlinkingDarkCounts(Effect, stage="arrival"):
 
     counted = True
     acts_on = "own"
+    moves = ("fano", "dark_map", "dark_level", "level", "outliers")
 
     amplitude = parameter(
         1000.0,

@@ -16,6 +16,7 @@ class CountSaturation(Effect, stage="readout"):
     """
 
     counted = True
+    moves = ("saturation",)
 
     bits = parameter(8.0, "", "length of the counter", bounds=(1, 32), search=(1, 16))
 

@@ -26,7 +26,7 @@ class Crosstalk(Effect, stage="correlated"):
     """
 
     counted = True
-    moves = ("neighbours", "far_pairs", "ceiling", "level", "dark_level", "surface", "fano", "first")
+    moves = ("neighbours", "ceiling", "level", "dark_level")
 
     probability = parameter(
         0.002,

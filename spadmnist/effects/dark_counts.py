@@ -14,6 +14,7 @@ class DarkCounts(Effect, stage="dark"):
     """
 
     cause = "dark"
+    moves = ("dark_level", "dark_map", "level")
 
     rate = parameter(
         100.0,

@@ -18,18 +18,7 @@ class DeadTime(Effect, stage="dead_time"):
     tau_d), Knoll, Radiation Detection and Measurement, ch. 4.
     """
 
-    moves = (
-        "edge",
-        "intervals",
-        "linearity",
-        "fano",
-        "level",
-        "map",
-        "rows_columns",
-        "surface",
-        "ceiling",
-        "saturation",
-    )
+    moves = ("edge", "intervals", "linearity", "fano", "level", "ceiling")
 
     duration = parameter(
         50e-9,

@@ -38,6 +38,8 @@ class Flicker(Effect, stage="arrival"):
     Source: no published number; 100 or 120 Hz and their harmonics, 0.01-10 %, are realistic.
     """
 
+    moves = ("spectrum", "far_pairs", "neighbours", "autocorrelation", "trend")
+
     amplitude = parameter(
         0.05, "", "largest relative change of the light", symbol="m", bounds=(0, 1), off=0.0, search=(1e-4, 0.5)
     )

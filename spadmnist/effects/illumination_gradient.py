@@ -16,6 +16,8 @@ class IlluminationGradient(Effect, stage="light"):
     Source: no published number; 0.5-10 % over the array is what a good set-up shows.
     """
 
+    moves = ("surface", "level")
+
     x = parameter(
         0.05,
         "",

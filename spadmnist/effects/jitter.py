@@ -22,6 +22,7 @@ class Jitter(Effect, stage="timing"):
     """
 
     counted = True
+    moves = ("edge",)
 
     sigma = parameter(
         50e-12,

@@ -21,6 +21,7 @@ class ReadoutLoss(Effect, stage="readout"):
     """
 
     counted = True
+    moves = ("ceiling", "linearity", "far_pairs", "neighbours", "edge", "intervals", "spectrum", "trend")
 
     service_time = parameter(
         10e-9,

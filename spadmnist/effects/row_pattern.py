@@ -16,6 +16,8 @@ class RowPattern(Pattern, stage="light"):
     Source: no published number; 0.1-3 % from row to row is realistic.
     """
 
+    moves = ("rows_columns", "surface", "level")
+
     gain = parameter(1.0, "", "gain of a row", bounds=(0, None), off=1.0, search=(0.5, 1.5), per="row")
 
     def line(self, chip: Chip) -> np.ndarray:

@@ -18,6 +18,19 @@ class ShortGate(Effect, stage="gate"):
     5.75 ns; for a fixed error, 0.2-20 ns a frame by experience, no published number.
     """
 
+    moves = (
+        "first",
+        "spectrum",
+        "level",
+        "dark_level",
+        "ceiling",
+        "intervals",
+        "edge",
+        "far_pairs",
+        "neighbours",
+        "frames_lag",
+    )
+
     fraction = parameter(
         1.0,
         "",

@@ -17,7 +17,7 @@ class SlowAfterpulsing(Traps):
     """
 
     cause = "slow_afterpulse"
-    moves = ("fano", "intervals", "autocorrelation", "frames_lag", "level", "dark_level", "first", "edge", "saturation")
+    moves = ("fano", "intervals", "autocorrelation", "frames_lag", "level", "dark_level")
 
     probability = parameter(
         0.002,

@@ -20,7 +20,7 @@ class SlowRecovery(Effect, stage="dead_time"):
     Source: Krause and Walenta, arXiv 2507.10361; typical 1-50 ns.
     """
 
-    moves = ("edge", "intervals", "linearity", "fano", "level", "saturation")
+    moves = ("edge", "intervals", "linearity", "fano", "level")
 
     time_constant = parameter(
         5e-9,

@@ -11,10 +11,11 @@ from ..events import Events
 from ..streams import Draws
 from . import Conditions, Effect, parameter
 
-_MOST_TERMS = 16
+_MOST_TERMS = 9
 _FLIPS = 4e6  # an image that has more of them gets fewer terms
 _MOST_FLIPS = 5e7
-_WINDOW = 16384  # flips that are looked at together: they stay in the processor's cache
+_WINDOW = 4096  # flips that are looked at together
+_FINE = 8  # buckets of time to a flip
 _BATCH = 64  # flips that are drawn together: a divisor of the window
 
 
@@ -38,7 +39,7 @@ def levels(
     out = np.empty(times.size)
     flips = np.empty(_WINDOW)
     before = np.empty(_WINDOW)
-    first = np.empty(2 * _WINDOW, np.int32)
+    first = np.empty(_FINE * _WINDOW, np.int32)
     place = np.empty(pixels, np.int64)
     waits = np.empty(_BATCH)
     choices = np.empty(_BATCH)
@@ -67,10 +68,10 @@ def levels(
                     before[count] = power[up]
                     count += 1
                     up += -1 if choices[k] < up else 1
-            # `first`: of all flips, the first one in a bucket of time or behind it, two buckets to a flip. Flips and
+            # `first`: of all flips, the first one in a bucket of time or behind it, `_FINE` buckets to a flip. Flips and
             # events find their buckets by one formula, so that rounding cannot put one on the wrong side of another
-            fine = 2 * count / (now - begin)
-            last = 2 * count - 1
+            fine = _FINE * count / (now - begin)
+            last = _FINE * count - 1
             first[: last + 1] = 0
             for k in range(count):
                 first[min(int((flips[k] - begin) * fine), last)] += 1
@@ -98,7 +99,7 @@ class SourceNoise(Effect, stage="arrival"):
 
     g2(tau) - 1 = contrast^2 exp(-2 tau / coherence_time). The power is 1 plus a sum of independent telegraphs, each of
     which flips between two equal and opposite values at the rate 1 / coherence_time: as many as the contrast allows
-    without a negative power, at most 16 (fewer where one exposure would see more than 4e6 flips). It multiplies the
+    without a negative power, at most 9 (fewer where one exposure would see more than 4e6 flips). It multiplies the
     light under both rules; dark counts stay as they are.
     Source: Mandel and Wolf, Optical Coherence and Quantum Optics (1995), for counts of fluctuating light. No published
     number: a lamp's coherence time (about 0.2 ps for 5 nm at 500 nm) is out of sight; pseudo-thermal light and the
@@ -106,6 +107,7 @@ class SourceNoise(Effect, stage="arrival"):
     """
 
     counted = True
+    moves = ("far_pairs", "neighbours", "autocorrelation", "spectrum", "fano", "intervals", "frames_lag", "ceiling")
 
     contrast = parameter(
         0.1, "", "relative standard deviation of the light's power", bounds=(0, 1), off=0.0, search=(1e-3, 1)

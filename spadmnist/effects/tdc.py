@@ -19,6 +19,7 @@ class Tdc(Effect, stage="timing"):
 
     counted = True
     last = True  # whatever else happens to a time stamp happens before it becomes a number
+    moves = ("phase", "edge", "ceiling")
 
     resolution = parameter(
         10e-12,

@@ -22,6 +22,7 @@ class TdcNonlinearity(Effect, stage="timing"):
 
     counted = True
     after = "jitter"
+    moves = ("phase", "edge")
 
     widths = parameter(
         1.0,
