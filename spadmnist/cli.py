@@ -369,6 +369,100 @@ def _begin_effect(name: str, stage: str | None, as_json: bool) -> None:
     click.echo("\n".join([*lines, f"  spadmnist generate my.yaml -o out --plugin {path}"]))
 
 
+@cli.command("statistics", short_help="List what measurements are compared by, or describe one.")
+@click.argument("name", required=False)
+@_plugin
+@_json
+def statistics_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool) -> None:
+    """List the statistics by which models and measurements are compared, or describe NAME with its law.
+
+    \b
+    spadmnist statistics
+    spadmnist statistics neighbours
+    """
+    _load(plugin_files)
+    _describe("statistic", name, as_json)
+
+
+@cli.command(short_help="Where does a model fail?")
+@click.argument("sensor", type=click.Path(path_type=Path))
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
+)
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="REPORT",
+    help="Folder for a report: one HTML page with pictures.",
+)
+@click.option(
+    "--tolerance",
+    metavar="X",
+    help='What is smaller does not matter: "0.5 %" of the detections or of the rate.',
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
+)
+@_jobs
+@_plugin
+def compare(
+    sensor: Path,
+    measurement: Path,
+    json_file: Path | None,
+    output: Path | None,
+    tolerance: str | None,
+    seed: int,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+) -> None:
+    """Set the model SENSOR beside MEASUREMENT: where does it fail, and by how much?
+
+    Every capture is simulated many times. A check fails where the data lie outside what the model itself scatters; a
+    right model is called wrong once in a hundred comparisons. Exit status: 0 the model is adequate, 1 it fails.
+
+    \b
+    spadmnist compare sensor.yaml lab/2025-03-01 -o report
+    spadmnist compare sensor.yaml lab/2025-03-01 --tolerance "0.5 %" --json answer.json
+    """
+    from . import config as configs
+    from . import disk, units
+    from . import measurement as measurements
+    from .criticism import compare as criticism
+    from .errors import InputError
+
+    _load(plugin_files)
+    smallest = None
+    if tolerance is not None:
+        try:
+            smallest = float(units.parse(tolerance, ""))
+        except ValueError as error:
+            raise InputError(f"--tolerance: {error}") from None
+    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    with _terminal() as progress:
+        progress.start("comparing", 100, 0)
+        done = [0.0]
+
+        def told(what: str, share: float) -> None:
+            progress.advance(100 * share - done[0], what)
+            done[0] = 100 * share
+
+        found = criticism.compare(model, data, seed, smallest, jobs or _processors(), progress=told)
+        progress.stop()
+    if json_file is not None:
+        with _writing(json_file):
+            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
+    if output is not None:
+        from . import pages
+
+        page = pages.comparison(found, output)
+        _say(f"Report: {page}")
+    click.echo(criticism.table(found))
+    if found.verdict != "adequate":
+        sys.exit(1)
+
+
 @cli.command("methods", short_help="List flux reconstructions, or describe one.")
 @click.argument("name", required=False)
 @_plugin
@@ -392,10 +486,8 @@ def _describe(kind: str, name: str | None, as_json: bool) -> None:
     try:
         if as_json:
             click.echo(json.dumps(reference.as_data(kind, name)))
-        elif kind == "effect":
-            click.echo(reference.effect_page(name) if name else reference.effect_list())
         else:
-            click.echo(reference.method_page(name) if name else reference.method_list())
+            click.echo(reference.text(kind, name))
     except KeyError as error:
         raise SpadError(str(error.args[0])) from None
 

@@ -1,18 +1,20 @@
-"""The reference of effects and reconstruction methods as text, made from their classes."""
+"""The reference of effects, statistics and reconstruction methods as text, made from their classes."""
 
 from __future__ import annotations
 
 import inspect
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from . import effects, units
 from .effects import STAGES, Effect
-from .plugins import Parameter, Plugin, source_file
+from .plugins import Parameter, Plugin, Registry, source_file
 from .readout import READOUTS
 from .reconstruct import Method
+from .recording import MODALITIES
+from .statistics import Statistic
 
 _WIDTH = 100
 
@@ -85,12 +87,43 @@ def method_page(name: str) -> str:
     return _page(cls, facts, ["In a config:", "", f"  reconstruct: [{cls.name}]"])
 
 
+def statistic_list() -> str:
+    """Every statistic: name, modalities, unit, first line of its docstring; TR first."""
+    known: list[type[Statistic]] = [Statistic.registry.find(name) for name in Statistic.registry]
+    known.sort(key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
+    rows = [(cls.name, " ".join(cls.modalities), cls.unit, cls.summary()) for cls in known]
+    return _listing(("statistic", "of", "unit", "what it looks at"), rows)
+
+
+def statistic_page(name: str) -> str:
+    """All about one statistic. Raises KeyError with a sentence where there is none."""
+    cls: type[Statistic] = Statistic.registry.find(name)
+    return _page(cls, [f"of: {', '.join(cls.modalities)}", f"unit: {cls.unit}"], [])
+
+
+# kind of plug-in -> its registry, the list of all, the page of one
+_KINDS: dict[str, tuple[Registry, Callable[[], str], Callable[[str], str]]] = {
+    "effect": (Effect.registry, effect_list, effect_page),
+    "method": (Method.registry, method_list, method_page),
+    "statistic": (Statistic.registry, statistic_list, statistic_page),
+}
+
+
+def text(kind: str, name: str | None = None) -> str:
+    """The reference of `kind` ("effect", "method" or "statistic") for people: all, or the page of one.
+
+    Raises KeyError with a sentence where there is none of that name.
+    """
+    _, listed, page = _KINDS[kind]
+    return page(name) if name else listed()
+
+
 def as_data(kind: str, name: str | None = None) -> list[dict[str, Any]] | dict[str, Any]:
-    """The reference of `kind` ("effect" or "method") for programs: all, or the one of that name.
+    """The reference of `kind` ("effect", "method" or "statistic") for programs: all, or the one of that name.
 
     Raises KeyError with a sentence where there is none.
     """
-    registry = Effect.registry if kind == "effect" else Method.registry
+    registry = _KINDS[kind][0]
     return _data(registry.find(name)) if name else [_data(registry.find(known)) for known in registry]
 
 
@@ -98,6 +131,8 @@ def _data(cls: type[Plugin]) -> dict[str, Any]:
     out: dict[str, Any] = {"name": cls.name, "about": inspect.getdoc(cls)}
     if issubclass(cls, Effect):
         out |= {"stage": cls.stage, "expected_rate": mean_law(cls) or None}
+    if issubclass(cls, Statistic):
+        out |= {"modalities": list(cls.modalities), "unit": cls.unit}
     if issubclass(cls, Method):
         out |= {"readouts": list(cls.readouts()), "unit": cls.unit, "normalised": cls.normalised}
     facts = ("unit", "about", "symbol", "default", "choices", "bounds", "off", "search")

@@ -9,8 +9,10 @@ uncertainty, is a check of its own.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,13 +21,12 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy import stats
 
-from .. import __version__, light, plugins
-from ..errors import InputError
+from .. import plugins, twin
 from ..measurement import Measurement
-from ..recording import Capture, Recording, of_image
+from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Statistic, Summary
-from ..streams import BLOCK, Streams
+from ..streams import Streams
 from .nulls import Judgement, Null, learn
 
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
@@ -135,17 +136,6 @@ def statistics_for(modality: str) -> list[Statistic]:
     return [kind() for kind in kinds if modality in kind.modalities]
 
 
-def photons_at(sensor: Sensor, capture: Capture) -> float | None:
-    """Photons/s on the active area of a pixel as the capture states its light; 0 in the dark, None where it is free."""
-    if capture.light.dark:
-        return 0.0
-    if capture.light.level is None:
-        return None
-    assert capture.light.wavelength is not None
-    convert = light.photons_from_lux if capture.light.kind_of_level == "lux" else light.photons_from_irradiance
-    return convert(capture.light.level, sensor.layout.active_area, capture.light.wavelength)
-
-
 def simulated(
     sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
 ) -> Iterator[Recording]:
@@ -155,16 +145,10 @@ def simulated(
     """
     expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
     step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
-    if sensor.block > 1:
-        step = -(-step // BLOCK) * BLOCK
-    dead_time = sensor.nominal_dead_time
     for start in range(0, len(numbers), step):
         some = slice(start, start + step)
         streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
-        shone = np.repeat(photons[some, None], sensor.layout.pixels, axis=1)
-        made = sensor.expose(shone, capture.conditions, streams, (capture.modality,))
-        for i in range(len(shone)):
-            yield of_image(made, i, capture, sensor.layout, dead_time)
+        yield from twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
 
 
 @dataclass(frozen=True)
@@ -198,10 +182,37 @@ class CaptureNull:
         return math.exp(found), error, slope
 
 
+@dataclass(frozen=True)
+class _Model:
+    """A sensor on its way to a worker, which must have run the user's plug-in files before it can unpack it."""
+
+    files: tuple[str, ...]
+    packed: bytes
+
+    @staticmethod
+    def of(sensor: Sensor) -> _Model:
+        return _Model(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
+
+    @property
+    def sensor(self) -> Sensor:
+        for file in self.files:
+            plugins.load_file(file)
+        return _unpacked(self.packed)
+
+
+@functools.lru_cache(maxsize=2)
+def _unpacked(packed: bytes) -> Sensor:
+    """What this program has packed itself, a moment ago."""
+    sensor = pickle.loads(packed)
+    assert isinstance(sensor, Sensor)
+    return sensor
+
+
 def _reduced(
-    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
+    model: _Model, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
 ) -> tuple[list[int], dict[str, list[Summary]]]:
     """(totals, summaries by statistic) of some of the model's recordings: the task of a worker."""
+    sensor = model.sensor
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
     known = statistics_for(capture.modality)
@@ -240,7 +251,7 @@ def model_of(
     told: Callable[[int], None],
 ) -> CaptureNull:
     """Simulate a capture many times and learn its nulls. total: detections measured, to find a level that is free."""
-    stated = photons_at(sensor, capture)
+    stated = twin.photons_at(capture, sensor.layout)
     centre = 0.0 if capture.light.dark else _level_for(sensor, capture, total, stated)
     half = 0.0
     if not capture.light.dark:
@@ -255,8 +266,9 @@ def model_of(
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
     factors = np.exp(half * np.linspace(-1, 1, replicates)[order])
     tasks = np.array_split(numbers, max(1, min(replicates // 4, 24))) if sensor.block == 1 else [numbers]
+    packed = _Model.of(sensor)
     results = parallel(
-        delayed(_reduced)(sensor, capture, centre * factors[part.astype(int)], part, seed) for part in tasks
+        delayed(_reduced)(packed, capture, centre * factors[part.astype(int)], part, seed) for part in tasks
     )
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
@@ -313,11 +325,7 @@ def compare(
     Raises InputError where sensor and measurement do not belong together.
     """
     sensor = sensor.settled()
-    if (sensor.layout.rows, sensor.layout.columns) != (measurement.rows, measurement.columns):
-        raise InputError(
-            f"the sensor has {sensor.layout.rows} x {sensor.layout.columns} pixels, the measurement "
-            f"{measurement.rows} x {measurement.columns}; they must be the same array"
-        )
+    measurement.check_layout(sensor.layout)
     say = progress or (lambda what, share: None)
     checks: list[Check] = []
     judged: list[tuple[Judgement, Null]] = []
@@ -326,8 +334,11 @@ def compare(
     with Parallel(n_jobs=jobs, return_as="generator") as parallel:
         for k, capture in enumerate(captures):
             say(capture.id, k / len(captures))
-            recording = None if capture.mean is not None else measurement.recording(capture.id, sensor)
-            total = float(capture.mean * sensor.layout.pixels) if recording is None else float(recording.totals.sum())
+            recording = measurement.recording(capture.id, sensor) if capture.mean is None else None
+            if recording is not None:
+                total = float(recording.totals.sum())
+            else:
+                total = (capture.mean or 0.0) * sensor.layout.pixels
             seen = capture if recording is None else recording.capture
             shown = _Share(say, capture.id, k, len(captures), replicates)
             made = model_of(sensor, seen, total, seed, replicates, parallel, shown)
@@ -413,7 +424,7 @@ def _level_checks(
         return [
             Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels, no light", size, relative)
         ]
-    stated = photons_at(sensor, capture)
+    stated = twin.photons_at(capture, sensor.layout)
     factor, error, elasticity = made.factor_of(total)
     if stated is not None and elasticity > 0.01:
         levels.append((capture, math.log(factor * made.photons / stated), error, elasticity))
@@ -487,4 +498,40 @@ def canonical(comparison: Comparison) -> str:
     return json.dumps(comparison.as_data(), indent=1, allow_nan=False)
 
 
-__all__ = ["Check", "Comparison", "Nuisance", "__version__", "compare"]
+def table(comparison: Comparison) -> str:
+    """The answer for a terminal, at most 100 characters wide: verdict, failing checks, light."""
+    failing = comparison.failing
+    lines = []
+    if failing:
+        lines.append(f"The model fails {len(failing)} of {len(comparison.checks)} checks. The clearest first:")
+        lines.append("")
+        lines += _columns(
+            [("statistic", "capture", "p", "where", "measured against expected")]
+            + [(c.statistic, c.capture or "all", f"{c.p_value:.1g}", c.where, c.size) for c in failing[:12]]
+        )
+        if len(failing) > 12:
+            lines.append(f"... and {len(failing) - 12} more (--json FILE or -o REPORT holds all)")
+    else:
+        lines.append(f"The model is adequate: none of {len(comparison.checks)} checks fails.")
+        closest = sorted(comparison.checks, key=lambda c: c.p_value)[:3]
+        near = ", ".join(f"{c.statistic} of {c.capture or 'all'} (p = {c.p_value:.2g})" for c in closest)
+        lines.append(f"Nearest to failing: {near}.")
+    lines.append("")
+    lines.append(
+        f"misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
+        f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture;"
+    )
+    lines.append(f"a right model is called wrong in {comparison.false_alarm_rate:.0%} of comparisons.")
+    for n in comparison.nuisances:
+        where = n.capture or "all lit captures"
+        interval = f"95 %: {n.low:.4f} to {n.high:.4f}"
+        lines.append(f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}")
+    return "\n".join(lines)
+
+
+def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+__all__ = ["Check", "Comparison", "Nuisance", "canonical", "compare", "table"]

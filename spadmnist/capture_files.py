@@ -1,0 +1,535 @@
+"""One HDF5 file per capture of a measurement: read with care, since it comes from anywhere, and written.
+
+| modality | data sets | attributes |
+| --- | --- | --- |
+| tr | `time` (ticks since the start of the exposure), `pixel` (row-major), one entry per detection | `tick` (s) |
+| qis | `frames` (M, rows, ceil(columns / 8)) uint8, packed along columns, high bit first | `width` (columns) |
+| | or (M, rows, columns) of 0 and 1 | |
+| str | `frames` (M, rows, columns) ticks since the start of the frame; none = ceil(frame time / tick) | `tick` (s) |
+| counts | `frames` (M, rows, columns) | `bits`, `counting` (`frames` or `counter`) |
+
+Only plain data sets of unsigned integers that lie in the file itself are read: no links, no data of other files, no
+filter but HDF5's own. What a file declares is compared with the capture before any memory is taken for it. Frames are
+read piece by piece, when they are asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import units
+from .errors import InputError, SpadError
+from .events import Events, Layout
+from .kernels import jit
+from .readout import counts_type, no_detection, unsigned_for
+from .recording import Capture, Recording
+
+_MOST_EVENTS = 1 << 29  # of a capture: 16 bytes each are 8 GiB
+_MOST_BITS = 16  # of a count
+_LARGEST_CHUNK = 1 << 28  # bytes
+_LARGEST_FRAME = 1 << 28  # bytes
+_PIECE = 1 << 20  # events that are read at a time
+_FRAMES_AT_ONCE = 1 << 25  # bytes as they are stored
+_KEPT = 1 << 26  # bytes: frames that are no more than this are read once and kept
+_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
+# what h5py raises on damaged files
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, OverflowError, TypeError, EOFError)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a file says of itself, checked against its capture."""
+
+    capture: Capture  # with what only the file knows
+    tick: float | None = None
+    packed: bool = False
+
+
+# --- the file -----------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The HDF5 file; whatever is wrong with it becomes a sentence."""
+    import h5py
+
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(f"{path}: is no file; a capture is one HDF5 file")
+        if not h5py.is_hdf5(path):
+            raise InputError(f"{path}: is not an HDF5 file; write the capture as one, or name another file")
+        with h5py.File(path, "r", locking="best-effort", rdcc_nbytes=_FRAMES_AT_ONCE) as file:
+            yield file
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; put it there, or name another one") from None
+    except PermissionError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); allow it") from None
+    except MemoryError:
+        raise InputError(f"{path}: needs more memory than there is; cut the capture into several") from None
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{path}: is damaged, cut short or was never closed ({reason[:120]}); copy it again from where it was made"
+        ) from None
+
+
+def _data_set(file: Any, name: str, path: Path) -> Any:
+    """A plain data set of unsigned integers (or of booleans) in the file itself."""
+    import h5py
+
+    there = ", ".join(sorted(str(key)[:40] for key in list(file)[:10])) or "nothing"
+    link = file.get(name, getlink=True)
+    if link is None:
+        raise InputError(f"{path}: has no data set {name}; there is {there}")
+    if not isinstance(link, h5py.HardLink):
+        raise InputError(f"{path}: {name} is a link to somewhere else, which is not followed; copy the data in")
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        raise InputError(f"{path}: {name} is a {type(found).__name__.lower()}, not a data set")
+    if found.is_virtual or found.external:
+        raise InputError(f"{path}: the data of {name} lie in another file, which is not read; copy them in")
+    if found.dtype.kind not in "ub":
+        raise InputError(f"{path}: {name} holds {found.dtype}; unsigned integers are read: store it as uint32 or alike")
+    made = found.id.get_create_plist()
+    for code in (made.get_filter(i)[0] for i in range(made.get_nfilters())):
+        if code not in _FILTERS:
+            allowed = ", ".join(_FILTERS.values())
+            raise InputError(f"{path}: {name} is stored with the filter number {code}; allowed are {allowed}")
+    if found.chunks is not None and math.prod(found.chunks) * found.dtype.itemsize > _LARGEST_CHUNK:
+        raise InputError(
+            f"{path}: {name} is stored in chunks of more than {_LARGEST_CHUNK >> 20} MiB; take smaller ones"
+        )
+    return found
+
+
+def _check_stored(found: Any, name: str, path: Path) -> None:
+    """What was declared but never written would be read as zeros."""
+    if not found.size:
+        return
+    if found.chunks is not None:
+        wanted = math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks, strict=True))
+        whole = found.id.get_num_chunks() == wanted
+    else:
+        whole = found.id.get_storage_size() >= found.size * found.dtype.itemsize
+    if not whole:
+        raise InputError(
+            f"{path}: {name} declares {found.size:,} values, and not all of them were written; write it again"
+        )
+
+
+def _attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
+    """A number or text from the first of some nodes that has it; None where none has."""
+    import h5py
+
+    for node in nodes:
+        if name not in node.attrs:
+            continue
+        description = node.attrs.get_id(name)
+        text = description.dtype.kind == "S" or h5py.check_string_dtype(description.dtype) is not None
+        if math.prod(description.shape) != 1 or not (text or description.dtype.kind in "iuf"):
+            raise InputError(f"{path}: the attribute {name} is not one number or one text; write it as that")
+        value = np.asarray(node.attrs[name]).ravel()[0]
+        if text:
+            return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+        return value.item()
+    return None
+
+
+def examine(path: Path, capture: Capture, shape: tuple[int, int]) -> Capture:
+    """Compare what a file declares with its capture; the capture with what only the file knows (`counts`).
+
+    shape: rows and columns of the array. Raises InputError with a sentence.
+    """
+    with _opened(path) as file:
+        return _found(file, capture, shape, path).capture
+
+
+def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _Found:
+    said = _attribute((file,), "modality", path)
+    if said is not None and said != capture.modality:
+        raise InputError(
+            f"{path}: says that it is {str(said)[:40]!r}, but the capture {capture.id} is {capture.modality!r}; "
+            "correct one of them"
+        )
+    if capture.modality == "tr":
+        return _found_events(file, capture, path)
+    frames = _data_set(file, "frames", path)
+    if frames.ndim != 3:
+        raise InputError(f"{path}: frames has {frames.ndim} axes, {frames.shape}; it needs (frames, rows, columns)")
+    if capture.modality == "counts":
+        found = _found_counts(file, frames, capture, path)
+    elif capture.modality == "str":
+        tick = _tick((file, frames), capture.conditions.frame_time, path)
+        found = _Found(capture, tick)
+    else:
+        found = _Found(capture, None, _is_packed(file, frames, shape[1], path))
+    conditions = found.capture.conditions
+    count = conditions.count_frames if capture.modality == "counts" else conditions.frames
+    wanted = (count, shape[0], -(-shape[1] // 8) if found.packed else shape[1])
+    if frames.shape[1:] != wanted[1:]:
+        raise InputError(
+            f"{path}: frames are {_by(frames.shape[1:])}, but the array has {_by(shape)} pixels"
+            f"{f' ({_by(wanted[1:])} bytes)' if found.packed else ''}; correct the layout or the file"
+        )
+    if frames.shape[0] != count:
+        raise InputError(
+            f"{path}: holds {frames.shape[0]:,} frames, but {capture.id} says {count:,}; correct one of them"
+        )
+    if frames.dtype.kind == "b" and (found.packed or capture.modality != "qis"):
+        raise InputError(f"{path}: frames holds booleans; store unsigned integers")
+    if math.prod(wanted[1:]) * frames.dtype.itemsize > _LARGEST_FRAME:
+        raise InputError(f"{path}: one frame has more than {_LARGEST_FRAME >> 20} MiB; that is more than can be read")
+    _check_stored(frames, "frames", path)
+    return found
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in shape)
+
+
+def _found_events(file: Any, capture: Capture, path: Path) -> _Found:
+    time, pixel = _data_set(file, "time", path), _data_set(file, "pixel", path)
+    for name, found in (("time", time), ("pixel", pixel)):
+        if found.ndim != 1 or found.dtype.kind != "u":
+            raise InputError(f"{path}: {name} is {found.dtype} of shape {found.shape}; it needs one unsigned axis")
+    if time.shape != pixel.shape:
+        raise InputError(
+            f"{path}: time has {len(time):,} entries and pixel {len(pixel):,}; both need one for each detection"
+        )
+    if len(time) > _MOST_EVENTS:
+        raise InputError(
+            f"{path}: declares {len(time):,} detections; a capture may have {_MOST_EVENTS:,}, which take 8 GiB: "
+            "cut it into several"
+        )
+    _check_stored(time, "time", path)
+    _check_stored(pixel, "pixel", path)
+    return _Found(capture, _tick((file, time), capture.conditions.exposure, path))
+
+
+def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
+    value = _attribute(nodes, "tick", path)
+    if value is None:
+        raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
+    if isinstance(value, str) or not 0 < value < math.inf:
+        raise InputError(f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0")
+    if value > end:
+        raise InputError(
+            f"{path}: a tick of {units.show(value, 's')} is longer than the {units.show(end, 's')} that it divides; "
+            "tick is in s"
+        )
+    unsigned_for(end / value, f"{path}: time stamps")
+    return float(value)
+
+
+def _is_packed(file: Any, frames: Any, columns: int, path: Path) -> bool:
+    width = _attribute((frames, file), "width", path)
+    if width is None:
+        if frames.shape[2] == columns:
+            return False
+        hint = ""
+        if frames.shape[2] == -(-columns // 8):
+            hint = f"; if they are packed along columns, write the attribute width = {columns} on frames"
+        raise InputError(f"{path}: frames have {frames.shape[2]} columns, but the array has {columns}{hint}")
+    if width != columns:
+        raise InputError(f"{path}: width is {width}, but the array has {columns} columns; correct one of them")
+    if frames.dtype != np.uint8:
+        raise InputError(f"{path}: packed frames are {frames.dtype}; they must be uint8")
+    return True
+
+
+def _found_counts(file: Any, frames: Any, capture: Capture, path: Path) -> _Found:
+    """Count frames: a capture states the clock of the binary frames that they sum, or that of the count frames."""
+    c = capture.conditions
+    bits = _attribute((file, frames), "bits", path)
+    counting = _attribute((file, frames), "counting", path) or "frames"
+    if bits is None:
+        raise InputError(f"{path}: lacks the attribute bits, of a count; write for example bits = 8")
+    if isinstance(bits, (str, float)) or not 1 <= bits <= _MOST_BITS:
+        raise InputError(f"{path}: bits is {bits!r}; it must be a whole number from 1 to {_MOST_BITS}")
+    if counting not in ("frames", "counter"):
+        raise InputError(f"{path}: counting is {str(counting)[:40]!r}; it is one of frames, counter")
+    if c.bits and (bits, counting) != (c.bits, c.counting):
+        raise InputError(
+            f"{path}: its counts have {bits} bits of a {counting}, but the capture {capture.id} says {c.bits} bits of "
+            f"a {c.counting}; correct one of them"
+        )
+    each = (1 << bits) - 1 if counting == "frames" else 1
+    if each > 1 and c.frames == frames.shape[0]:
+        # the capture counts the frames of the file
+        clock = replace(c, frames=c.frames * each, frame_time=c.frame_time / each, frame_period=c.frame_period / each)
+    elif c.frames == frames.shape[0] * each:
+        clock = c
+    else:
+        both = f" or, as binary frames, {frames.shape[0] * each:,}" if each > 1 else ""
+        raise InputError(
+            f"{path}: holds {frames.shape[0]:,} frames, but the capture {capture.id} says {c.frames:,}; "
+            f"write {frames.shape[0]:,}{both}"
+        )
+    return _Found(replace(capture, conditions=replace(clock, bits=int(bits), counting=str(counting))))
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+
+
+def read(path: Path, capture: Capture, layout: Layout, dead_time: float) -> tuple[Recording, list[str]]:
+    """(the recording of a capture, what is to be known of its data). Events are read now, frames when asked for.
+
+    Raises InputError with a sentence.
+    """
+    with _opened(path) as file:
+        found = _found(file, capture, layout.shape, path)
+        if capture.modality == "tr":
+            events, notes = _events(file, found, layout.pixels, path)
+            return Recording(found.capture, layout, events, None, found.tick, dead_time), notes
+    frames = StoredFrames(path, found, layout.shape)
+    return Recording(found.capture, layout, None, frames, found.tick, dead_time), []
+
+
+def _events(file: Any, found: _Found, pixels: int, path: Path) -> tuple[Events, list[str]]:
+    """Detections as rows of pixels, by counting: two passes, whatever the order in the file."""
+    assert found.tick is not None
+    end = no_detection(found.capture.conditions.exposure, found.tick)  # what is rounded up may reach it
+    time, pixel = file["time"], file["pixel"]
+    where = np.empty(len(pixel), np.uint16 if pixels <= 1 << 16 else np.uint32)
+    counts = np.zeros(pixels, np.int64)
+    for start in range(0, len(pixel), _PIECE):
+        piece = pixel[start : start + _PIECE]
+        if len(piece) and int(piece.max()) >= pixels:
+            wrong = start + int(np.argmax(piece >= pixels))
+            raise InputError(
+                f"{path}: pixel[{wrong}] is {pixel[wrong]}, but the array has pixels 0 to {pixels - 1}; "
+                "correct the layout or the file"
+            )
+        where[start : start + _PIECE] = piece
+        _count(where[start : start + _PIECE], counts)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    ticks = np.empty(len(time), unsigned_for(end, f"{path}: time stamps"))
+    place, late = offsets[:-1].copy(), 0
+    for start in range(0, len(time), _PIECE):
+        piece = time[start : start + _PIECE]
+        if int(piece.max()) > end:
+            wrong = start + int(np.argmax(piece > end))
+            raise InputError(
+                f"{path}: time[{wrong}] is {time[wrong]} ticks of {units.show(found.tick, 's')}, beyond the exposure, "
+                f"{units.show(found.capture.conditions.exposure, 's', 9)}; correct tick, the exposure or the file"
+            )
+        late += _place(piece.astype(ticks.dtype), where[start : start + _PIECE], offsets, place, ticks)
+    notes = []
+    if late:
+        _sort_rows(ticks, offsets)
+        notes.append(
+            f"{late:,} of {len(ticks):,} detections stand behind a later one of their own pixel; they were sorted"
+        )
+    return Events(None, offsets, pixels, ticks, found.tick, end=found.capture.conditions.exposure), notes
+
+
+@jit
+def _count(where, counts):  # type: ignore[no-untyped-def]
+    for i in range(where.size):
+        counts[where[i]] += 1
+
+
+@jit
+def _place(times, where, offsets, place, out):  # type: ignore[no-untyped-def]
+    """Put times behind those that their pixels have; how many of them are earlier than the one before."""
+    late = 0
+    for i in range(times.size):
+        pixel = where[i]
+        at = place[pixel]
+        late += at > offsets[pixel] and out[at - 1] > times[i]
+        out[at] = times[i]
+        place[pixel] = at + 1
+    return late
+
+
+@jit
+def _sort_rows(values, offsets):  # type: ignore[no-untyped-def]
+    for row in range(offsets.size - 1):
+        part = values[offsets[row] : offsets[row + 1]]
+        part.sort()
+
+
+class StoredFrames:
+    """Frames of a file, read when they are asked for; see `recording.FrameSource`. Bits are packed along columns.
+
+    It holds no open file: it may be pickled, and used after a fork.
+    """
+
+    def __init__(self, path: Path, found: _Found, shape: tuple[int, int]):
+        self._path, self._found, self._array = path, found, shape
+        c = found.capture.conditions
+        modality = found.capture.modality
+        count = c.count_frames if modality == "counts" else c.frames
+        self.shape = (count, shape[0], -(-shape[1] // 8) if modality == "qis" else shape[1])
+        self._kept: tuple[int, np.ndarray] | None = None  # the number of its first frame, frames
+
+    def __repr__(self) -> str:
+        return f"StoredFrames({self._path}, {_by(self.shape)})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": None}
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        start, stop, step = part.indices(self.shape[0])
+        if step != 1:
+            raise ValueError("frames are read one after the other; take a step of 1")
+        if stop <= start:
+            return np.zeros((0, *self.shape[1:]), self._type)
+        first, kept = self._kept or (0, np.zeros((0, *self.shape[1:]), self._type))
+        if not first <= start < stop <= first + len(kept):
+            with _opened(self._path) as file:
+                frames = _data_set(file, "frames", self._path)
+                first, last = self._around(start, stop, frames)
+                kept = self._read(frames, first, last)
+            self._kept = first, kept
+        return kept[start - first : stop - first]
+
+    @property
+    def _type(self) -> Any:
+        modality = self._found.capture.modality
+        largest = self._found.capture.conditions.largest_count
+        return {"qis": np.uint8, "str": np.uint32}.get(modality) or counts_type(largest)
+
+    def _around(self, start: int, stop: int, frames: Any) -> tuple[int, int]:
+        """Whole chunks, so that none is decoded for each piece of it anew; everything, where that is not much."""
+        if math.prod(self.shape) * np.dtype(self._type).itemsize <= _KEPT:
+            return 0, self.shape[0]
+        rows = frames.chunks[0] if frames.chunks else 1
+        return start // rows * rows, min(-(-stop // rows) * rows, self.shape[0])
+
+    def _read(self, frames: Any, first: int, last: int) -> np.ndarray:
+        out = np.empty((last - first, *self.shape[1:]), self._type)
+        each = math.prod(frames.shape[1:]) * frames.dtype.itemsize
+        step = max(1, _FRAMES_AT_ONCE // each)
+        if frames.chunks:
+            step = max(step // frames.chunks[0], 1) * frames.chunks[0]
+        for start in range(first, last, step):
+            piece = frames[start : min(start + step, last)]
+            self._check(piece, start)
+            if self._found.capture.modality == "qis" and not self._found.packed:
+                piece = np.packbits(piece, axis=2)
+            out[start - first : start - first + len(piece)] = piece
+        return out
+
+    def _check(self, piece: np.ndarray, start: int) -> None:
+        """Raise InputError where a value is not possible."""
+        c = self._found.capture.conditions
+        columns = self._array[1]
+        modality = self._found.capture.modality
+        if self._found.packed:
+            if columns % 8 and (piece[:, :, -1] & (0xFF >> columns % 8)).any():
+                raise InputError(
+                    f"{self._path}: bits beyond the {columns} columns are set; is width right, and the high bit first?"
+                )
+            return
+        if piece.dtype.kind == "b":
+            return
+        most, why = 1, "a bit is 0 or 1"
+        if modality == "str":
+            assert self._found.tick is not None
+            most = no_detection(c.frame_time, self._found.tick)
+            why = f"a frame of {units.show(c.frame_time, 's')} ends at {most} ticks, which means no detection"
+        elif modality == "counts":
+            most, why = c.largest_count, f"{c.bits} bits count up to {c.largest_count}"
+        if int(piece.max()) > most:
+            f, row, column = (int(n[0]) for n in np.nonzero(piece > most))
+            raise InputError(
+                f"{self._path}: frames[{start + f}, {row}, {column}] is {piece[f, row, column]}, but {why}; "
+                "correct the capture or the file"
+            )
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+
+_FINEST = 1e-12  # s: the tick of stamps that a sensor without a converter gives
+
+
+def file_image(recording: Recording) -> bytes:
+    """A whole HDF5 file of a recording, made in memory: the same bytes for the same recording.
+
+    Detections stand grouped by pixel. Stamps that are no whole ticks are rounded down to ticks of 1 ps.
+    """
+    import h5py
+
+    with h5py.File(
+        "capture.h5", "w", driver="core", backing_store=False, block_size=1 << 22, libver=("earliest", "v110")
+    ) as file:
+        _put(file, {"modality": recording.modality})
+        if recording.events is not None:
+            _put_events(file, recording, recording.events)
+        else:
+            _put_frames(file, recording)
+        file.flush()
+        return bytes(file.id.get_file_image())
+
+
+def _put_events(file: Any, recording: Recording, events: Events) -> None:
+    tick, ticks = events.tick, events.ticks
+    if ticks is None or tick is None:
+        tick = _FINEST
+        ticks = (events.times / tick).astype(unsigned_for(recording.conditions.exposure / tick, "time stamps"))
+    pixels = recording.pixels
+    where = np.repeat(np.arange(pixels, dtype=np.uint16 if pixels <= 1 << 16 else np.uint32), events.counts)
+    _put(file, {"tick": tick, "tick_units": "s"})
+    about = "time of each detection since the start of the exposure"
+    for name, data, unit, text in (
+        ("time", ticks, units.show(tick, "s", 12), about),
+        ("pixel", where, "1", "pixel of each detection, counted row by row"),
+    ):
+        _create(file, name, data.shape, data.dtype, min(len(data), 1 << 16), unit, text)[...] = data
+
+
+def _put_frames(file: Any, recording: Recording) -> None:
+    assert recording.frames is not None
+    c, modality = recording.conditions, recording.modality
+    largest = max(recording.none, 1) if modality == "str" else c.largest_count
+    kind = np.dtype({"qis": np.uint8, "str": np.uint32}.get(modality) or counts_type(largest))
+    unit, about = "1", "does a pixel have a detection? Eight columns to a byte, the high bit first"
+    if modality == "str":
+        assert recording.tick is not None
+        if largest >= 1 << 32:
+            raise SpadError(f"{recording.capture.id}: stamps of {largest} ticks do not fit 32 bits; coarsen the tick")
+        _put(file, {"tick": recording.tick, "tick_units": "s"})
+        unit = units.show(recording.tick, "s", 12)
+        about = f"first detection since the start of the frame; {largest}: none"
+    elif modality == "counts":
+        _put(file, {"bits": c.bits, "counting": c.counting})
+        about = "detections of a count frame"
+    shape = recording.frames.shape
+    rows = max(1, min(shape[0], (1 << 20) // max(1, math.prod(shape[1:]) * kind.itemsize)))
+    frames = _create(file, "frames", shape, kind, rows, unit, about)
+    if modality == "qis":
+        frames.attrs["width"] = recording.layout.columns
+    for start, part in recording.chunks():
+        frames[start : start + len(part)] = part
+
+
+def _create(file: Any, name: str, shape: tuple[int, ...], kind: Any, rows: int, unit: str, about: str) -> Any:
+    """An empty data set, packed as every HDF5 program can read it (an empty one has no chunks, and so no filters)."""
+    filters: dict[str, Any] = {}
+    if math.prod(shape):
+        filters = {"chunks": (rows, *shape[1:]), "shuffle": np.dtype(kind).itemsize > 1, "fletcher32": True}
+        filters |= {"compression": "gzip", "compression_opts": 1}
+    made = file.create_dataset(name, shape, np.dtype(kind).newbyteorder("<"), track_times=False, **filters)
+    _put(made, {"units": unit, "long_name": about})
+    return made
+
+
+def _put(node: Any, attributes: dict[str, Any]) -> None:
+    """Text of a fixed length: what HDF5 keeps for text of any length makes it hang on some damaged files."""
+    import h5py
+
+    for name, value in sorted(attributes.items()):
+        if isinstance(value, str):
+            kind = h5py.string_dtype("utf-8", max(1, len(value.encode())))
+            node.attrs.create(name, np.array(value.encode(), kind), dtype=kind)
+        else:
+            node.attrs[name] = value

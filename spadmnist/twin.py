@@ -1,0 +1,191 @@
+"""The model's twin of a measurement: the same captures, as a sensor would have recorded them.
+
+A capture is one image of uniform light. What is too large for the memory is simulated in parts where that is exact:
+where frames do not depend on each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import kernels, light, recording
+from .effects import Conditions
+from .errors import InputError
+from .events import Layout
+from .measurement import Measurement, write
+from .readout import Recorded
+from .recording import Capture, Recording
+from .sensor import Sensor
+from .streams import Streams
+
+_AT_ONCE = 3e7  # expected events of a capture that is simulated in one go; a larger one in parts, where that is exact
+_MOST_AT_ONCE = 1e8  # where it is not
+_MOST = 2e9  # in parts
+
+
+def photons_at(capture: Capture, layout: Layout) -> float | None:
+    """Photons/s on a pixel's active area as a capture states its light; 0 in the dark, None where the level is free."""
+    lit = capture.light
+    if lit.wavelength is None:
+        return 0.0
+    if lit.level is None:
+        return None
+    convert = light.photons_from_lux if lit.kind_of_level == "lux" else light.photons_from_irradiance
+    return convert(lit.level, layout.active_area, lit.wavelength)
+
+
+def model_recordings(
+    sensor: Sensor,
+    capture: Capture,
+    photons: float | np.ndarray,
+    streams: Streams,
+    images: np.ndarray,
+    direct: bool = False,
+) -> list[Recording]:
+    """What the sensor would record in a capture, once for each of `images`.
+
+    photons: photons/s on each pixel's active area: one number, one for each image, or (images, pixels). streams: whose
+    draws are taken; images: (n,) uint64, their numbers, one after the other. A capture that would take more memory than
+    there should be is simulated in parts where that is exact, and refused where it is not (InputError). direct: draw
+    the bits of frames that stand alone without their events, which is faster.
+    """
+    sensor = sensor.settled()
+    pixels, wanted = sensor.layout.pixels, len(images)
+    flux = np.asarray(photons, np.float64)
+    flux = np.broadcast_to(flux[:, None] if flux.ndim == 1 else flux, (wanted, pixels))
+    if capture.modality == "str" and not sensor.tick:
+        raise InputError(f"{capture.id}: STR stamps are whole ticks, and the sensor has no converter; add tdc to it")
+    if not wanted:
+        return []
+    brightest = flux[[int(np.argmax(flux.mean(axis=1)))]]
+    events = float(sensor.expected(brightest, capture.conditions)[0].sum())
+    if (events > _AT_ONCE or (direct and capture.modality == "qis")) and (whole := _in_parts(sensor, capture, events)):
+        return [whole(flux[i], streams.of(images[i : i + 1])) for i in range(wanted)]
+    if events > _MOST_AT_ONCE:
+        raise InputError(
+            f"{capture.id}: would hold {events:.2g} events, more than the {_MOST_AT_ONCE:.0e} that can be simulated at "
+            "once; shorten it, or lower its light (frames that do not depend on each other may be more)"
+        )
+    # where an effect draws by blocks of images, from the beginning of the block
+    before = int(images[0]) % sensor.block
+    numbers = np.arange(int(images[0]) - before, int(images[0]) + wanted, dtype=np.uint64)
+    around = flux[np.maximum(np.arange(len(numbers)) - before, 0)]
+    made = sensor.expose(around, capture.conditions, streams.of(numbers), (capture.modality,))
+    return [_recording(sensor, made, before + i, capture) for i in range(wanted)]
+
+
+def _recording(sensor: Sensor, made: Recorded, image: int, capture: Capture) -> Recording:
+    return recording.of_image(made, image, capture, sensor.layout, sensor.nominal_dead_time)
+
+
+_Part = Callable[[np.ndarray, Streams], Recording]
+
+
+def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
+    """How to simulate a large capture part by part; None where its frames depend on each other."""
+    c = capture.conditions
+    each = c.largest_count if capture.modality == "counts" and c.counting == "frames" else 1
+    frames = max(1, int(c.frames // each * _AT_ONCE / events / 2)) * each
+    part = replace(c, frames=frames, exposure=frames * c.frame_period)
+    if capture.modality == "tr" or not _frames_stand_alone(sensor, c, part):
+        return None
+    if capture.modality == "qis" and not sensor.at("gate"):
+        return lambda flux, streams: _by_bits(sensor, capture, flux, streams)
+    if events > _MOST:
+        return None
+    return lambda flux, streams: _by_stretches(sensor, capture, flux, streams, frames)
+
+
+def _frames_stand_alone(sensor: Sensor, conditions: Conditions, part: Conditions) -> bool:
+    """Are frames independent of each other, and alike, so that a stretch of them may be simulated by itself?"""
+    carried = any(e.carried() > 0 for e in sensor.at("dead_time") if hasattr(e, "carried"))
+    if sensor.at("arrival") or sensor.at("correlated") or carried or sensor.block > 1:
+        return False
+    one = np.ones((1, sensor.layout.pixels))
+    if not all(
+        np.array_equal(*rates) for rates in zip(*(sensor.rates(one, c) for c in (conditions, part)), strict=True)
+    ):
+        return False
+    # a gate must open in each frame as in the first
+    n = 4096
+    within = (np.arange(n) * 0.6180339887498949 % 1) * conditions.frame_period
+    frame = np.arange(n) * conditions.frames // n
+    times = frame * conditions.frame_period + within
+    gates: list[Any] = list(sensor.at("gate"))
+    return all(np.array_equal(gate.open(within, part), gate.open(times, conditions)) for gate in gates)
+
+
+def _by_stretches(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, frames: int) -> Recording:
+    """Frames that stand alone, a stretch of them at a time."""
+    found = []
+    for n, start in enumerate(range(0, capture.conditions.frames, frames)):
+        count = min(frames, capture.conditions.frames - start)
+        part = replace(capture.conditions, frames=count, exposure=count * capture.conditions.frame_period)
+        own = Streams(streams.seed, f"{streams.level}/stretch {n}", streams.split, streams.images)
+        made = sensor.expose(flux[None], part, own, (capture.modality,))
+        found.append(_recording(sensor, made, 0, replace(capture, conditions=part)))
+    whole = np.concatenate([np.asarray(one.frames[:]) for one in found if one.frames is not None])
+    return Recording(capture, sensor.layout, None, whole, found[0].tick, sensor.nominal_dead_time)
+
+
+def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams) -> Recording:
+    """Frames that stand alone and are not stamped: a bit is 1 with probability 1 - exp(-rate * frame time).
+
+    The frames with a detection are those in which a Poisson process has an event; where most have one, those without
+    are drawn in the same way.
+    """
+    c, (rows, columns) = capture.conditions, sensor.layout.shape
+    mean = sensor.rates(flux[None], c)[0][0] * c.frame_time  # detections of a frame
+    dense = mean > np.log(2)
+    mean[dense] = -np.log1p(-np.exp(-mean[dense]))
+    out = np.empty((c.frames, rows, -(-columns // 8)), np.uint8)
+    step = max(1, int(rows * 4e6 / (mean.sum() * c.frames + 1)))
+    for row in range(0, rows, step):
+        some = slice(row * columns, min(row + step, rows) * columns)
+        key = streams.key(f"bits/row {row}")
+        times, offsets = kernels.arrivals(mean[None, some].copy(), float(c.frames), streams.images, key)
+        bits, _ = kernels.frame_readout(times, offsets, c.frames, 1.0, 1.0, np.empty(len(times) + 1))
+        bits[dense[some]] ^= np.uint8(0xFF)
+        if c.frames % 8:
+            bits[:, -1] &= np.uint8(0xFF << (8 - c.frames % 8) & 0xFF)
+        out[:, row : row + step] = kernels.frames_first(bits, c.frames, len(bits) // columns, columns)
+    return Recording(capture, sensor.layout, None, out, None, sensor.nominal_dead_time)
+
+
+def twin(sensor: Sensor, measurement: Measurement, seed: int = 0) -> Iterator[Recording | Capture]:
+    """The measurement's captures as the sensor would have recorded them, one after the other; a mean for a mean.
+
+    Every capture draws numbers of its own, named by its id: it is the same whichever others there are. Raises
+    InputError before the first one where the sensor has other pixels or a light level is free.
+    """
+    sensor = sensor.settled()
+    measurement.check_layout(sensor.layout)
+    fluxes = []
+    for capture in measurement.captures:
+        flux = photons_at(capture, sensor.layout)
+        if flux is None:
+            raise InputError(
+                f"{measurement.place(capture.id)}: the light level of {capture.id} is free; to simulate it, write one "
+                "in light, for example irradiance: 120 nW/cm^2"
+            )
+        fluxes.append(flux)
+    return _twins(sensor, measurement, fluxes, seed)
+
+
+def _twins(sensor: Sensor, measurement: Measurement, fluxes: list[float], seed: int) -> Iterator[Recording | Capture]:
+    images = np.zeros(1, np.uint64)
+    for capture, flux in zip(measurement.captures, fluxes, strict=True):
+        streams = Streams(seed, f"capture/{capture.id}", "simulate", images)
+        (made,) = model_recordings(sensor, capture, flux, streams, images)
+        yield made if capture.mean is None else replace(capture, mean=float(made.totals.mean()))
+
+
+def simulate(sensor: Sensor, measurement: Measurement, out: str | Path, seed: int = 0) -> Path:
+    """Write the model's twin of a measurement: the same captures, simulated."""
+    made = twin(sensor, measurement, seed)
+    return write(out, measurement.name, sensor.layout, made, measurement.captures)
