@@ -14,7 +14,7 @@ class DarkCounts(Effect, stage="dark"):
     """
 
     cause = "dark"
-    moves = ("dark_level", "dark_map", "level")
+    moves = ("dark_level", "dark_map", "level", "outliers")
 
     rate = parameter(
         100.0,

@@ -15,7 +15,7 @@ class Detection(Effect, stage="detection"):
     Source: Suonsivu et al., Alg. 1 lines 6-9; typical 30-70 % at the peak (Table 1).
     """
 
-    moves = ("map", "rows_columns", "surface", "level")
+    moves = ("map", "rows_columns", "surface", "level", "outliers")
 
     pdp = parameter(
         0.5,

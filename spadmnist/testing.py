@@ -1,0 +1,425 @@
+"""The contract that every effect keeps, and the reconstruction methods; for us and for anybody's own file.
+
+    from spadmnist.testing import check_effect
+
+    def test_mine():
+        check_effect(MyEffect)
+
+`check_effect` simulates a small sensor with and without the effect and raises AssertionError at the first thing that
+is wrong. What an effect changes, at the values that the contract chooses, it says in `moves` by the names of
+`signatures.BLOCKS`: the first of them must change, the others may, and whatever is not named must stay. Where nothing
+is declared, the report alone says what moved.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import config, document, signatures, units
+from .effects import STAGES, Conditions, Effect
+from .errors import ConfigError, SpadError
+from .events import Events, Layout
+from .plugins import Distribution, Parameter, source_file
+from .readout import READOUTS, Recorded
+from .reconstruct import Method, Settings
+from .sensor import Sensor
+from .signatures import BLOCKS, Shots
+from .streams import BLOCK, Streams
+
+MOVED = 6.0  # by so many standard errors the first block of `moves` must change at least
+STAYED = 5.5  # and by no more a block that is not named
+
+# The paper's sensor, small. A dead time and a dark count rate that few exposures suffice to see.
+_BASE = """
+seed: 1
+scene: {images: {source: uniform}, wavelength: 555 nm, lux: [1 lux]}
+recording: {exposure: 1 ms, frames: 1000, frame_time: 1 us}
+reconstruct: []
+sensor:
+  chip_seed: 1
+  layout: {rows: 8, columns: 8, pixel_area: 25 um^2}
+  effects:
+    detection: {pdp: 0.5}
+    dark_counts: {rate: 5 kHz}
+    afterpulsing: {probability: 0.5 %, lifetime: 25 ns}
+    dead_time: {duration: 100 ns}
+    tdc: {resolution: 100 ps}
+"""
+_CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photons/s, exposures of one repetition
+_REPETITIONS = 32
+
+
+@dataclass
+class Report:
+    """What `check_effect` found: a verdict on each check, and by how many standard errors each statistic moved."""
+
+    name: str
+    checks: dict[str, str] = field(default_factory=dict)
+    moved: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        lines = [self.name, *(f"  {name}: {verdict}" for name, verdict in self.checks.items())]
+        return "\n".join([*lines, *(f"    {name:16} {z:8.1f}" for name, z in self.moved.items())])
+
+
+def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
+    """Does an effect keep the contract? Raises AssertionError with one sentence where it does not.
+
+    effect: the class or its name. parameters: values in SI in place of those that the contract chooses; see `strong`.
+    """
+    kind: type[Effect] = Effect.registry.find(effect) if isinstance(effect, str) else effect
+    if not __debug__:
+        raise AssertionError("Python runs without assertions (-O), which the contract is made of")
+    trial = _Trial(kind, parameters)
+    report = Report(kind.name)
+    for check in _CHECKS:
+        title = check.__name__.strip("_").replace("_", " ")
+        try:
+            report.checks[title] = check(trial) or "kept"
+        except Exception as error:
+            what = str(error) if isinstance(error, AssertionError | SpadError) else f"{type(error).__name__}: {error}"
+            raise AssertionError(f"{source_file(kind)}: the effect {kind.name}, {title}: {what}") from error
+    report.moved = trial.moved
+    return report
+
+
+def check_method(method: type[Method] | str) -> None:
+    """Does a reconstruction method keep the contract? Raises AssertionError with one sentence where it does not.
+
+    Its image is finite, 0 where nothing was recorded, and that of each exposure whatever others stand beside it.
+    """
+    kind: type[Method] = Method.registry.find(method) if isinstance(method, str) else method
+    sensor = _sensor(None, "paper", lacking=("dark",))
+    conditions = _conditions(1.0, exposure=1e-4, frames=100, bits=1)
+    told = (sensor.nominal_pdp(conditions.wavelength), conditions.exposure, sensor.nominal_dead_time, sensor.tick)
+    settings = Settings(*told, conditions.frames, conditions.frame_time)
+    for light in (0.0, 1e5, 1e9):
+        what = f"{source_file(kind)}: the method {kind.name}: at {light:g} photons/s"
+        recorded = _expose(sensor, np.full((3, sensor.layout.pixels), light), conditions)
+        image, _ = kind().image(recorded, settings)
+        assert image.shape == (3 * sensor.layout.pixels,), f"{what} its image has the shape {image.shape}"
+        assert np.all(np.isfinite(image)), f"{what} its image is not finite"
+        assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
+        parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
+        assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+
+
+# --- an effect and its sensor -------------------------------------------------------------------------------------
+
+
+def strong(declared: Parameter) -> Any:
+    """A value of a parameter at which an effect is strong, out of its `search`, or else the default.
+
+    What can switch the effect off is taken far from there, anything else from the middle of its range; a parameter
+    that may vary over the array is a distribution, about off where the range lies on both sides of it.
+    """
+    if declared.search is None:
+        assert declared.default is not None, f"no value is known for {declared.name}: give one, or declare `search`"
+        return declared.default
+    (low, high), off = declared.search, declared.off
+    if declared.per and off is not None and low < off < high:
+        return Distribution("normal", (float(off), (high - low) / 8))
+    if off is None:
+        value = math.sqrt(low * high) if low > 0 else (low + high) / 2
+        # whole where everything that is said of it is: a number of things
+        value = float(round(value)) if all(said % 1 == 0 for said in (declared.default or 0.5, low, high)) else value
+    elif low > off >= 0:
+        value = low**0.25 * high**0.75
+    else:
+        value = off + ((high if high - off >= off - low else low) - off) / 2
+    return Distribution("lognormal", (value, 0.3)) if declared.per and value > 0 else value
+
+
+@dataclass
+class _Trial:
+    """An effect with its values, and what is measured once for several checks."""
+
+    kind: type[Effect]
+    given: dict[str, Any]
+    moved: dict[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        rest = {name: strong(p) for name, p in self.kind.parameters.items() if name not in self.given}
+        return rest | self.given
+
+    def sensor(self, rules: str, layout: Layout | None = None, lacking: Collection[str] = ()) -> Sensor:
+        return _sensor(self.kind(**self.values), rules, layout, lacking=lacking)
+
+    @property
+    def replaced(self) -> str:
+        """Its name, where the contract's sensor has an effect of that name; else nothing."""
+        return self.kind.name if any(e.name == self.kind.name for e in _base().sensor.effects) else ""
+
+
+@lru_cache
+def _base() -> Any:
+    return config.build(document.parse(_BASE, "the contract's sensor"), Path())
+
+
+def _sensor(
+    effect: Effect | None, rules: str, layout: Layout | None = None, without: str = "", lacking: Collection[str] = ()
+) -> Sensor:
+    """The contract's sensor with an effect on top, or in place of its own one of that name.
+
+    without: the name of another that is left out; lacking: stages at which it has none of its own.
+    """
+    base = _base().sensor
+    out = without or getattr(effect, "name", "")
+    effects = [e for e in base.effects if e.name != out and e.stage not in lacking]
+    return Sensor(layout or base.layout, [*effects, *([effect] if effect else [])], rules, base.chip_seed).settled()
+
+
+@lru_cache
+def _reference(without: str) -> dict[str, np.ndarray]:
+    """The statistics of the contract's sensor without an effect."""
+    sensor = _sensor(None, "device", without=without)
+    return _statistics(sensor, "without", 2 * _REPETITIONS, sensor.nominal_dead_time)
+
+
+def _statistics(sensor: Sensor, split: str, repetitions: int, dead_time: float) -> dict[str, np.ndarray]:
+    shots = {}
+    for name, (light, each) in _CAPTURES.items():
+        photons, conditions = np.full((repetitions * each, sensor.layout.pixels), light), _conditions(light)
+        recorded = _expose(sensor, photons, conditions, split=f"{split}/{name}", readouts=("tr", "str", "qis"))
+        shots[name] = Shots(recorded, sensor, conditions, each, dead_time)
+    return signatures.statistics(**shots)
+
+
+def _conditions(light: float, **changes: Any) -> Conditions:
+    """How light of so many photons/s is recorded."""
+    return replace(_base().conditions, wavelength=555e-9 if light else None, **changes)
+
+
+def _expose(
+    sensor: Sensor,
+    photons: np.ndarray,
+    conditions: Conditions,
+    images: Any = None,
+    split: str = "",
+    readouts: Collection[str] = READOUTS,
+    **how: Any,
+) -> Recorded:
+    numbers = np.asarray(range(len(photons)) if images is None else images, np.uint64)
+    return sensor.expose(photons, conditions, Streams(1, "contract", split, numbers), readouts, **how)
+
+
+def _lights(sensor: Sensor, images: int) -> Iterator[tuple[str, np.ndarray, Conditions]]:
+    """(what it is, photons/s, how it is recorded): no light, little, much, and empty rows among full ones."""
+    short = {"exposure": 1e-4, "frames": 10, "frame_time": 8e-6, "frame_period": 1e-5, "bits": 2}
+    shape = (images, sensor.layout.pixels)
+    yield "in the dark", np.zeros(shape), _conditions(0, **short)
+    yield "in dim light", np.full(shape, 1e5), _conditions(1e5, **short)
+    yield "in bright light", np.full(shape, 2e7), _conditions(2e7, **short | {"bits": 12, "counting": "counter"})
+    rising = np.linspace(0.2, 1.8, images)[:, None]
+    yield "with unlit pixels", np.where(np.arange(shape[1]) % 3 == 1, 3e6, 0.0) * rising, _conditions(3e6, **short)
+
+
+def _columns(part: Any) -> dict[str, np.ndarray]:
+    """Every array of a recording, by name."""
+    found: dict[str, np.ndarray] = {}
+    for name in ("offsets", "times", "ticks") if isinstance(part, Events) else vars(part):
+        value = getattr(part, name)
+        if isinstance(value, np.ndarray):
+            found[name] = value
+        elif isinstance(value, Events) or hasattr(value, "__dataclass_fields__"):
+            found |= {f"{name}.{below}": array for below, array in _columns(value).items()}
+    return found
+
+
+def _same(one: Recorded, other: Recorded, what: str) -> None:
+    a, b = _columns(one), _columns(other)
+    assert a.keys() == b.keys(), f"{what}: there is {', '.join(sorted(a.keys() ^ b.keys()))} in one alone"
+    for name, x in a.items():
+        y = b[name]
+        assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), f"{what}: {name} differs"
+
+
+# --- the checks: each returns what is to be said besides "kept" ---------------------------------------------------
+
+
+def _declarations(trial: _Trial) -> None:
+    kind = trial.kind
+    text = (kind.__doc__ or "").strip()
+    assert text.split("\n")[0].endswith("."), "the docstring must begin with one sentence on one line"
+    assert "Source:" in text, "the docstring must say where the effect is known from (Source: ...)"
+    have = [all(callable(getattr(kind, hook, None)) for hook in way.split("+")) for way in STAGES[kind.stage]]
+    assert any(have), f"it must define {' or '.join(STAGES[kind.stage])}"
+    unknown = sorted(set(kind.moves) - set(BLOCKS))
+    assert not unknown, f"moves names {', '.join(unknown)}, but the statistics are {', '.join(BLOCKS)}"
+    for name in trial.values:
+        assert name in kind.parameters, f"it has no parameter {name}"
+    for name, p in kind.parameters.items():
+        assert p.about, f"{name} does not say what it is (about)"
+        if p.unit == "bool" or p.choices:
+            continue
+        for where, one in (("default", p.default), ("off", p.off), *(("search", edge) for edge in p.search or ())):
+            try:
+                if one is not None:
+                    p.check(float(one))
+            except ValueError as error:
+                raise AssertionError(f"{where} of {name}: {error}") from None
+        assert p.search is None or p.search[0] < p.search[1], f"search of {name} ends before it begins: {p.search}"
+
+
+def _bounds(trial: _Trial) -> None:
+    kind = trial.kind
+    for name, p in kind.parameters.items():
+        low, high = p.bounds
+        outside: list[Any] = ["no_such_word"] if p.choices or p.unit == "bool" else []
+        if low is not None:
+            outside.append(low if p.open_bounds else low - max(1e-3, abs(low)))
+        if high is not None:
+            outside.append(high if p.open_bounds else high + max(1e-3, abs(high)))
+        for value in outside:
+            written = value if isinstance(value, str) else units.show(value, p.unit, 12)
+            raw = document.parse(_BASE, "c.yaml")
+            raw.value["sensor"]["effects"][kind.name] = {name: written}
+            try:
+                config.build(raw, Path())
+            except ConfigError as error:
+                said = any(f"{kind.name}.{name}" in problem for problem in error.problems)
+                assert said, f"the error for {name} = {written} does not name {kind.name}.{name}: {error}"
+            else:
+                raise AssertionError(f"a config takes {name} = {written}, out of its bounds ({p.allowed()})")
+
+
+def _off_is_the_identity(trial: _Trial) -> str | None:
+    off = {name: p.off for name, p in trial.kind.parameters.items() if p.off is not None}
+    if not off:
+        return "no value of its parameters switches it off"
+    for rules in ("paper", "device"):
+        absent, idle = _sensor(None, rules, without=trial.kind.name), _sensor(trial.kind(**trial.values | off), rules)
+        images = max(3, idle.block)
+        for light, photons, conditions in _lights(idle, images):
+            one, other = (_expose(sensor, photons, conditions) for sensor in (absent, idle))
+            _same(one, other, f"off ({light}, rules {rules}), it is not as if it were absent")
+    return None
+
+
+def _invariants(trial: _Trial) -> None:
+    for rules in ("paper", "device"):
+        sensor = trial.sensor(rules)
+        images = max(3, sensor.block)
+        for light, photons, conditions in _lights(sensor, images):
+            _sound(_expose(sensor, photons, conditions), sensor, conditions, f"{light}, rules {rules}")
+
+
+def _sound(recorded: Recorded, sensor: Sensor, conditions: Conditions, what: str) -> None:
+    """Raises AssertionError where a recording is not what it must be."""
+    assert recorded.tr is not None and recorded.frames is not None and recorded.frames.first is not None
+    # a stamp may be rounded up beyond the end, by half a tick at most
+    wrong = recorded.tr.problem(float(np.nextafter(conditions.exposure + sensor.tick / 2, 1)))
+    assert wrong is None, f"TR {what}: {wrong}"
+    first = recorded.frames.first
+    # a row for each stamp: those of a pixel's frames are in no order
+    wrong = Events(first.times, np.arange(len(first) + 1), first.pixels).problem(conditions.frame_time)
+    assert wrong is None, f"STR {what}: {wrong}"
+    bits = recorded.frames.unpacked().sum(axis=1, dtype=int).ravel()
+    assert np.array_equal(bits, first.counts), f"{what}: {bits.sum()} bits are set, but there are {len(first)} stamps"
+    assert recorded.counts is not None and np.array_equal(recorded.tr.counts, recorded.counts), (
+        f"{what}: the counts are not those of the stream"
+    )
+    tally, shape = recorded.tally, (len(bits), conditions.count_frames)
+    assert tally is not None and tally.shape == shape, f"{what}: the counts of frames are not an array of {shape}"
+    assert tally.max(initial=0) <= conditions.largest_count, f"{what}: a frame counts {tally.max()} detections"
+
+
+def _same_stream_same_result(trial: _Trial) -> None:
+    for rules in ("paper", "device"):
+        sensor = trial.sensor(rules)
+        step = sensor.block
+        images = np.arange(2 * BLOCK if step > 1 else 4)
+        photons, conditions = list(_lights(sensor, len(images)))[-1][1:]
+        together = _expose(sensor, photons, conditions, images)
+        where = f"rules {rules}: the recording changes"
+        _same(_expose(sensor, photons, conditions, images), together, f"{where} when it is made again")
+        copy = pickle.loads(pickle.dumps(sensor))
+        for start in reversed(range(0, len(images), step)):
+            part = slice(start, start + step)
+            alone = _expose(copy, photons[part], conditions, images[part])
+            _same(alone, together.images(start, start + step), f"{where} with the images that are made together")
+        known = _columns(_expose(sensor, photons, conditions, images, causes=True))
+        for name, column in _columns(together).items():
+            assert np.array_equal(known[name], column), f"{where} when causes are asked for: {name} differs"
+
+
+def _edge_cases(trial: _Trial) -> None:
+    area = _base().sensor.layout.pixel_area
+    places = np.array([[0, 0], [25e-6, 0], [12e-6, 22e-6], [-13e-6, 22e-6], [90e-6, 7e-6]])
+    layouts = (Layout(1, 1, area, 1.0), Layout(2, 3, area, 1.0), Layout(1, len(places), area, 1.0, places))
+    for rules, layout in ((rules, layout) for rules in ("paper", "device") for layout in layouts):
+        sensor = trial.sensor(rules, layout, lacking=("dark",))
+        images = max(2, sensor.block)
+        cases = list(_lights(sensor, images))
+        one_event = np.zeros_like(cases[0][1])
+        one_event[0, 0] = 2e4
+        cases.append(("nearly dark", one_event, cases[1][2]))
+        if sensor.block == 1:
+            cases.append(("without an image", cases[1][1][:0], cases[1][2]))
+        for light, photons, conditions in cases:
+            what = f"{layout.rows} x {layout.columns} pixels, {light}, rules {rules}"
+            _sound(_expose(sensor, photons, conditions), sensor, conditions, what)
+
+
+def _expected_rate(trial: _Trial) -> str | None:
+    """Seen without a dead time or traps of other effects, whose closed forms know nothing of this one.
+
+    Within 5 standard errors and 2 % of the change that the effect makes: some laws are first orders or bounds.
+    """
+    if trial.kind.expected_rate is Effect.expected_rate:
+        return "it has none of its own"
+    lacking = ("correlated", "dead_time")
+    sensor, plain = trial.sensor("device", lacking=lacking), _sensor(None, "device", None, trial.kind.name, lacking)
+    for name, (light, _) in _CAPTURES.items():
+        photons, conditions = np.full((BLOCK, sensor.layout.pixels), light), _conditions(light)
+        counts = _expose(sensor, photons, conditions, split=name, readouts=("tr",)).counts
+        assert counts is not None
+        seen = counts.reshape(photons.shape).mean(axis=1)
+        error = seen.std(ddof=1) / math.sqrt(len(seen))
+        told, without = (one.expected(photons[:1], conditions)[1].mean() for one in (sensor, plain))
+        assert abs(seen.mean() - told) <= 5 * error + 0.02 * abs(told - without), (
+            f"in the {name} capture a pixel has {seen.mean():.6g} detections (standard error {error:.2g}), but "
+            f"expected_rate makes it {told:.6g} (without the effect: {without:.6g}); allowed are 5 standard errors "
+            "and 2 % of the change"
+        )
+    return None
+
+
+def _moves(trial: _Trial) -> str | None:
+    dead_time = _sensor(None, "device", without=trial.kind.name).nominal_dead_time
+    one = _statistics(trial.sensor("device"), "with", _REPETITIONS, dead_time)
+    other = _reference(trial.replaced)
+    trial.moved = {name: signatures.significance(one[name], other[name]) for name in BLOCKS}
+    found = ", ".join(f"{name} {z:.1f}" for name, z in trial.moved.items() if abs(z) > STAYED) or "nothing"
+    moves = trial.kind.moves
+    if not moves:
+        return f"no `moves` is declared; it moved {found}"
+    z = trial.moved[moves[0]]
+    assert abs(z) > MOVED, (
+        f"{moves[0]} ({BLOCKS[moves[0]]}) must change, but moved by {z:.1f} standard errors; it moved {found}"
+    )
+    for name, z in trial.moved.items():
+        still = name in moves or abs(z) < STAYED
+        assert still, f"{name} ({BLOCKS[name]}) must stay, but moved by {z:.1f} standard errors; it moved {found}"
+    return None
+
+
+_CHECKS: tuple[Callable[[_Trial], str | None], ...] = (
+    _declarations,
+    _bounds,
+    _off_is_the_identity,
+    _invariants,
+    _same_stream_same_result,
+    _edge_cases,
+    _expected_rate,
+    _moves,
+)

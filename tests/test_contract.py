@@ -1,0 +1,372 @@
+"""The contract that every effect and every method keeps; and that it finds what is wrong with others.
+
+Nothing here is drawn anew: all seeds are fixed. What may stay by chance is 5.5 standard errors away, see
+`test_what_stays_stays_by_chance`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spadmnist import plugins, signatures, template, testing
+from spadmnist.effects import STAGES, Effect
+from spadmnist.plugins import Distribution
+from spadmnist.reconstruct import Method
+from spadmnist.testing import check_effect, check_method
+
+OURS = [name for name in Effect.registry if Effect.registry.find(name).__module__.startswith("spadmnist.")]
+
+
+def switched() -> list[tuple[str, dict[str, Any]]]:
+    """Every effect at each position of each of its switches that is not the default."""
+    found: list[tuple[str, dict[str, Any]]] = []
+    for name in OURS:
+        for key, declared in Effect.registry.find(name).parameters.items():
+            words = declared.choices or ((True, False) if declared.unit == "bool" else ())
+            found += [(name, {key: word}) for word in words if word != declared.default]
+    return found
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_an_effect_keeps_the_contract(name: str) -> None:
+    report = check_effect(name)
+    assert report.checks["moves"] == "kept", "an effect of ours says what it moves"
+    assert set(report.moved) == set(signatures.BLOCKS)
+
+
+@pytest.mark.parametrize(("name", "values"), switched(), ids=str)
+def test_an_effect_keeps_it_at_every_switch(name: str, values: dict[str, Any]) -> None:
+    assert check_effect(name, **values).checks["moves"] == "kept"
+
+
+@pytest.mark.parametrize("name", list(Method.registry))
+def test_a_method_keeps_the_contract(name: str) -> None:
+    check_method(name)
+
+
+def test_a_few_hot_pixels_are_outliers() -> None:
+    cold, hot = Distribution("lognormal", (5e3, 0.1)), Distribution("lognormal", (1e5, 0.1))
+    report = check_effect("dark_counts", rate=Distribution("mixture", (), ((0.95, cold), (0.05, hot))))
+    assert report.moved["outliers"] > testing.MOVED
+    assert re.search(r"^    outliers +inf$", str(report), re.M), "not one of 2048 pixels was without them"
+
+
+def test_strong_values() -> None:
+    def value(*args: Any, **how: Any) -> Any:
+        return testing.strong(plugins.parameter(*args, "", "what it is", **how))
+
+    assert value(0.1, off=0.0, search=(1e-4, 1.0)) == pytest.approx(0.1)
+    assert value(0.1, off=0.0, search=(-0.5, 0.5)) == 0.25
+    assert value(1.0, off=1.0, search=(0.5, 1.0)) == 0.75
+    assert value(8.0, search=(1, 16)) == 4.0
+    assert value(8.0, search=(2, 16)) == 6.0, "a number of things is whole"
+    assert value(0.3, search=(0.1, 0.4)) == pytest.approx(0.2)
+    assert value(0.7) == 0.7
+    assert value(5.0, off=0.0, search=(1e-4, 1.0), per_pixel=True).kind == "lognormal"
+    assert value(1.0, off=1.0, search=(0, 2), per="row").numbers == (1.0, 0.25)
+    with pytest.raises(AssertionError, match="give one, or declare `search`"):
+        value(None, required=True)
+
+
+# ---- somebody else's effect ----------------------------------------------------------------------------------
+
+HEAD = '''"""Mine."""
+
+import numpy as np
+
+from spadmnist import Children, Effect, Events, parameter
+
+STATE = np.random.Generator(np.random.SFC64(1))
+
+
+def chance(default=0.02, off=0.0, search=(1e-3, 0.05), **more):
+    return parameter(default, "", "chance that it happens", bounds=(0, 1), off=off, search=search, **more)
+
+
+class {name}(Effect, stage="{stage}"):
+    """It happens.
+
+    Source: this test.
+    """
+
+'''
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Writes an effect into a file, loads it and gives its name; it is forgotten afterwards."""
+    plugins.discover()
+    monkeypatch.setattr(Effect.registry, "classes", dict(Effect.registry.classes))
+    monkeypatch.setattr(plugins, "_loaded", dict(plugins._loaded))
+
+    def write(body: str, stage: str = "correlated", head: str = HEAD, name: str = "Mine") -> str:
+        file = tmp_path / "mine.py"
+        file.write_text(head.format(name=name, stage=stage) + body)
+        plugins.load_file(file)
+        return name.lower()
+
+    return write
+
+
+ECHO = """
+    p = chance()
+    moves = ("intervals", "edge", "fano", "frames_lag", "level", "dark_level", "first", "autocorrelation")
+
+    def spawn(self, events, rng):
+        parent = np.flatnonzero(rng.random(len(events)) < self.p)
+        return Children(parent, rng.exponential(1e-6, len(parent)){row})
+
+    def expected_rate(self, rate, conditions):
+        return rate * (1 + self.p)
+"""
+NEXT_PIXEL = ", events.rows[parent] // events.pixels * events.pixels + (events.rows[parent] + 1) % events.pixels"
+LOSS = """
+    p = chance(search=(0.01, 0.5))
+    moves = ("level", "dark_level")
+
+    def apply(self, events, rng):
+        return events.keep({mask})
+
+    def expected_rate(self, rate, conditions):
+        return rate * (1 - self.p)
+"""
+
+
+@pytest.mark.parametrize(
+    ("stage", "body"),
+    [("correlated", ECHO.format(row="")), ("readout", LOSS.format(mask="rng.random(len(events)) >= self.p"))],
+    ids=["echo", "loss"],
+)
+def test_somebody_elses_effect_keeps_it(planted: Any, stage: str, body: str) -> None:
+    assert check_effect(planted(body, stage)).checks["moves"] == "kept"
+
+
+# what is wrong -> (stage, body, the check that says so and what it says)
+FAULTS = {
+    "an echo in the next pixel": (
+        "correlated",
+        ECHO.format(row=NEXT_PIXEL),
+        "moves: neighbours .* must stay|moves: intervals .* must change",
+    ),
+    "crosstalk in the pixel itself": (
+        "correlated",
+        ECHO.format(row="").replace('"intervals",', '"neighbours",'),
+        "moves: neighbours .* must change",
+    ),
+    "a jitter that shifts everything": (
+        "timing",
+        """
+    sigma = parameter(2e-8, "s", "time by which it is late", bounds=(0, None), off=0.0, search=(1e-9, 1e-7))
+    moves = ("edge",)
+
+    def apply(self, events, rng):
+        return events.moved(events.times + self.sigma)
+""",
+        "moves: edge .* must change",
+    ),
+    "a jitter that is right, and something else": (
+        "timing",
+        """
+    sigma = parameter(2e-10, "s", "time by which it is late", bounds=(0, None), off=0.0, search=(1e-10, 1e-9))
+    moves = ("edge",)
+
+    def apply(self, events, rng):
+        return events.moved(events.times + self.sigma * (rng.standard_normal(len(events)) + 50 * (self.sigma > 0)))
+""",
+        "moves: first .* must stay",
+    ),
+    "an effect that does nothing": ("light", "    def apply(self, rate, conditions):\n        return rate\n", ""),
+    "bright light alone is lost": (
+        "light",
+        """
+    p = chance(search=(0.1, 0.9))
+    moves = ("level",)
+
+    def apply(self, rate, conditions):
+        return rate * (1 - self.p / (1 + 1e5 / (rate + 1)))
+""",
+        "moves: linearity .* must stay",
+    ),
+    "draws from a state of its own": (
+        "readout",
+        LOSS.format(mask="STATE.random(len(events)) >= self.p"),
+        "same stream same result: .* when it is made again",
+    ),
+    "draws that depend on the batch": (
+        "readout",
+        "    counted = True\n" + LOSS.format(mask="(np.arange(len(events)) * 0.618) % 1 >= self.p"),
+        "same stream same result: .* images that are made together",
+    ),
+    "what a worker cannot get": (
+        "light",
+        """
+    def made(self, chip):
+        self._factor = lambda rate: rate
+
+    def apply(self, rate, conditions):
+        return self._factor(rate)
+""",
+        "same stream same result: .*[pP]ickl",
+    ),
+    "off is not off": (
+        "readout",
+        LOSS.format(mask="rng.random(len(events)) >= self.p + 0.01"),
+        "off is the identity: .* is not as if it were absent",
+    ),
+    "stamps before the beginning": (
+        "timing",
+        """
+    counted = True
+
+    def apply(self, events, rng):
+        return Events(events.times - 1e-5, events.offsets, events.pixels, row_pixel=events.row_pixel, end=events.end)
+""",
+        "invariants: ",
+    ),
+    "stamps out of order": (
+        "timing",
+        """
+    counted = True
+
+    def apply(self, events, rng):
+        return Events(events.times[::-1].copy(), events.offsets, events.pixels, row_pixel=events.row_pixel)
+""",
+        "invariants: TR .* not in order",
+    ),
+    "no event is one too few": (
+        "readout",
+        """
+    def apply(self, events, rng):
+        return events.keep(events.times <= events.times.max())
+""",
+        "(off|invariants|edge cases).*: .*ValueError",
+    ),
+    "one pixel is too few": (
+        "light",
+        """
+    def apply(self, rate, conditions):
+        rate = rate.copy()
+        rate[:, 1] = 0
+        return rate
+""",
+        "edge cases: .*IndexError",
+    ),
+    "a wrong closed form": (
+        "readout",
+        LOSS.format(mask="rng.random(len(events)) >= self.p").replace("1 - self.p", "1 - 1.2 * self.p"),
+        "expected rate: in the .* expected_rate makes it",
+    ),
+    "a default out of bounds": (
+        "light",
+        "    p = chance(2.0)\n\n    def apply(self, rate, conditions):\n        return rate\n",
+        "declarations: default of p: 2 is not possible",
+    ),
+    "a range out of bounds": (
+        "light",
+        "    p = chance(search=(0.5, 2))\n\n    def apply(self, rate, conditions):\n        return rate\n",
+        "declarations: search of p: 2 is not possible",
+    ),
+    "a statistic that is none": (
+        "light",
+        '    moves = ("levle",)\n\n    def apply(self, rate, conditions):\n        return rate\n',
+        "declarations: moves names levle, but the statistics are level",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", [name for name, (_, _, says) in FAULTS.items() if says])
+def test_a_fault_is_found(fault: str, planted: Any, tmp_path: Path) -> None:
+    stage, body, says = FAULTS[fault]
+    name = planted(body, stage)
+    with pytest.raises(AssertionError) as caught:
+        check_effect(name)
+    assert re.search(f"^{re.escape(str(tmp_path))}/mine.py: the effect mine, (?:{says})", str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_says_nothing_of_itself_is_only_noted(planted: Any) -> None:
+    report = check_effect(planted(FAULTS["an effect that does nothing"][1], "light"))
+    assert report.checks["moves"] == "no `moves` is declared; it moved nothing"
+
+
+def test_an_effect_without_a_source(planted: Any) -> None:
+    body = "    def apply(self, rate, conditions):\n        return rate\n"
+    with pytest.raises(AssertionError, match="declarations: the docstring must say where the effect is known from"):
+        check_effect(planted(body, "light", HEAD.replace("Source:", "From")))
+
+
+def test_bounds_that_nobody_enforces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins.Parameter, "check", lambda self, value, written=None: None)
+    with pytest.raises(AssertionError, match=r"bounds: a config takes rate = -1 mHz, out of its bounds"):
+        check_effect("dark_counts")
+
+
+def test_a_parameter_that_it_has_not() -> None:
+    with pytest.raises(AssertionError, match="it has no parameter rat"):
+        check_effect("dark_counts", rat=1.0)
+
+
+class Doubtful(Method, abstract=True):
+    """A method that is no one's."""
+
+    name = "doubtful"
+    columns = ("counts",)
+    answer = np.nan
+
+    def estimate(self, settings: Any, counts: np.ndarray) -> np.ndarray:
+        return np.where(counts > 500, self.answer, counts + (self.answer == 1))
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"), [(np.nan, "is not finite"), (1.0, "is 1, not 0"), (0.0, ""), (np.inf, "is not finite")]
+)
+def test_a_method_that_does_not_keep_it(answer: float, says: str) -> None:
+    kind = type("Wrong", (Doubtful,), {"answer": answer, "name": "wrong"}, abstract=True)
+    if not says:
+        return check_method(kind)
+    with pytest.raises(AssertionError, match=says):
+        check_method(kind)
+
+
+# ---- slow ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_template_keeps_it(stage: str, planted: Any) -> None:
+    name = f"mine_{stage}"
+    check_effect(planted("", head=template.text(name, stage).replace("{", "{{").replace("}", "}}"), name=name))
+
+
+@pytest.mark.slow
+def test_one_call_in_somebodys_own_test(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(HEAD.format(name="Mine", stage="correlated") + ECHO.format(row=""))
+    (tmp_path / "test_mine.py").write_text(
+        "from mine import Mine\nfrom spadmnist.testing import check_effect\n\n\n"
+        "def test_mine():\n    check_effect(Mine)\n\n\n"
+        "def test_mine_weak():\n    check_effect(Mine, p=0.0)\n"
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST")}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert "1 failed, 1 passed" in done.stdout, done.stdout
+    assert re.search(r"AssertionError: .*mine\.py: the effect mine, moves: intervals .* must change", done.stdout)
+
+
+@pytest.mark.slow
+def test_what_stays_stays_by_chance() -> None:
+    """Of 24 pairs of the same sensor no statistic moves, and the differences scatter by their standard errors."""
+    sensor = testing._sensor(None, "device")
+    found = [testing._statistics(sensor, f"null {i}", 32, sensor.nominal_dead_time) for i in range(48)]
+    for name in signatures.BLOCKS:
+        z = np.array([signatures.significance(a[name], b[name]) for a, b in zip(found[::2], found[1::2], strict=True)])
+        # of at most 8 numbers the largest: 24 such have a larger root mean square once in 2e6 (Student's t, drawn)
+        assert np.sqrt(np.mean(z**2)) < 2.56 and np.abs(z).max() < testing.STAYED, name
