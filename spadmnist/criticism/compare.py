@@ -22,12 +22,13 @@ from joblib import Parallel, delayed
 from scipy import stats
 
 from .. import plugins, twin
+from ..effects import Conditions
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Statistic, Summary
 from ..streams import Streams
-from .nulls import Judgement, Null, learn
+from .nulls import Judgement, Null, learn, poisson_scores
 
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
 REPLICATES = 96
@@ -151,35 +152,68 @@ def simulated(
         yield from twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
 
 
+class _InTheDark(Sensor):
+    """A sensor without light whose dark rates are all scaled by what would be the photons/s.
+
+    So a dark capture, too, can be simulated with as many detections as were measured: whether their number is right is
+    one question, whether their pattern is, another.
+    """
+
+    @staticmethod
+    def of(sensor: Sensor) -> Sensor:
+        s = sensor
+        return _InTheDark(s.layout, s.effects, s.rules, s.chip_seed, s.name, True)
+
+    def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """The dark rates times the factors that stand for photons."""
+        rate, light = super().rates(np.zeros_like(photons), conditions)
+        return rate * photons, light * photons
+
+
 @dataclass(frozen=True)
 class CaptureNull:
     """What the model makes of a capture: the null of each statistic, and how the total follows the light.
 
-    factors, totals: (recordings,) light relative to `photons` and the detections it gave; shapes: cells by statistic.
+    level: photons/s on a pixel, in the dark a factor on the rates, about which the recordings were made; factors,
+    totals: (recordings,) the light relative to it and the detections it gave; stated: what the measurement says.
+    law: log of the total as (offset, slope) of the log of what the closed form `expected` says; scatter: about that.
     """
 
-    photons: float
+    level: float
+    stated: float | None
     factors: np.ndarray
     totals: np.ndarray
+    expected: Callable[[float], float]
+    law: tuple[float, float]
+    scatter: float
     nulls: Mapping[str, Null]
 
-    def factor_of(self, total: float) -> tuple[float, float, float]:
-        """(light relative to `photons` that gives this total, its standard error, elasticity of the total)."""
-        x, y = np.log(self.factors), np.log(np.maximum(self.totals, 0.5))
-        if np.ptp(x) == 0:
-            return 1.0, 0.0, 0.0
-        coefficients = np.polyfit(x, y, 2)
-        scatter = float(np.std(y - np.polyval(coefficients, x), ddof=3))
-        target = math.log(max(total, 0.5))
-        found = 0.0
-        for _ in range(50):
-            slope = 2 * coefficients[0] * found + coefficients[1]
-            if not slope > 1e-3:
-                break
-            found += float(np.clip((target - np.polyval(coefficients, found)) / slope, -0.5, 0.5))
-        slope = float(2 * coefficients[0] * found + coefficients[1])
-        error = scatter * math.sqrt(1 + 3 / len(x)) / max(slope, 1e-3)
-        return math.exp(found), error, slope
+    def total_at(self, level: float) -> float:
+        """Detections of the whole array expected at a level."""
+        return math.exp(self.law[0] + self.law[1] * math.log(self.expected(level)))
+
+    def level_of(self, total: float) -> tuple[float, float, float]:
+        """(level that gives this total, standard error of its log, elasticity of the total there)."""
+        low, high = self.level * 1e-6, self.level * 1e6
+        for _ in range(200):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
+        found = math.sqrt(low * high)
+        step = 1.01
+        elasticity = math.log(self.total_at(found * step) / self.total_at(found / step)) / (2 * math.log(step))
+        error = self.scatter * math.sqrt(1 + 2 / len(self.totals)) / max(elasticity, 1e-3)
+        return found, error, elasticity
+
+
+def _law_of(totals: np.ndarray, told: np.ndarray) -> tuple[tuple[float, float], float]:
+    """((offset, slope), scatter) of log totals against the closed form's; the slope is near 1, by 2 % or so."""
+    x, y = np.log(told), np.log(np.maximum(totals, 0.5))
+    apart = x - x.mean()
+    beside = y - y.mean() - apart
+    noise = float(np.var(beside, ddof=1)) / 0.02**2
+    slope = 1 + float(apart @ beside) / (float(apart @ apart) + max(noise, 1e-12))
+    offset = float(y.mean() - slope * x.mean())
+    return (offset, slope), float(np.std(y - offset - slope * x, ddof=2))
 
 
 @dataclass(frozen=True)
@@ -251,16 +285,17 @@ def model_of(
     told: Callable[[int], None],
 ) -> CaptureNull:
     """Simulate a capture many times and learn its nulls. total: detections measured, to find a level that is free."""
-    stated = twin.photons_at(capture, sensor.layout)
-    centre = 0.0 if capture.light.dark else _level_for(sensor, capture, total, stated)
-    half = 0.0
-    if not capture.light.dark:
-        uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
-        half = max(_LEAST_SPREAD, _SPREAD * uncertainty)
-        if stated is not None and abs(math.log(centre / stated)) < half:
-            centre = stated  # the same recordings then serve every measurement of this model
-        else:
-            half = _LEAST_SPREAD * 3
+    if capture.light.dark:
+        sensor = _InTheDark.of(sensor)
+        stated: float | None = 1.0
+    else:
+        stated = twin.photons_at(capture, sensor.layout)
+    expected = _closed_form(sensor, capture)
+    centre = _level_for(expected, total, stated)
+    uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
+    half = max(_LEAST_SPREAD, _SPREAD * uncertainty)
+    if stated is not None and (total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(total, 1.0))):
+        centre = stated  # the same recordings then serve every measurement of this model
     numbers = np.arange(replicates, dtype=np.uint64)
     # evenly spread, in an order that has nothing to do with the number
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
@@ -278,33 +313,36 @@ def model_of(
             found.setdefault(name, []).extend(summaries)
         told(len(part_totals))
     array = np.array(totals, float)
-    nulls = {name: learn(summaries, array) for name, summaries in found.items() if len(summaries) == replicates}
-    return CaptureNull(centre, factors, array, nulls)
+    whole = {name: summaries for name, summaries in found.items() if len(summaries) == replicates}
+    nulls = {name: learn(summaries, array) for name, summaries in whole.items()}
+    law, scatter = _law_of(array, np.array([expected(float(centre * f)) for f in factors]))
+    return CaptureNull(centre, stated, factors, array, expected, law, scatter, nulls)
 
 
-def _level_for(sensor: Sensor, capture: Capture, total: float, stated: float | None) -> float:
-    """Photons/s on a pixel at which the model's closed form expects so many detections."""
-    low, high = 1e-3, 1e12
-    framed = capture.modality != "tr"
+def _closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
+    """Level -> detections of the whole array, as the effects' closed forms have it."""
+    conditions = capture.conditions
 
-    def detections(photons: float) -> float:
-        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), photons), capture.conditions)
-        if not framed:
-            return float(recorded.sum())
-        frames = capture.conditions.frames
-        live = capture.conditions.frame_time / capture.conditions.frame_period
-        return float((frames * -np.expm1(-candidates * live / frames)).sum())
+    @functools.lru_cache(maxsize=4096)
+    def detections(level: float) -> float:
+        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), level), conditions)
+        if capture.modality == "tr" or (capture.modality == "counts" and conditions.counting == "counter"):
+            return max(float(recorded.sum()), 1e-9)
+        live = conditions.frame_time / conditions.frame_period
+        share = -np.expm1(-candidates * live / conditions.frames)
+        return max(float((conditions.frames * share).sum()), 1e-9)
 
+    return detections
+
+
+def _level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
+    """The level at which so many detections are expected; the stated one where none does."""
+    low, high = 1e-6, 1e12
     for _ in range(100):
         middle = math.sqrt(low * high)
-        if detections(middle) < total:
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if expected(middle) < total else (low, middle)
     found = math.sqrt(low * high)
-    if not 1e-2 < found < 1e11:
-        return stated or 1.0
-    return found
+    return found if 1e-5 < found < 1e11 else stated or 1.0
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------
@@ -414,21 +452,22 @@ def _level_checks(
     levels: list[tuple[Capture, float, float, float]],
 ) -> list[Check]:
     """The total of a dark capture against the model's; that of a lit one becomes a light level."""
-    if capture.light.dark:
-        mean, scatter = float(made.totals.mean()), float(made.totals.std(ddof=1))
-        scatter = max(scatter, math.sqrt(max(mean, 1.0)) * 0.5) * math.sqrt(1 + 1 / len(made.totals))
-        z = (total - mean) / scatter
-        per = sensor.layout.pixels * capture.conditions.exposure
-        size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
-        relative = (total - mean) / max(mean, 1.0)
-        return [
-            Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels, no light", size, relative)
-        ]
-    stated = twin.photons_at(capture, sensor.layout)
-    factor, error, elasticity = made.factor_of(total)
-    if stated is not None and elasticity > 0.01:
-        levels.append((capture, math.log(factor * made.photons / stated), error, elasticity))
-    return []
+    level, error, elasticity = made.level_of(total)
+    if made.stated is None or elasticity <= 0.01:
+        return []
+    log = math.log(level / made.stated)
+    if not capture.light.dark:
+        levels.append((capture, log, error, elasticity))
+        return []
+    # few detections are not normal: their score against the mean, wider by what they scatter more than chance has it
+    mean = made.total_at(made.stated)
+    wider = max(1.0, error * elasticity * math.sqrt(max(mean, 1.0)))
+    z = float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider
+    per = sensor.layout.pixels * capture.conditions.exposure
+    size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
+    relative = (total - mean) / max(mean, 1.0)
+    p = float(2 * stats.norm.sf(abs(z)))
+    return [Check("rate", capture.id, z * z, p, "all pixels, no light", size, relative)]
 
 
 def _light(

@@ -18,6 +18,7 @@ from scipy import special, stats
 from ..statistics import Summary
 
 _LEAST = 1e-300
+_FEW = 20.0  # expected counts below which a cell does not tell by itself how it follows the light
 _MANY = 200.0  # expected counts beyond which a root of them is normal enough
 
 
@@ -61,7 +62,11 @@ class Null:
     def expected(self, total: float) -> tuple[np.ndarray, float]:
         """((cells,) expectation for a capture with so many detections, relative variance of that expectation)."""
         terms = _terms(np.array([total / self.middle - 1.0]), len(self.coefficients))
-        return (terms @ self.coefficients)[0], float((terms @ self.inverse @ terms.T)[0, 0])
+        expected = (terms @ self.coefficients)[0]
+        if self.law == "poisson":
+            # what none of the recordings had may still be there once in a while
+            expected = np.maximum(expected, 0.5 / self.recordings)
+        return expected, float((terms @ self.inverse @ terms.T)[0, 0])
 
     def judge(self, values: np.ndarray, total: float) -> Judgement:
         """values: (cells,) of the measured summary; total: detections of its capture."""
@@ -75,14 +80,14 @@ class Null:
             p = 1e-12 if wrong.any() else 1.0
             return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
         square = float(np.mean(z**2))
-        mean, variance = float(self.own.mean()), float(self.own.var(ddof=1))
+        mean, variance = max(float(self.own.mean()), 0.05), float(self.own.var(ddof=1))
         shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
-        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape)) if mean > 0 else 1.0
+        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
         p = min(1.0, 2 * min(p_sum, p_cell))
-        return Judgement(p, square / mean if mean > 0 else 0.0, z, expected, spread, worst)
+        return Judgement(p, square / mean, z, expected, spread, worst)
 
     def _spread(self, expected: np.ndarray) -> np.ndarray:
         if self.law == "poisson":
@@ -100,20 +105,23 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     n = len(values)
     middle = float(totals.mean()) or 1.0
     x = totals / middle - 1.0
-    terms = 1 if law in ("exponential", "exact") or np.ptp(x) == 0 else (3 if np.std(x) > 0.01 else 2)
-    design = _terms(x, terms)
-    inverse = np.linalg.pinv(design.T @ design)
     if law == "exact":
         coefficients = np.median(values, axis=0, keepdims=True)
-        own = np.zeros(n)
-        return Null(law, middle, coefficients, inverse, np.zeros(values.shape[1]), n, 1.0, 1.0, own, False)
+        return Null(
+            law, middle, coefficients, np.ones((1, 1)), np.zeros(values.shape[1]), n, 1.0, 1.0, np.zeros(n), False
+        )
+    follows = law in ("poisson", "normal") and bool(np.ptp(x) > 0)
+    design = _terms(x, 3 if follows else 1)
+    inverse = np.linalg.pinv(design.T @ design)
     coefficients = inverse @ design.T @ values
+    if law == "poisson" and follows:
+        _alike_where_few(values, x, coefficients)
     fitted = design @ coefficients
     hat = np.einsum("ij,jk,ik->i", design, inverse, design)
     scaled = first.scale is not None
     scale = np.ones(values.shape[1])
     if law == "normal":
-        freedom = max(1, n - terms)
+        freedom = max(1, n - len(coefficients))
         sample = np.sqrt(np.sum((values - fitted) ** 2, axis=0) / freedom)
         if scaled:
             scale = np.mean([s.scale for s in summaries if s.scale is not None], axis=0)
@@ -129,6 +137,20 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
         factor = max(float(np.sqrt(np.mean(z**2))), 1e-6)
     z = z / factor
     return Null(law, middle, coefficients, inverse, scale, n, factor, _tail(z), np.mean(z**2, axis=1), scaled)
+
+
+def _alike_where_few(values: np.ndarray, x: np.ndarray, coefficients: np.ndarray) -> None:
+    """Few counts cannot tell how their cell follows the total: such cells are taken to do it alike."""
+    mean = values.mean(axis=0)
+    few = mean < _FEW
+    if few.any():
+        together = values[:, few].sum(axis=1)
+        design = _terms(x, 2)
+        level, slope = np.linalg.lstsq(design, together, rcond=None)[0]
+        elasticity = float(np.clip(slope / level, -1.0, 4.0)) if level > 0 else 1.0
+        coefficients[:, few] = 0.0
+        coefficients[0, few] = mean[few] / max(float(np.mean(1 + elasticity * x)), 0.1)
+        coefficients[1, few] = coefficients[0, few] * elasticity
 
 
 def _terms(x: np.ndarray, terms: int) -> np.ndarray:
@@ -159,7 +181,7 @@ def _standardized(
     """
     widened = np.sqrt(np.maximum(1.0 + np.asarray(leverage), 1e-6))
     if law == "poisson":
-        return np.asarray(_poisson_scores(values, np.maximum(expected, 1e-9)) / widened)
+        return np.asarray(poisson_scores(values, np.maximum(expected, 0.5 / recordings)) / widened)
     if law == "exponential":
         ratio = values / np.maximum(expected, _LEAST)
         # the mean is known from so many recordings only
@@ -171,7 +193,7 @@ def _standardized(
     return _normal_of_t(z, max(1, recordings - 3))
 
 
-def _poisson_scores(n: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def poisson_scores(n: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Normal scores of counts: of the mid-p value where they are few, Anscombe's residual where they are many."""
     n, mean = np.broadcast_arrays(np.asarray(n, np.float64), np.asarray(mean, np.float64))
     # E n^(2/3) is m^(2/3) - m^(-1/3) / 9, its spread 2/3 m^(1/6)
