@@ -330,11 +330,17 @@ def _checked_mnist(path: Path, name: str) -> np.ndarray:
     return array
 
 
-def _cached_mnist(name: str) -> np.ndarray:
-    """MNIST's file from the user's cache; downloaded if it is not there, or there but damaged."""
+def cache_folder() -> Path:
+    """Where the program keeps what it can make or fetch again: `$SPADMNIST_CACHE`, or the system's place for it."""
     import pooch
 
-    path = Path(pooch.os_cache("spadmnist")) / "mnist" / f"{name}.gz"
+    return Path(os.environ.get("SPADMNIST_CACHE") or pooch.os_cache("spadmnist"))
+
+
+def _cached_mnist(name: str) -> np.ndarray:
+    """MNIST's file from the user's cache; downloaded if it is not there, or there but damaged."""
+
+    path = cache_folder() / "mnist" / f"{name}.gz"
     if path.is_file():
         with contextlib.suppress(InputError):
             return _checked_mnist(path, name)

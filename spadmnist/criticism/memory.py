@@ -1,0 +1,94 @@
+"""Nulls that were learnt before, on disk: another measurement of the same model then costs one reduction.
+
+An entry is named by everything that it is a function of: sensor, capture, light, seed, the program's own source and the
+user's plug-ins. What cannot be read is learnt again; the oldest entries go when there are too many.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import plugins
+from ..images import cache_folder
+from ..recording import Capture
+from ..sensor import Sensor
+from .nulls import Null
+
+_MOST_BYTES = 1 << 30  # of all entries together
+_ARRAYS = ("coefficients", "inverse", "spread", "own")
+_FACTS = ("law", "middle", "recordings", "factor", "tail", "scaled")
+
+
+def name_of(sensor: Sensor, capture: Capture, *more: Any) -> str:
+    """The name of the entry for a capture of a settled sensor; more: numbers and words that it depends on."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(path.read_bytes())
+    for _, text in sorted(plugins.loaded_files().items()):
+        digest.update(text.encode())
+    places = None if sensor.layout.positions is None else sensor.layout.positions.tobytes()
+    digest.update(repr((sensor.layout, places, sensor.rules, sensor.chip_seed, capture, more)).encode())
+    for effect in sensor.effects:
+        digest.update(effect.name.encode())
+        for name in effect.parameters:
+            value = getattr(effect, name)
+            digest.update(name.encode() + (value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()))
+    return digest.hexdigest()[:32]
+
+
+def recall(name: str) -> tuple[dict[str, np.ndarray], dict[str, Null]] | None:
+    """(further arrays, nulls by statistic), or None where there is no such entry, or none that can be read."""
+    path = _folder() / f"{name}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        facts = json.loads(arrays.pop("facts").tobytes().decode())
+        nulls = {
+            statistic: Null(**facts[statistic], **{key: arrays.pop(f"{statistic}/{key}") for key in _ARRAYS})
+            for statistic in facts
+        }
+        os.utime(path)
+    except (OSError, ValueError, KeyError, TypeError, EOFError):
+        return None
+    return arrays, nulls
+
+
+def keep(name: str, further: Mapping[str, np.ndarray], nulls: Mapping[str, Null]) -> None:
+    """Put an entry there. Where that is not possible nothing happens."""
+    facts = {statistic: {key: getattr(null, key) for key in _FACTS} for statistic, null in nulls.items()}
+    arrays = {f"{statistic}/{key}": getattr(null, key) for statistic, null in nulls.items() for key in _ARRAYS}
+    header = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    folder = _folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, allow_pickle=False, facts=header, **further, **arrays)
+            os.replace(temporary, folder / f"{name}.npz")
+        finally:
+            Path(temporary).unlink(missing_ok=True)
+        _make_room(folder)
+    except OSError:
+        return
+
+
+def _make_room(folder: Path) -> None:
+    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    total = 0
+    for path in entries:
+        total += path.stat().st_size
+        if total > _MOST_BYTES:
+            path.unlink(missing_ok=True)
+
+
+def _folder() -> Path:
+    return cache_folder() / "nulls"
