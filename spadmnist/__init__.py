@@ -24,6 +24,8 @@ _PUBLIC = {
     "open": "dataset",
     "Dataset": "dataset",
     "Part": "dataset",
+    "open_measurement": "measurement",
+    "Measurement": "measurement",
     "Events": "events",
     "Layout": "events",
     "Sensor": "sensor",

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import mmap
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -75,17 +76,21 @@ def _opened(path: Path) -> Iterator[Any]:
     except MemoryError:
         raise InputError(f"{path}: needs more memory than there is; cut the capture into several") from None
     except _DAMAGE as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(_printable(str(error)).split())
         raise InputError(
             f"{path}: is damaged, cut short or was never closed ({reason[:120]}); copy it again from where it was made"
         ) from None
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _data_set(file: Any, name: str, path: Path) -> Any:
     """A plain data set of unsigned integers (or of booleans) in the file itself."""
     import h5py
 
-    there = ", ".join(sorted(str(key)[:40] for key in list(file)[:10])) or "nothing"
+    there = ", ".join(sorted(_printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
     link = file.get(name, getlink=True)
     if link is None:
         raise InputError(f"{path}: has no data set {name}; there is {there}")
@@ -136,11 +141,35 @@ def _attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
         text = description.dtype.kind == "S" or h5py.check_string_dtype(description.dtype) is not None
         if math.prod(description.shape) != 1 or not (text or description.dtype.kind in "iuf"):
             raise InputError(f"{path}: the attribute {name} is not one number or one text; write it as that")
+        if text and description.dtype.kind == "O":
+            _check_heaps(path)
         value = np.asarray(node.attrs[name]).ravel()[0]
         if text:
             return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
         return value.item()
     return None
+
+
+def _check_heaps(path: Path) -> None:
+    """Raise InputError where a heap of text of any length is damaged: HDF5 would follow some of them for ever.
+
+    A heap is `GCOL`, a version, three zeros and its size; then objects, each with a number, its size and what it holds.
+    The number 0 is what is free behind them.
+    """
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start = data.find(b"GCOL\x01")
+        while start >= 0:
+            size = int.from_bytes(data[start + 8 : start + 16], "little")
+            at, end = start + 16, start + size
+            while at + 16 <= end <= len(data):
+                number, held = data[at : at + 2], int.from_bytes(data[at + 8 : at + 16], "little")
+                needed = 16 + (held + 7) // 8 * 8 if any(number) else held
+                if needed < 16 or at + needed > end:
+                    break
+                at += needed
+            if end - at >= 16 or end < start + 16:
+                raise InputError(f"{path}: is damaged (in what it holds of text); copy it again from where it was made")
+            start = data.find(b"GCOL\x01", start + 1)
 
 
 def examine(path: Path, capture: Capture, shape: tuple[int, int]) -> Capture:

@@ -221,28 +221,32 @@ def reconstruct_(
     click.echo(report.level_table(manifest))
 
 
-@cli.command(short_help="Say and show what a dataset holds.")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@cli.command(short_help="Say and show what a dataset or a measurement holds.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
     metavar="FILE.png",
-    help="Draw a sheet of images in all readouts and methods.",
+    help="Draw a sheet: images in all readouts and methods, or maps, rates and intervals of captures.",
 )
 @_json
 def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
-    """Say what DATASET holds: per light level detections, empty and saturated pixels, bytes, bits per detection.
+    """Say what DATASET holds: per light level detections, empty and saturated pixels, bytes, bits per detection; or
+    MEASUREMENT: per capture detections, rates, empty, hot and dead pixels, intervals.
 
     \b
     spadmnist inspect out
     spadmnist inspect out --plot sheet.png
     """
     from . import dataset as library
-    from . import report
+    from . import measurement, report
     from .errors import SpadError
 
     if plot is not None and plot.suffix.lower() != ".png":
         raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
+    if measurement.is_measurement(dataset):
+        _inspect_measurement(dataset, plot, as_json)
+        return
     manifest = library.intact_manifest(dataset)
     if as_json:
         click.echo(
@@ -260,6 +264,60 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         with _writing(plot):
             report.sheet(library.open(dataset), plot)
         _say(f"Drawn: {plot}")
+
+
+def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
+    from . import measurement, report
+
+    opened = measurement.open(path)
+    looks = report.looks(opened, plot is not None)
+    if as_json:
+        click.echo(json.dumps({"measurement": opened.name, "captures": [one.numbers for one in looks]}))
+    else:
+        click.echo(report.capture_table(opened, looks))
+    if plot is not None:
+        with _writing(plot):
+            report.capture_sheet(opened, looks, plot)
+        _say(f"Drawn: {plot}")
+
+
+@cli.command(short_help="Make the model's twin of a measurement.")
+@click.argument("sensor", type=click.Path(path_type=Path))
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    required=True,
+    help="Folder of the twin, which is a measurement too.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the draws.  [default: 0]"
+)
+@_plugin
+@_json
+def simulate(
+    sensor: Path, measurement: Path, output: Path, seed: int, plugin_files: tuple[Path, ...], as_json: bool
+) -> None:
+    """Simulate the captures of MEASUREMENT as SENSOR (a sensor file, or a config) would have recorded them.
+
+    \b
+    spadmnist simulate sensor.yaml lab -o twin
+    spadmnist inspect twin --plot twin.png
+    """
+    from . import config, twin
+    from . import measurement as library
+
+    _load(plugin_files)
+    model = config.read_sensor(sensor)
+    opened = library.open(measurement)
+    twin.simulate(model, opened, output, seed)
+    if as_json:
+        click.echo(json.dumps({"measurement": str(output), "captures": [c.id for c in opened.captures]}))
+    else:
+        _say(f"Simulated {len(opened.captures)} captures: {output}")
+        _say(f"Look at them:  spadmnist inspect {output} --plot {output.name}.png")
 
 
 @cli.command(short_help="Compare every byte with the manifest; repair.")
@@ -322,6 +380,138 @@ def verify(
 def _count(damage: Any) -> str:
     n = len(damage.changed) + len(damage.missing) + len(damage.extra)
     return f"{n} file is" if n == 1 else f"{n} files are"
+
+
+@cli.command("import", short_help="Make a measurement of files that other programs wrote.")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
+@click.option("--output", "-o", type=click.Path(path_type=Path), metavar="MEASUREMENT", help="Its folder.")
+@click.option("--name", metavar="NAME", help="Of the measurement.  [default: that of the file or folder]")
+@click.option(
+    "--light",
+    "lights",
+    multiple=True,
+    metavar="LIGHT",
+    help='What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2". Once for all files, or once for each.',
+)
+@click.option(
+    "--relative-uncertainty", metavar="SHARE", help="Of the light's calibration, one standard deviation: 1.5 %."
+)
+@click.option(
+    "--rows",
+    "--height",
+    "rows",
+    type=click.IntRange(1, 10**6),
+    default=None,
+    metavar="N",
+    help="Of pixels, which are then the channels of the same number.  [default: 1 x channels in use]",
+)
+@click.option("--columns", "--width", "columns", type=click.IntRange(1, 10**6), default=None, metavar="N")
+@click.option(
+    "--positions", type=click.Path(path_type=Path), metavar="FILE.csv", help="x,y (um) of pixels that are no grid."
+)
+@click.option("--exposure", metavar="TIME", help="Of time stamps: how long was recorded.")
+@click.option("--tick", metavar="TIME", help="Length of a tick, where the file does not say it; of a table 1 ps.")
+@click.option(
+    "--modality", type=click.Choice(["tr", "str", "qis", "counts"]), default=None, help="Of a stack of numbers."
+)
+@click.option("--frames", type=click.IntRange(1), default=None, metavar="N", help="How many; the file is compared.")
+@click.option("--frame-time", metavar="TIME", help="How long a frame looks.")
+@click.option("--frame-period", metavar="TIME", help="From one frame to the next.")
+@click.option("--bits", type=click.IntRange(1, 16), default=None, metavar="N", help="Of a count.")
+@click.option(
+    "--counting",
+    type=click.Choice(["frames", "counter"]),
+    default=None,
+    help="A count is the sum of 2^bits - 1 binary frames (default), or of a counter in each frame.",
+)
+@click.option("--packed", is_flag=True, help="In .npy or HDF5 a byte is eight columns.")
+@click.option("--bit-order", type=click.Choice(["big", "little"]), default="big", help="Which bit is the left column.")
+@click.option("--dataset", metavar="PATH", help="In HDF5: the frames.  [default: frames]")
+@click.option("--tdc", type=click.Path(path_type=Path), metavar="FILE.csv", help="LinoSPAD2: ends of the codes, in ps.")
+@click.option("--offsets", type=click.Path(path_type=Path), metavar="FILE.npy", help="LinoSPAD2: of the pixels, in ps.")
+@click.option("--firmware", type=click.Choice(["2212b", "2212s"]), default=None, help="LinoSPAD2.")
+@click.option("--timestamps", type=click.IntRange(1, 2**24), default=None, metavar="N", help="LinoSPAD2: of a cycle.")
+@click.option("--cycle", metavar="TIME", help="LinoSPAD2: its length.")
+@_json
+def import_(
+    files: tuple[Path, ...], output: Path | None, name: str | None, lights: tuple[str, ...], as_json: bool, **given: Any
+) -> None:
+    """Make a measurement of FILES, each a capture that is named as its file.
+
+    The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
+    NumPy .npy and .npz, TIFF; or by its name: LinoSPAD2 .dat, raw 1-bit frames .bin, CSV of pixel and time. What no
+    file says is asked for. Times are written with their unit: --exposure "100 ms".
+
+    \b
+    spadmnist import t2.ptu -o lab --light free
+    spadmnist import dark.npy flat.npy -o lab --frame-time "10 us" --frame-period "10 us" \\
+        --light dark --light "500 nm 75.67 nW/cm^2"
+    """
+    from .errors import SpadError
+    from .importers import Said, light
+    from .importers.captures import import_files
+
+    if output is None:
+        raise SpadError("--output: name the folder of the measurement that is made, for example -o lab")
+    said = Said.of(**given)
+    with _terminal() as progress:
+        made = import_files(files, output, said, [light(text) for text in lights], name, progress)
+    for note in made.notes:
+        _say(f"Note: {note}")
+    if as_json:
+        captures = [{"id": capture.id, "modality": capture.modality} for capture in made.captures]
+        click.echo(json.dumps({"measurement": str(output), "captures": captures, "notes": made.notes}))
+        return
+    for file, capture in zip(files, made.captures, strict=True):
+        click.echo(f"{capture.id}: {capture.modality}, from {file}")
+    _say(f"Made: {output}. Look at it:  spadmnist inspect {output}")
+
+
+@cli.command(short_help="Write captures to files that other programs read.")
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="A file, or a folder for several.",
+)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["photon-hdf5", "hdf5", "npz", "npy"]),
+    help="photon-hdf5: time stamps; npy: frames, QIS packed; hdf5, npz: all.",
+)
+@click.option("--capture", "ids", multiple=True, metavar="ID", help="Only this capture (repeatable).")
+@click.option("--readout", type=click.Choice(["tr", "str", "qis", "counts"]), default=None, help="Of a dataset.")
+@_json
+def export(
+    measurement: Path,
+    output: Path | None,
+    format_: str | None,
+    ids: tuple[str, ...],
+    readout: str | None,
+    as_json: bool,
+) -> None:
+    """Write the captures of MEASUREMENT (or of a dataset of uniform images) to OUT.
+
+    Files say how a capture was recorded, so that `import` gives it back as it was; .npy alone does not.
+
+    \b
+    spadmnist export lab -o dark.hdf5 --format photon-hdf5 --capture dark
+    """
+    from . import exporters
+    from . import measurement as library
+    from .errors import SpadError
+
+    if output is None or format_ is None:
+        raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
+    paths = exporters.export(library.open(measurement, readout), output, format_, ids)
+    if as_json:
+        click.echo(json.dumps({"files": [str(path) for path in paths]}))
+        return
+    for path in paths:
+        click.echo(str(path))
 
 
 @cli.command("effects", short_help="List physical effects, describe one, or begin one of your own.")

@@ -156,6 +156,29 @@ def read(
     return experiment
 
 
+def read_sensor(path: str | Path) -> Sensor:
+    """The sensor of a sensor file or of a config, with every map read and every distribution drawn.
+
+    Raises ConfigError with every mistake, or InputError where a file cannot be read.
+    """
+    source = document.read(Path(path))
+    reader = _Reader(source, Path(path).resolve().parent, [])
+    raw: Any = source.value
+    place: Path_ = ()
+    if isinstance(raw, Mapping) and "sensor" in raw:
+        raw, place = raw["sensor"], ("sensor",)
+        for key in source.value:
+            if key not in _SECTIONS:
+                hint = did_you_mean(str(key), _SECTIONS)
+                reader.problems.append(f"{source.place((key,))} is not an entry of a sensor file or of a config.{hint}")
+    elif not isinstance(raw, Mapping) or not {"layout", "effects"} & set(raw):
+        raise ConfigError([f"{source.name}: describes no sensor; it begins with sensor: and has layout and effects"])
+    described = reader.sensor(raw, None) if isinstance(raw, str) else reader.described(raw, place, None)
+    if reader.problems or described is None or described.settled is None:
+        raise ConfigError(reader.problems)
+    return described.settled
+
+
 def build(
     source: Document,
     base: Path,

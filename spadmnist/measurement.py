@@ -36,7 +36,7 @@ _LONGEST = 100  # characters of a name
 _DEFAULT_WAVELENGTH = "555 nm"  # where a level is given in lux, which mean light of this colour
 
 
-@dataclass
+@dataclass(repr=False, eq=False)
 class Measurement:
     """Captures of one array of pixels.
 
@@ -49,9 +49,12 @@ class Measurement:
     layout: Layout
     captures: tuple[Capture, ...]
     source: str
-    _read: Callable[[int, Layout, float], tuple[Recording, list[str]]] = field(repr=False)
-    _places: tuple[str, ...] = field(default=(), repr=False)
-    notes: dict[str, list[str]] = field(default_factory=dict, repr=False)
+    _read: Callable[[int, Layout, float], tuple[Recording, list[str]]]
+    _places: tuple[str, ...] = ()
+    notes: dict[str, list[str]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Measurement({self.name}: {_size(self.layout)} pixels; {_row([c.id for c in self.captures])})"
 
     def capture(self, id: str) -> Capture:
         """The capture of that name. Raises InputError with a sentence."""
@@ -130,16 +133,21 @@ def open(path: str | Path, readout: str | None = None) -> Measurement:
     if path.is_dir() and not (path / FILE).exists():
         if (path / dataset.MANIFEST).exists():
             return _of_dataset(path, readout)
-        raise InputError(f"{path} is not a measurement: it has no {FILE}; see `spadmnist simulate --help` for its form")
+        raise InputError(
+            f"{path} is not a measurement: it has no {FILE} (spadmnist import makes one of files of other programs)"
+        )
     source = document.read(path / FILE if path.is_dir() else path)
     return _Reader(source, path if path.is_dir() else path.parent).measurement()
+
+
+open_measurement = open  # its name in the package
 
 
 # --- measurement.yaml ---------------------------------------------------------------------------------------------
 
 Path_ = tuple[Any, ...]
 
-_CLOCKS = {"tr": ("exposure",), "frames": ("frames", "frame_time", "frame_period")}
+_CLOCK = ("frames", "frame_time", "frame_period")
 _EXAMPLES = {
     "format": f"format: {FORMAT}",
     "layout": "layout: {rows: 16, columns: 16}",
@@ -156,14 +164,7 @@ _EXAMPLES = {
     "frame_time": "frame_time: 10 us",
     "bits": "bits: 8",
 }
-_UNITS = {
-    "exposure": "s",
-    "frame_time": "s",
-    "frame_period": "s",
-    "wavelength": "m",
-    "irradiance": "W/m^2",
-    "lux": "lux",
-}
+_UNITS = {"wavelength": "m", "irradiance": "W/m^2", "lux": "lux"}
 
 
 @dataclass
@@ -250,18 +251,17 @@ class _Reader:
         self.say(path, f"{_brief(raw)} is not possible; it must be a whole number from 1 to {most}")
         return None
 
-    def quantity(self, path: Path_, raw: Any, unit: str, low: float = 0.0, high: float = np.inf) -> float | None:
-        """A number in SI above 0; with a `low` below 0 from 0 on."""
+    def quantity(self, path: Path_, raw: Any, unit: str, zero: bool = False, most: float = np.inf) -> float | None:
+        """A number in SI, more than 0 or, with `zero`, at least 0."""
         try:
             value = units.parse(raw, unit)
         except ValueError as error:
             self.say(path, str(error))
             return None
-        if (value > low if low >= 0 else value >= 0) and value <= high:
+        if 0 < value <= most or (zero and value == 0):
             return float(value)
-        allowed = "more than 0" if low >= 0 else "at least 0"
-        upper = "" if high == np.inf else f" and at most {high:g}"
-        self.say(path, f"{value} is not possible; it must be {allowed}{upper}")
+        upper = "" if most == np.inf else f" and at most {most:g}"
+        self.say(path, f"{value} is not possible; it must be {'at least' if zero else 'more than'} 0{upper}")
         return None
 
     def layout(self, raw: Any) -> Layout | None:
@@ -311,8 +311,7 @@ class _Reader:
 
     def capture(self, path: Path_, raw: Any) -> tuple[Capture, Path | None] | None:
         before = len(self.problems)
-        clock = ("exposure", "frames", "frame_time", "frame_period", "bits", "counting")
-        allowed = ("id", "file", "mean", "modality", "light", *clock)
+        allowed = ("id", "file", "mean", "modality", "light", "exposure", *_CLOCK, "bits", "counting")
         parts = self.group(path, raw, allowed, ("id", "modality", "light"), " of a capture")
         if not isinstance(raw, Mapping):
             return None
@@ -363,7 +362,7 @@ class _Reader:
             hint = did_you_mean(str(kind), ("dark", "flat"))
             self.say((*path, "kind"), f"{_brief(kind)} is not one of dark, flat.{hint}")
         values = {key: self.quantity((*path, key), parts[key], _UNITS[key]) for key in lit if key in parts}
-        shares = [self.quantity((*path, k), parts[k], "", -1.0, 1.0) if k in parts else 0.0 for k in uncertain]
+        shares = [self.quantity((*path, k), parts[k], "", True, 1.0) if k in parts else 0.0 for k in uncertain]
         if kind == "dark":
             for key in values:
                 self.say((*path, key), "belongs to light, and this capture is dark; take it out, or write kind: flat")
@@ -389,7 +388,7 @@ class _Reader:
             if key in parts
         }
         if modality == "tr":
-            for key in (*_CLOCKS["frames"], "bits", "counting"):
+            for key in (*_CLOCK, "bits", "counting"):
                 if key in parts:
                     self.say((*path, key), "belongs to frames; a tr capture has an exposure")
             if "exposure" not in parts:
@@ -444,7 +443,7 @@ class _Reader:
             most = conditions.frames
         elif modality == "counts":
             most = conditions.count_frames * conditions.largest_count
-        return self.quantity((*path, "mean"), raw, "", -1.0, most)
+        return self.quantity((*path, "mean"), raw, "", True, most)
 
 
 def _brief(value: Any) -> str:
@@ -528,22 +527,21 @@ def write(
     folder that holds anything else is refused. Raises SpadError where it cannot be written.
     """
     root = Path(path)
+    if root.exists() and not root.is_dir():
+        raise SpadError(f"{root} is a file; choose another place with -o")
     with disk.writing(root, 0):
         root.mkdir(parents=True, exist_ok=True)
     with _alone(root):
-        text = _yaml(name, layout, captures) if captures else None
-        _check_place(root, captures, layout, text)
+        _check_place(root, captures, layout)
         done: list[Capture] = []
         for one in recordings:
-            capture = one if isinstance(one, Capture) else one.capture
-            done.append(capture)
+            done.append(one if isinstance(one, Capture) else one.capture)
             if isinstance(one, Recording):
                 _commit(root, _files(done)[-1], capture_files.file_image(one))
         if layout.positions is not None:
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
-        final = _yaml(name, layout, done)
-        _check_place(root, done, layout, final)
-        _commit(root, FILE, final.encode())
+        _check_place(root, done, layout)
+        _commit(root, FILE, _yaml(name, layout, done).encode())
         for folder in (disk.temporary(root), disk.temporary(root).parent):
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -574,32 +572,33 @@ def _alone(root: Path) -> Iterator[None]:
     with disk.writing(root, 0):
         handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder") from None
         yield
-    except BlockingIOError:
-        raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder") from None
     finally:
         os.close(handle)
 
 
-def _check_place(root: Path, captures: Sequence[Capture], layout: Layout, text: str | None) -> None:
-    """Refuse a folder that holds anything but (parts of) this measurement."""
-    there = {entry.name for entry in os.scandir(root)}
-    ours = {FILE, ".spadmnist", *_files(captures), *([_POSITIONS] if layout.positions is not None else [])}
-    strange = sorted(there - ours) if captures else sorted(there - {".spadmnist"})
-    if strange and FILE not in strange:
+def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> None:
+    """Refuse a folder that holds anything but parts of this measurement. captures: all of them; none: not known yet."""
+    there = {entry.name for entry in os.scandir(root)} - {FILE, disk.temporary(root).parent.name}
+    if layout.positions is not None:
+        there.discard(_POSITIONS)
+    known = set(_files(captures))
+    strange = sorted(name for name in there if (name not in known if captures else not name.endswith(".h5")))
+    if strange:
         raise SpadError(f"{root} is not empty (there is {strange[0]}); choose another folder with -o, or remove it")
-    if FILE in there and (text is None or (root / FILE).read_bytes() != text.encode()):
-        raise SpadError(f"{root} holds another measurement; choose another folder with -o, or remove it")
 
 
 def _commit(root: Path, name: str, data: bytes) -> None:
     final = root / name
     if final.exists():
-        if final.stat().st_size != len(data) or final.read_bytes() != data:
+        if not final.is_file() or final.stat().st_size != len(data) or final.read_bytes() != data:
             raise SpadError(
-                f"{final}: is that of another measurement (or of another seed); choose another folder with -o, "
-                "or remove it"
+                f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another "
+                f"folder with -o, or remove {root}"
             )
         return
     disk.commit_file(final, data, disk.temporary(root))
@@ -682,7 +681,8 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
         "live": c.exposure if capture.modality == "tr" else c.frames * c.frame_time,
         "pixels": measurement.layout.pixels,
         "mean": capture.mean,
-        "detections": None,
+        **dict.fromkeys(("detections", "rate_median", "rate_mean", "rate_min", "rate_max", "empty_pixels")),
+        **dict.fromkeys(("hot_pixels", "dead_pixels", "ones_share", "shortest_interval")),
         "notes": list(measurement.notes.get(capture.id, [])),
     }
     if recorded is None:
@@ -698,8 +698,6 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
         "empty_pixels": int((totals == 0).sum()),
         "hot_pixels": int((totals > largest + 5 * np.sqrt(largest) + 10).sum()),
         "dead_pixels": int((totals == 0).sum()) if median >= 20 else None,
-        "ones_share": None,
-        "shortest_interval": None,
     }
     if capture.modality in ("qis", "str"):
         row["ones_share"] = float(totals.mean() / c.frames)

@@ -128,8 +128,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
         else:
             # a cell that never moves has no scatter to compare with: the rounding of its value stands in
             scale = np.maximum(sample, 1e-12 * np.maximum(np.abs(fitted).max(axis=0), 1e-30))
-    # the residuals of a fit to these very recordings are too small: by the share of each that it explains
-    z = _standardized(law, values, fitted, scale, -hat[:, None], n, scaled)
+    z = _of_their_own(law, values, fitted, scale, hat[:, None], len(coefficients), scaled)
     factor = 1.0
     if law == "poisson":
         factor = max(float(np.sqrt(np.mean(z**2))), 1.0)  # scores of few counts spread less than 1, in their middle
@@ -137,6 +136,25 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
         factor = max(float(np.sqrt(np.mean(z**2))), 1e-6)
     z = z / factor
     return Null(law, middle, coefficients, inverse, scale, n, factor, _tail(z), np.mean(z**2, axis=1), scaled)
+
+
+def _of_their_own(
+    law: str, values: np.ndarray, fitted: np.ndarray, spread: np.ndarray, hat: np.ndarray, terms: int, scaled: bool
+) -> np.ndarray:
+    """Standardized residuals of the recordings that the null was learnt from, as if each were a new one.
+
+    A fit to a recording comes too close to it: each is set against what the others say.
+    """
+    n = len(values)
+    if law == "exponential":
+        return _standardized(law, values, (n * fitted - values) / (n - 1), spread, 0.0, n - 1, scaled)
+    if law == "normal" and not scaled:
+        inner = (values - fitted) / (spread * np.sqrt(np.maximum(1 - hat, 1e-6)))
+        freedom = max(1, n - terms - 1)
+        outer = inner * np.sqrt(freedom / np.maximum(n - terms - inner**2, 1e-9))
+        return _normal_of_t(outer, freedom)
+    # what a fit leaves is smaller than its scatter by the share of each recording that it explains
+    return _standardized(law, values, fitted, spread, -hat, n, scaled)
 
 
 def _alike_where_few(values: np.ndarray, x: np.ndarray, coefficients: np.ndarray) -> None:

@@ -1,0 +1,179 @@
+"""What several statistics share: whole ticks, logarithmic bins, counts of pairs beyond chance, and words for sizes."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from .. import units
+from ..kernels import inline, jit
+from ..recording import Recording
+
+_FREE_RUNNING = 1e-11  # s: the tick that stands in where stamps are seconds
+_OCTAVE = 16  # entries of a guide for each octave
+_MANY = 1e5  # pairs
+
+
+def whole_ticks(recording: Recording) -> tuple[np.ndarray, float]:
+    """((events,) unsigned ticks of a TR recording, their length in s)."""
+    events = recording.events
+    assert events is not None
+    if events.ticks is not None and recording.tick is not None:
+        return events.ticks, recording.tick
+    return np.rint(events.times / _FREE_RUNNING).astype(np.uint64), _FREE_RUNNING
+
+
+def tick_of(recording: Recording) -> float:
+    """s; the length of the ticks that `whole_ticks` gives."""
+    return recording.tick or _FREE_RUNNING
+
+
+def exposure_in(recording: Recording, tick: float) -> int:
+    """The exposure in ticks."""
+    return max(1, round(recording.conditions.exposure / tick))
+
+
+@lru_cache(maxsize=64)
+def logarithmic(first: int, last: int, per_decade: int) -> np.ndarray:
+    """Whole edges from `first` to `last`, evenly spaced on a logarithmic scale where they are not too narrow for it."""
+    first, last = max(1, first), max(1, first, last)
+    steps = max(1, round(per_decade * math.log10(last / first)))
+    edges = np.unique(np.rint(np.geomspace(first, last, steps + 1)).astype(np.int64))
+    edges.setflags(write=False)
+    return edges
+
+
+@lru_cache(maxsize=64)
+def _guide(edges: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    keys = np.arange(53 * _OCTAVE, dtype=np.int64)
+    least = ((keys + (1023 << 4)) << 48).view(np.float64)  # the smallest number with these leading bits
+    start = np.searchsorted(np.array(edges), np.ceil(least), side="right") - 1
+    if edges[0] < 1 or np.diff(start).max() > 1:
+        raise ValueError("these edges are too close to each other")
+    return np.array([*edges, np.iinfo(np.int64).max]), start
+
+
+def guide(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(edges with one beyond everything, where to start): what `place` needs to find the bin of a number at once.
+
+    edges: whole numbers from 1 on, more than a sixteenth of an octave apart.
+    """
+    return _guide(tuple(edges.tolist()))
+
+
+@inline
+def place(value, edges, start):
+    """The bin of a whole number: k for edges[k] <= value < edges[k + 1], -1 below the first edge.
+
+    edges, start: see `guide`. At most one edge lies within the numbers that have the same leading bits.
+    """
+    if value < edges[0]:
+        return np.int64(-1)
+    k = start[(np.float64(value).view(np.int64) >> 48) - (1023 << 4)]
+    return k + (edges[k + 1] <= value)
+
+
+_DIGIT = 2048
+
+
+@jit
+def sort_ticks(raw, count, low, span, out, first, spare, heads):
+    """Put `raw[:count]` in order into `out[first:]`: whole numbers, most of them between low and low + span, evenly.
+
+    spare: (count,) int64, heads: (2, 2049) int64, buffers. By the upper 22 bits of their place in two turns; what has
+    the same ones, or lies outside, is put right at the end.
+    """
+    if count < _DIGIT // 4:
+        out[first : first + count] = raw[:count]
+        out[first : first + count].sort()
+        return
+    scale = _DIGIT * np.float64(_DIGIT) / max(span, 1)
+    most = np.int64(_DIGIT * _DIGIT - 1)
+    heads[:, :] = 0
+    for i in range(count):
+        q = min(max(np.int64((raw[i] - low) * scale), 0), most)
+        heads[0, (q & 2047) + 1] += 1
+        heads[1, (q >> 11) + 1] += 1
+    for b in range(_DIGIT):
+        heads[0, b + 1] += heads[0, b]
+        heads[1, b + 1] += heads[1, b]
+    for i in range(count):
+        q = min(max(np.int64((raw[i] - low) * scale), 0), most) & 2047
+        spare[heads[0, q]] = raw[i]
+        heads[0, q] += 1
+    for i in range(count):
+        q = min(max(np.int64((spare[i] - low) * scale), 0), most) >> 11
+        out[first + heads[1, q]] = spare[i]
+        heads[1, q] += 1
+    moves = 0
+    for i in range(first + 1, first + count):
+        value = out[i]
+        k = i
+        while k > first and out[k - 1] > value:
+            out[k] = out[k - 1]
+            k -= 1
+        out[k] = value
+        moves += i - k
+        if moves > 8 * count:  # they do not lie evenly at all
+            out[first : first + count].sort()
+            break
+
+
+def beyond_chance(
+    pairs: np.ndarray, chance: np.ndarray, variance: np.ndarray, power: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of pairs as counts with a Poisson law that hardly depend on the light level, and (pairs per count).
+
+    chance: pairs that the pixels' totals make by chance; variance: of the number of pairs, given those totals.
+    Few pairs are what they are. Of many, the part that chance explains is not known better than by the totals, and
+    wanders with them; so it is kept small: m = variance / (1 + variance / 1e5)^power counts stand for it, and what is
+    beyond chance is added in the same measure, sqrt(m / variance), which makes the variance of the whole m again.
+    """
+    pairs, chance = np.asarray(pairs, np.float64), np.asarray(chance, np.float64)
+    variance = np.asarray(variance, np.float64)
+    counts = variance / (1 + variance / _MANY) ** power
+    measure = np.sqrt((1 + variance / _MANY) ** -power)
+    return counts + (pairs - chance) * measure, 1 / measure
+
+
+def per_cent(share: float) -> str:
+    """A share in per cent with three digits: 0.82 %, +1.5e-05 %."""
+    return f"{100 * share:.3g} %"
+
+
+def of_detections(total: float) -> Callable[[int, float, float], tuple[str, float]]:
+    """The `size` of cells that count detections, of which there are `total`."""
+
+    def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+        share = float(measured - expected) / max(float(total), 1.0)
+        return f"{'excess' if share >= 0 else 'deficit'} of {per_cent(abs(share))} of detections", share
+
+    return size
+
+
+def of_pairs(
+    values: np.ndarray, pairs: np.ndarray, chance: np.ndarray, each: np.ndarray, total: float
+) -> Callable[[int, float, float], tuple[str, float]]:
+    """The `size` of cells made by `beyond_chance`: values and pairs per count `each`."""
+
+    def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+        number = max(float(total), 1.0)
+        found = float(pairs[cell] - chance[cell] + (measured - values[cell]) * each[cell]) / number
+        share = float((measured - expected) * each[cell]) / number
+        return f"{per_cent(found)} of detections beyond chance, {per_cent(found - share)} expected", share
+
+    return size
+
+
+def span(low: float, high: float, unit: str = "s") -> str:
+    """Two quantities with a unit: 10 to 30 ns, or 300 ns to 1 us."""
+    a, b = units.show(low, unit), units.show(high, unit)
+    if low == 0:
+        a = f"0 {b.partition(' ')[2]}"
+    number, _, name = a.partition(" ")
+    return f"{number} to {b}" if name == b.partition(" ")[2] else f"{a} to {b}"

@@ -1,0 +1,210 @@
+"""Normal scores: where a number lies in the law that it follows if nothing is at work, as a standard normal variable.
+
+A number of pairs or of detections that is a whole number and often small is no normal variable. Its score is: of the
+probability below it and a random share of its own, the normal quantile (Dunn and Smyth, J. Comput. Graph. Stat. 5,
+1996). The share is a function of the recording, different for every one. With it a number that carries no information
+is a score like any other, and one that is nearly always 0 has no spread that is too small.
+
+The laws here hold where detections fall where they like, given how many there are: boxes (blocks of time, pixels) are
+equal, each with `slots` places that can be taken once (frames), or with any number (`inf`: times).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+_FEW = 128  # up to so many detections the law of their pairs is worked out exactly
+_THIN = 0.1  # and if they fill less than this share of the slots, so that slots hardly matter
+_SPARSE = 30.0  # expectations below it are no normal variable
+_GOLDEN = 0x9E3779B97F4A7C15
+
+
+def _mixed(words: np.ndarray) -> np.ndarray:
+    """64 well mixed bits for each word (Steele, Lea and Flood, SplitMix64, 2014)."""
+    z = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+def shares(of: np.ndarray, size: int) -> np.ndarray:
+    """(size,) numbers in (0, 1), as good as random, that are a function of the whole numbers `of`."""
+    places = np.arange(1, max(size, of.size) + 1, dtype=np.uint64) * np.uint64(_GOLDEN)
+    seed = np.bitwise_xor.reduce(_mixed(of.ravel().astype(np.uint64) + places[: of.size]), keepdims=True)
+    words = _mixed(places[:size] + seed)
+    return np.asarray(((words >> np.uint64(12)) + 0.5) * 2.0**-52)
+
+
+def poisson_score(count: np.ndarray | float, mean: np.ndarray | float, share: np.ndarray | float) -> np.ndarray:
+    """Score of Poisson counts. Below a mean of 30 by the exact law, above by that of Wilson and Hilferty (1931)."""
+    from scipy import special
+
+    count, mean, share = np.broadcast_arrays(np.asarray(count, np.float64), np.asarray(mean, np.float64), share)
+    a = count + share
+    score = np.array(3.0 * np.sqrt(a) * (1.0 - 1.0 / (9.0 * a) - np.cbrt(mean / a)))
+    few = mean < _SPARSE
+    k, m, u = count[few], mean[few], share[few]
+    own = np.exp(special.xlogy(k, m) - m - special.gammaln(k + 1.0))
+    exact = _from_tails(np.where(k > 0, special.pdtr(k - 1.0, m), 0.0) + u * own, special.pdtrc(k, m) + (1.0 - u) * own)
+    score[few] = np.where(np.abs(exact) < 6.7, exact, score[few])
+    return score
+
+
+def _from_tails(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Normal quantile from the probabilities below and above, the smaller of which is the more precise."""
+    from scipy import special
+
+    return np.where(lower < upper, special.ndtri(lower), -special.ndtri(upper))
+
+
+class Pairs(NamedTuple):
+    """The law of the number of pairs of detections that share a box: mean, variance, third cumulant; any shape."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    third: np.ndarray
+
+    def pooled(self, times: np.ndarray) -> Pairs:
+        """The law of the sum of independent numbers. times: how often there is each of them."""
+        return Pairs(*(np.asarray((part * times).sum()) for part in self))
+
+
+def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pairs:
+    """Law of the pairs within `boxes` equal boxes, given the number of detections.
+
+    Mean and variance are exact, and with `slots` = inf the third cumulant, too: indicators of pairs are independent
+    but for triangles (index of dispersion: Fisher 1950, Haldane 1937). Otherwise it is made up of its limits for few
+    and for many detections.
+    """
+    n = np.asarray(detections, np.float64)
+    all_pairs = n * (n - 1.0) / 2.0
+    if not np.isfinite(slots):
+        q = 1.0 / boxes
+        variance = all_pairs * q * (1.0 - q)
+        return Pairs(all_pairs * q, variance, variance * (1.0 - 2.0 * q + 2.0 * np.maximum(n - 2.0, 0.0) * q))
+    places = boxes * slots
+    p = n / places
+    within = boxes * slots * (slots - 1.0) / 2.0 * (1.0 - (slots - 1.0) / max(1.0, places - 1.0))
+    drawn = n * (n - 1.0) / (places * max(1.0, places - 1.0))
+    left = (places - n) * (places - n - 1.0) / (max(1.0, places - 2.0) * max(1.0, places - 3.0))
+    variance = within * drawn * left
+    shape = (1.0 - 2.0 * p) ** 2 + 2.0 * (slots - 2.0) * p * (1.0 - p)
+    return Pairs(all_pairs * (slots - 1.0) / max(1.0, places - 1.0), variance, variance * np.maximum(shape, 1e-3))
+
+
+def gamma_score(number: np.ndarray | float, law: Pairs) -> np.ndarray:
+    """Score by the gamma law with the same three cumulants, by its cube root (Wilson and Hilferty). Never infinite."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shape = 4.0 * law.variance**3 / law.third**2
+        ratio = 1.0 + (number - law.mean) * law.third / (2.0 * law.variance**2)
+        score = 3.0 * np.sqrt(shape) * (np.cbrt(ratio) - 1.0 + 1.0 / (9.0 * shape))
+    return np.asarray(np.where(law.variance > 0, score, 0.0))
+
+
+def number_at(score: float, scores: Callable[[float, float], float], mean: float) -> float:
+    """The number, whole or not, that has a score. scores: (whole number, share) -> score, rising with both."""
+
+    def at(number: float) -> float:
+        whole = math.floor(number + 0.5)
+        return scores(float(whole), min(max(number + 0.5 - whole, 1e-9), 1.0 - 1e-9))
+
+    low, high = 0.0, max(1.0, 2.0 * mean)
+    while at(high) < score and high < 1e30:
+        high *= 2.0
+    while high - low > 1e-10 * (1.0 + high):
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if at(middle) < score else (low, middle)
+    return (low + high) / 2.0
+
+
+def pooled_score(number: float, law: Pairs, share: float) -> float:
+    """Score of a pooled number of pairs: Poisson where few are expected and they do not come in clumps."""
+    mean, variance, third = (float(part) for part in law)
+    if mean < _SPARSE and third <= 1.2 * variance:
+        return float(poisson_score(max(0.0, round(number)), mean, share))
+    return float(gamma_score(number + share - 0.5, law))
+
+
+def pair_scores(
+    pairs: np.ndarray, detections: np.ndarray, boxes: int, slots: float, share: np.ndarray
+) -> tuple[np.ndarray, Pairs]:
+    """(scores of the pairs in equal boxes, their laws): for every pixel, exact up to 128 detections (or gaps).
+
+    Where more than half of the slots are taken, the pairs of slots that are free are counted: the same number but for
+    a constant.
+    """
+    pairs, detections = minority(pairs, detections, boxes, slots)
+    law = pairs_law(detections, boxes, slots)
+    few = (detections <= _FEW) & (detections <= _THIN * boxes * slots)
+    if not few.any():
+        return gamma_score(pairs + share - 0.5, law), law
+    lower, own, upper = _pairs_of_few(boxes)
+    n, u = detections[few].astype(np.intp), share[few]
+    k = np.minimum(pairs[few].astype(np.intp), own.shape[1] - 1)
+    below, above = lower[n, k] + u * own[n, k], upper[n, k] + (1.0 - u) * own[n, k]
+    exact = _from_tails(np.maximum(below, 1e-12), np.maximum(above, 1e-12))
+    # the table is for slots without end; where they end, mean and spread are less, the score's but half as much
+    if np.isfinite(slots):
+        ends, here = pairs_law(n, boxes), Pairs(*(part[few] for part in law))
+        steady = here.variance <= 0
+        variance = np.where(steady, 1.0, here.variance)
+        ends_variance = np.where(steady, 1.0, ends.variance)
+        exact += np.where(steady, 0.0, (ends.mean - here.mean) / np.sqrt(ends_variance))
+        exact *= (ends_variance / variance) ** 0.25
+    score = np.empty(len(pairs))
+    score[few] = exact
+    rest = ~few
+    rest[few] = np.minimum(below, above) < 1e-11  # beyond the precision of the table
+    by_gamma = gamma_score((pairs + share - 0.5)[rest], Pairs(*(part[rest] for part in law)))
+    beyond = few[rest]
+    by_gamma[beyond] = np.copysign(np.maximum(np.abs(by_gamma[beyond]), 6.7), by_gamma[beyond])
+    score[rest] = by_gamma
+    return score, law
+
+
+def minority(
+    pairs: np.ndarray | float, detections: np.ndarray, boxes: int, slots: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(pairs, number) of the slots that are taken, or of those that are free where these are fewer."""
+    detections = np.asarray(detections, np.float64)
+    if not np.isfinite(slots):
+        return np.asarray(pairs, np.float64), detections
+    free = boxes * slots - detections
+    of_free = pairs + boxes * slots * (slots - 1.0) / 2.0 - (slots - 1.0) * detections
+    more = free < detections
+    return np.where(more, of_free, pairs), np.where(more, free, detections)
+
+
+@lru_cache(maxsize=8)
+def _pairs_of_few(boxes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities (detections 0 to 128, pairs 0 to 2047) of fewer pairs, of so many, and of more."""
+    size = 2048  # more pairs than have a chance above 1e-15 in 16 boxes or more: nothing comes around the corner
+    k = np.arange(_FEW + 1)
+    frequency = np.exp(-2j * np.pi / size * np.arange(size // 2 + 1))
+    one = frequency[None, :] ** (k * (k - 1) // 2)[:, None]  # all in one box
+    total, done = one, 1
+    for bit in bin(boxes)[3:]:
+        total, done = _together(total, done, total, done), 2 * done
+        if bit == "1":
+            total, done = _together(total, done, one, 1), done + 1
+    own = np.maximum(np.fft.irfft(total, size, axis=1), 0.0)
+    own[own < 1e-15] = 0.0
+    upto = np.cumsum(own, axis=1)
+    down = np.cumsum(own[:, ::-1], axis=1)[:, ::-1]
+    return upto - own, own, down - own
+
+
+def _together(a: np.ndarray, boxes_a: int, b: np.ndarray, boxes_b: int) -> np.ndarray:
+    """Characteristic functions over the detections in boxes_a + boxes_b boxes: a binomial number falls in the first."""
+    from scipy import stats
+
+    out = np.empty_like(a)
+    for n in range(_FEW + 1):
+        k = np.arange(n + 1)
+        split = stats.binom.pmf(k, n, boxes_a / (boxes_a + boxes_b))
+        out[n] = np.einsum("k,kw,kw->w", split, a[k], b[n - k])
+    return out

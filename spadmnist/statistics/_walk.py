@@ -1,0 +1,426 @@
+"""A walk through the detections of the whole array in the order of time: spacings, clusters, pairs.
+
+Everything that several statistics need of it is counted in one go, and kept with the recording.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..events import Layout
+from ..kernels import jit
+from ..recording import Recording
+from ._counting import exposure_in, guide, logarithmic, place, sort_ticks, tick_of, whole_ticks
+
+REACH = 3  # pitches
+SIZES = ((2, 2), (3, 3), (4, 4), (5, 8), (9, 16), (17, 0))  # detections in a cluster; 0: any number
+_LAGS = (1e-9, 3e-9, 10e-9, 30e-9, 100e-9)  # s
+_LATER = 30e-9  # s: up to here one neighbour is asked to fire after the other
+_GAPS = (1e-9, 10e-9)  # s
+_PER_DECADE = 10
+_AT_ONCE = 65536  # events that are sorted together: they fit into the cache
+_NEVER = -(1 << 62)
+
+
+@dataclass(frozen=True)
+class Near:
+    """Pairs of pixels up to 3 pitches apart, in classes.
+
+    names: of the classes; second: of those with a direction, which pixel is the second one, "" for the others; pairs:
+    (class, first pixels, second pixels); steps: on a grid the same as (class, columns, rows) to go.
+    """
+
+    names: tuple[str, ...]
+    second: tuple[str, ...]
+    pairs: tuple[tuple[int, np.ndarray, np.ndarray], ...]
+    steps: np.ndarray | None
+
+    def sums(self, of_first: np.ndarray, of_second: np.ndarray) -> np.ndarray:
+        """(classes,) sums over the pairs of products of what belongs to their pixels, each (pixels,)."""
+        out = np.zeros(len(self.names))
+        for kind, first, second in self.pairs:
+            out[kind] += of_first[first] @ of_second[second]
+        return out
+
+    @property
+    def number(self) -> int:
+        """How many pairs there are."""
+        return sum(len(first) for _, first, _ in self.pairs)
+
+
+_DIRECTIONS = {
+    (1, 0): ("horizontal side neighbours", "the right-hand one"),
+    (0, 1): ("vertical side neighbours", "the lower one"),
+    (1, 1): ("diagonal neighbours, falling", "the lower one"),
+    (-1, 1): ("diagonal neighbours, rising", "the lower one"),
+}
+
+
+def near(layout: Layout) -> Near:
+    """The pairs of near pixels of an array."""
+    places = None if layout.positions is None else layout.positions.tobytes()
+    return _near(layout.rows, layout.columns, places)
+
+
+@lru_cache(maxsize=4)
+def _near(rows: int, columns: int, places: bytes | None) -> Near:
+    positions = None if places is None else np.frombuffer(places).reshape(-1, 2)
+    known = Layout(rows, columns, 1.0, 1.0, positions).neighbours(REACH)
+    names: list[str] = []
+    second: list[str] = []
+    pairs = []
+    steps = []
+
+    def kind(name: str, other: str = "") -> int:
+        if name not in names:
+            names.append(name)
+            second.append(other)
+        return names.index(name)
+
+    if known.first is None:
+        pixel = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+        for distance, (dx, dy) in zip(known.distance, known.step, strict=True):
+            if dy < 0 or (dy == 0 and dx < 0):
+                continue
+            far = f"pixels about {2 if distance < 2.5 else 3} pitches apart", ""
+            first = pixel[: rows - dy, max(0, -dx) : columns - max(0, dx)].ravel()
+            pairs.append((kind(*_DIRECTIONS.get((int(dx), int(dy)), far)), first, first + np.int32(dy * columns + dx)))
+            steps.append((pairs[-1][0], dx, dy))
+    else:
+        a = np.repeat(np.arange(rows * columns), np.diff(known.first))
+        b, distance = known.step, known.distance
+        bounds = (("nearest neighbours", 0.0, 1.25), ("pixels about 2 pitches apart", 1.25, 2.25))
+        for name, low, high in (*bounds, ("pixels about 3 pitches apart", 2.25, np.inf)):
+            some = (a < b) & (distance > low) & (distance <= high)
+            if some.any():
+                pairs.append((kind(name), a[some].astype(np.int32), b[some].astype(np.int32)))
+    return Near(tuple(names), tuple(second), tuple(pairs), np.array(steps, np.int64) if steps else None)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What was counted.
+
+    spacings: (edges + 1,), the first those of 0; clusters: (gaps, sizes); pairs: (bins,) of the whole array by lag;
+    near: (classes, bins) the same of near pixels; same: (bins,) of the same pixel; later: (classes,) near pairs of
+    which the second pixel is later.
+    """
+
+    spacings: np.ndarray
+    clusters: np.ndarray
+    pairs: np.ndarray
+    near: np.ndarray
+    same: np.ndarray
+    later: np.ndarray
+
+
+def spacing_edges(recording: Recording) -> np.ndarray:
+    """(edges,) ticks, of spacings."""
+    tick = tick_of(recording)
+    longest = exposure_in(recording, tick) if recording.modality == "tr" else recording.none
+    return logarithmic(1, longest, _PER_DECADE)
+
+
+def lag_edges(tick: float) -> np.ndarray:
+    """(bins,) ticks: a lag belongs to the first bin whose edge is beyond it."""
+    return np.unique([max(1, round(lag / tick)) for lag in _LAGS])
+
+
+def latest(tick: float) -> int:
+    """Ticks: what is later by less counts in `Walk.later`."""
+    return max(2, round(_LATER / tick))
+
+
+def gaps(tick: float) -> np.ndarray:
+    """(gaps,) ticks: what is not further apart belongs to one cluster."""
+    return np.array([max(1, round(gap / tick)) for gap in _GAPS])
+
+
+def walk(recording: Recording) -> Walk:
+    """Walk through a recording with time stamps, once."""
+    known = recording._kept.get("walk")
+    if known is None:
+        known = recording._kept["walk"] = _through(recording)
+    return known  # type: ignore[return-value]
+
+
+def _through(recording: Recording) -> Walk:
+    tick = tick_of(recording)
+    edges, start = guide(spacing_edges(recording))
+    lags, near_by = lag_edges(tick), near(recording.layout)
+    spacings = np.zeros(edges.size, np.int64)
+    clusters = np.zeros((len(_GAPS), len(SIZES)), np.int64)
+    upto = np.zeros(lags.size, np.int64)
+    kinds = np.array([low for low, _ in SIZES])
+    # behind the classes of near pixels comes the pixel itself
+    found = np.zeros((len(near_by.names) + 1, lags.size), np.int64)
+    later = np.zeros(len(near_by.names) + 1, np.int64)
+    if recording.events is None:
+        for _, part in recording.chunks():
+            frames = np.ascontiguousarray(part.reshape(len(part), -1))
+            _through_frames(frames, recording.none, edges, start, gaps(tick), kinds, spacings, clusters)
+    else:
+        stamps, _ = whole_ticks(recording)
+        offsets, end = recording.events.offsets, exposure_in(recording, tick)
+        spot, stride, first, step, kind, second = _around(recording.layout, near_by)
+        _through_exposure(
+            stamps, offsets, end, edges, start, gaps(tick), kinds, lags, latest(tick),
+            spot, stride, first, step, kind, second, spacings, clusters, upto, found, later,
+        )  # fmt: skip
+    return Walk(spacings, clusters, np.diff(upto, prepend=0), found[:-1], found[-1], later[:-1])
+
+
+def _around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Who is around whom: (spot of each pixel, stride, first, step, kind, second).
+
+    A spot is a place in an array with an empty margin, so that there is one around every pixel. On a grid all spots
+    have the same entries: step (entries,) to go, with the class of the pair, and whether the pixel itself is its second
+    one (not the one at the other end). With positions, stride is 0: spot p has the entries first[p] to first[p + 1],
+    and step is the other spot itself. The pixel itself is the last class.
+    """
+    own = len(near_by.names)
+    if near_by.steps is not None or layout.positions is None:
+        stride = layout.columns + 2 * REACH
+        rows, columns = np.divmod(np.arange(layout.pixels), layout.columns)
+        spot = (rows + REACH) * stride + columns + REACH
+        steps = np.zeros((0, 3), np.int64) if near_by.steps is None else near_by.steps
+        go = steps[:, 1] + steps[:, 2] * stride
+        step, kind = np.concatenate([go, -go, [0]]), np.concatenate([steps[:, 0], steps[:, 0], [own]])
+        second = np.concatenate([np.zeros(go.size, bool), np.ones(go.size, bool), [False]])
+        return spot, stride, np.zeros(0, np.int64), step, kind, second
+    spot = np.arange(layout.pixels)
+    a = np.concatenate([*(first for _, first, _ in near_by.pairs), *(second for _, _, second in near_by.pairs), spot])
+    b = np.concatenate([*(second for _, _, second in near_by.pairs), *(first for _, first, _ in near_by.pairs), spot])
+    classes = np.concatenate([np.full(len(first), kind) for kind, first, _ in near_by.pairs])
+    classes = np.concatenate([classes, classes, np.full(spot.size, own)])
+    order = np.argsort(a, kind="stable")
+    first = np.searchsorted(a[order], np.arange(spot.size + 1))
+    return spot, 0, first, b[order].astype(np.int64), classes[order], np.zeros(order.size, bool)
+
+
+@jit
+def _through_exposure(
+    stamps, offsets, end, edges, start, gaps, kinds, lags, latest, spot, stride, first, step, kind, second,
+    spacings, clusters, upto, found, later,
+):  # fmt: skip
+    """Walk through all rows' stamps in the order of time, a slab of time after the other.
+
+    edges, start: of spacings, see `guide`; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
+    `_around`. Adds to spacings, clusters, upto (bins,) pairs of the array that are nearer than each of `lags`, found
+    (classes, bins) pairs of near pixels, later (classes,).
+    """
+    rows = offsets.size - 1
+    total = offsets[rows]
+    if total == 0:
+        return
+    slabs = 1 + total // max(_AT_ONCE, 2 * rows)
+    width = end // slabs + 1
+    spots = np.int64(0)
+    for row in range(rows):
+        spots = max(spots, spot[row] + 1 + REACH * (stride + 1))
+    bits = 0
+    while (np.int64(1) << bits) < spots:
+        bits += 1
+    top = (np.int64(1) << (62 - bits)) - 1
+    row_of = np.zeros(spots, np.int64)
+    recent = np.full(spots, _NEVER)  # the last stamp that was passed
+    passed = np.zeros(spots, np.int64)  # its place
+    for row in range(rows):
+        row_of[spot[row]] = row
+        passed[spot[row]] = offsets[row] - 1
+    position = offsets[:-1].copy()
+    raw = np.empty(2 * total // slabs + 1024, np.int64)
+    spare = np.empty(0, np.int64)
+    ordered = np.empty(0, np.int64)
+    times = np.empty(0, np.int64)
+    heads = np.empty((2, 2049), np.int64)
+    held = 0  # stamps of the slabs before that are near enough to matter
+    runs = np.ones(gaps.size, np.int64)
+    last = np.int64(-1)
+    longest = lags[lags.size - 1]
+    behind = np.zeros(lags.size, np.int64)
+    for slab in range(slabs):
+        stop = (slab + 1) * width if slab < slabs - 1 else top
+        before = position.copy()
+        count = _gather(stamps, offsets, position, stop, spot, bits, raw)
+        while count < 0:
+            raw = np.empty(2 * raw.size, np.int64)
+            position[:] = before
+            count = _gather(stamps, offsets, position, stop, spot, bits, raw)
+        if spare.size < count:
+            spare = np.empty(raw.size, np.int64)
+            ordered = np.empty(raw.size, np.int64)
+        if times.size < held + count:
+            grown = np.empty(held + raw.size, np.int64)
+            grown[:held] = times[:held]
+            times = grown
+        sort_ticks(raw, count, (slab * width) << bits, width << bits, ordered, 0, spare, heads)
+        _near_pairs(
+            ordered[:count], bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
+            row_of, recent, passed, found, later,
+        )  # fmt: skip
+        for i in range(count):
+            times[held + i] = ordered[i] >> bits
+        last = _follow(times, held, held + count, last, edges, start, gaps, kinds, runs, spacings, clusters)
+        for k in range(lags.size):
+            crowded = np.float64(total) * lags[k] > end
+            upto[k] += _pairs(times, held, held + count, lags[k], crowded, behind, k)
+        whole = held + count
+        oldest = behind[lags.size - 1]
+        while oldest < whole and stop - times[oldest] >= longest:
+            oldest += 1
+        for i in range(oldest, whole):
+            times[i - oldest] = times[i]
+        held = whole - oldest
+        for k in range(lags.size):
+            behind[k] = max(behind[k] - oldest, 0)
+    _finish(kinds, runs, clusters)
+
+
+@jit
+def _gather(stamps, offsets, position, stop, spot, bits, raw):
+    """The stamps before `stop`, with their spots in the lower bits; moves `position` on. -1 where there is no room."""
+    count = 0
+    for row in range(offsets.size - 1):
+        i = position[row]
+        while i < offsets[row + 1] and np.int64(stamps[i]) < stop:
+            i += 1
+        if count + i - position[row] > raw.size:
+            return -1
+        for k in range(position[row], i):
+            raw[count] = (np.int64(stamps[k]) << bits) | spot[row]
+            count += 1
+        position[row] = i
+    return count
+
+
+@jit
+def _near_pairs(
+    ordered, bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
+    row_of, recent, passed, found, later,
+):  # fmt: skip
+    """Count the pairs that each stamp makes with earlier ones around it; moves `recent` and `passed` on."""
+    mask = (np.int64(1) << bits) - 1
+    longest = lags[lags.size - 1]
+    begin, end = np.int64(0), np.int64(step.size)
+    hits = np.empty(step.size + 1, np.int64)
+    for i in range(ordered.size):
+        now = ordered[i] >> bits
+        here = ordered[i] & mask
+        around = here
+        if stride > 0:
+            # mostly there is nothing, and this says so at once
+            close = 0
+            for dy in range(-REACH, REACH + 1):
+                line = recent[here + dy * stride - REACH : here + dy * stride + REACH + 1]
+                for dx in range(2 * REACH + 1):
+                    close += now - line[dx] < longest
+            end = np.int64(step.size if close > 0 else 0)
+        else:
+            around = 0
+            begin, end = first[here], first[here + 1]
+        some = 0
+        for e in range(begin, end):
+            hits[some] = e
+            some += now - recent[around + step[e]] < longest
+        for h in range(some):
+            e = hits[h]
+            there = around + step[e]
+            k = passed[there]
+            oldest = offsets[row_of[there]]
+            while k >= oldest:
+                lag = now - np.int64(stamps[k])
+                if lag >= longest:
+                    break
+                b = 0
+                for j in range(lags.size - 1):
+                    b += lag >= lags[j]
+                found[kind[e], b] += 1
+                later[kind[e]] += second[e] & (lag > 0) & (lag < latest)
+                k -= 1
+        recent[here] = now
+        passed[here] += 1
+
+
+@jit
+def _pairs(times, begin, end, lag, crowded, behind, k):
+    """Pairs of times, of which the later one is one of begin to end, less than `lag` apart.
+
+    behind[k]: the first time that is near enough to the last one, moved on; crowded: are there usually several?
+    """
+    oldest = behind[k]
+    number = np.int64(0)
+    if crowded:
+        # each step goes on in one of the two places, whichever it is: no branch that a processor could guess wrong
+        i = begin
+        while i < end:
+            far = np.int64(times[i] - times[oldest] >= lag)
+            number += (1 - far) * (i - oldest)
+            oldest += far
+            i += 1 - far
+    else:
+        for i in range(begin, end):
+            while times[i] - times[oldest] >= lag:
+                oldest += 1
+            number += i - oldest
+    behind[k] = oldest
+    return number
+
+
+@jit
+def _follow(times, begin, end, last, edges, start, gaps, kinds, runs, spacings, clusters):
+    """Count spacings and clusters of times in order; last: the one before them, -1 without. Returns the last one."""
+    for i in range(begin, end):
+        now = times[i]
+        if last >= 0:
+            apart = now - last
+            spacings[place(apart, edges, start) + 1] += 1
+            for g in range(gaps.size):
+                if apart <= gaps[g]:
+                    runs[g] += 1
+                elif runs[g] > 1:
+                    _end_of_run(kinds, runs[g], clusters[g])
+                    runs[g] = 1
+        last = now
+    return last
+
+
+@jit
+def _end_of_run(kinds, length, clusters):
+    k = kinds.size - 1
+    while kinds[k] > length:
+        k -= 1
+    clusters[k] += 1
+
+
+@jit
+def _finish(kinds, runs, clusters):
+    for g in range(runs.size):
+        if runs[g] > 1:
+            _end_of_run(kinds, runs[g], clusters[g])
+        runs[g] = 1
+
+
+@jit
+def _through_frames(frames, none, edges, start, gaps, kinds, spacings, clusters):
+    """Spacings and clusters of first stamps (frames, pixels), frame by frame."""
+    pixels = frames.shape[1]
+    raw = np.empty(pixels, np.int64)
+    spare = np.empty(pixels, np.int64)
+    times = np.empty(pixels, np.int64)
+    heads = np.empty((2, 2049), np.int64)
+    runs = np.ones(gaps.size, np.int64)
+    for f in range(frames.shape[0]):
+        count = 0
+        for p in range(pixels):
+            if frames[f, p] < none:
+                raw[count] = frames[f, p]
+                count += 1
+        sort_ticks(raw, count, 0, none, times, 0, spare, heads)
+        _follow(times, 0, count, -1, edges, start, gaps, kinds, runs, spacings, clusters)
+        _finish(kinds, runs, clusters)

@@ -1,0 +1,245 @@
+"""Pairs of detections of the same pixel, by the time between them."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..kernels import jit
+from . import Recording, Statistic, Summary
+from ._counting import beyond_chance, exposure_in, of_pairs, span, whole_ticks
+from ._frames import as_words, at_ends, count_ones, moments
+
+_SHORTEST, _LONGEST = 10e-9, 10e-3  # s
+_LAGS = (1, 2, 3, 5, 10, 20, 50, 100)  # frames
+_PER_OCTAVE = 4
+_SPARSE = 1.5  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
+
+
+class Autocorrelation(Statistic):
+    """Pairs of detections of the same pixel, by the time between them: all pairs, not only successive ones.
+
+    Time stamps: lags from the dead time to 10 ms, four cells to an octave, as a multiple-tau correlator takes them:
+    for lags of 4 to 8 boxes of time, products of the numbers of detections in boxes 4, 5, 6 and 7 apart, and then in
+    boxes twice as long. Frames: products of a pixel's frames 1, 2, 3, 5, 10, 20, 50 and 100 apart. Pooled over the
+    pixels.
+    Counts of pairs: given the pixels' totals, their variance is the number that chance makes (of frames: (1 - p)^2
+    times it, p the share of frames with a detection), and with few of them their law is Poisson's; many are measured
+    from what chance makes of the totals, so that neither the light level nor a map of the pixels is seen here. Slow
+    traps, source noise, flicker and blinking show, and in frames what one leaves to the next.
+    Source: Schätzel, Quantum Opt. 2 (1990) 287, for the correlator.
+    """
+
+    modalities = ("tr", "str", "qis", "counts")
+    unit = "pairs"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Pairs beyond chance, as counts (see `beyond_chance`)."""
+        return self._stamps(recording) if recording.events is not None else self._frames(recording)
+
+    def _stamps(self, recording: Recording) -> Summary | None:
+        stamps, tick = whole_ticks(recording)
+        end = exposure_in(recording, tick)
+        box = max(1, math.ceil(max(recording.dead_time, _SHORTEST) / tick / 3))
+        longest = min(round(_LONGEST / tick), end // 4)
+        levels = int(math.log2(longest / box)) - 2 if longest >= 8 * box else 0
+        if levels < 1:
+            return None
+        assert recording.events is not None
+        # as many boxes as make whole ones at all levels
+        boxes = end // box >> (levels - 1) << (levels - 1)
+        pairs = np.zeros((levels, _PER_OCTAVE), np.int64)
+        chance, variance = np.zeros(pairs.shape), np.zeros(pairs.shape)
+        _correlate(stamps, recording.events.offsets, 1.0 / box, boxes, pairs, chance, variance)
+        total = float(recording.totals.sum())
+        lags = (np.arange(4, 8) * box * tick) * 2.0 ** np.arange(levels)[:, None]
+        width = (lags / np.arange(4, 8)).ravel()
+        lags = lags.ravel()
+
+        def where(cell: int) -> str:
+            return f"the same pixel, {span(lags[cell], lags[cell] + width[cell])} later"
+
+        return _summary(pairs.ravel(), chance.ravel(), variance.ravel(), total, where, lags, "lag (s)")
+
+    def _frames(self, recording: Recording) -> Summary | None:
+        frames = recording.n_frames
+        lags = np.array([lag for lag in _LAGS if 2 * lag <= frames])
+        if not lags.size:
+            return None
+        pairs = _products(recording, lags)
+        n, _, variance = moments(recording)
+        mean = n / frames
+        first, last = at_ends(recording, mean, int(lags[-1]))
+        lone = np.cumsum(first + last)[lags - 1]  # frames at the ends have one partner instead of two
+        chance = 2 * (n @ mean) - lone - (frames - lags) * (mean @ mean + variance.sum() / frames)
+        spread = (variance @ variance) * (frames - lags)
+
+        def where(cell: int) -> str:
+            return "the same pixel, the next frame" if lags[cell] == 1 else f"the same pixel, {lags[cell]} frames later"
+
+        return _summary(pairs, chance, spread, n.sum(), where, lags.astype(np.float64), "lag (frames)")
+
+
+def _summary(
+    pairs: np.ndarray, chance: np.ndarray, variance: np.ndarray, total: float, where, axis: np.ndarray, label: str
+) -> Summary:
+    values, each = beyond_chance(pairs, chance, variance)
+    size = of_pairs(values, pairs, chance, each, total)
+    return Summary(values, "poisson", where, size, axis=axis, label=label, log=True)
+
+
+@jit
+def _correlate(stamps, offsets, per_box, boxes, pairs, chance, variance):
+    """Add up the pairs of the same row (levels, 4) that are 4 to 7 boxes apart; a level's boxes are twice as long.
+
+    per_box: boxes of the first level in a tick; boxes: of the first level, what is later is left out. chance: pairs
+    expected of the row's total and of what lies at the ends, where boxes have one partner instead of two.
+    While a window of 8 boxes holds few stamps pairs are looked up one by one, then all boxes are filled.
+    """
+    levels = pairs.shape[0]
+    most = 0
+    for row in range(offsets.size - 1):
+        most = max(most, offsets[row + 1] - offsets[row])
+    box = np.empty(most, np.int64)
+    inside = np.empty(most, np.int64)
+    filled = np.empty(0, np.int32)
+    for row in range(offsets.size - 1):
+        n = 0
+        total = 0
+        for i in range(offsets[row], offsets[row + 1]):
+            b = np.int64(np.float64(stamps[i]) * per_box)
+            if b >= boxes:
+                break
+            total += 1
+            if n > 0 and b == box[n - 1]:
+                inside[n - 1] += 1
+            else:
+                box[n] = b
+                inside[n] = 1
+                n += 1
+        if n == 0:
+            continue
+        _by_chance(box[:n], inside[:n], total, boxes, chance, variance)
+        if n == 1:
+            continue
+        sparse = 0
+        while sparse < levels and n * np.float64(8 << sparse) < _SPARSE * boxes:
+            sparse += 1
+        if sparse > 0:
+            _few(box[:n], inside[:n], sparse, pairs)
+        if sparse < levels:
+            size = boxes >> sparse
+            if filled.size < size:
+                filled = np.empty(size + size // 4, np.int32)
+            filled[:size] = 0
+            for i in range(n):
+                filled[box[i] >> sparse] += np.int32(inside[i])
+            _many(filled, size, sparse, pairs)
+
+
+@jit
+def _by_chance(box, inside, total, boxes, chance, variance):
+    """Add what chance makes of a row: of its total, and of the boxes at its ends, which are gone through inwards."""
+    head, tail = 0, box.size - 1
+    lone = 0
+    for level in range(chance.shape[0]):
+        n = np.float64(boxes >> level)
+        mean = total / n
+        for d in range(4, 8):
+            reach = d << level
+            while head < box.size and box[head] < reach:
+                lone += inside[head]
+                head += 1
+            while tail >= 0 and box[tail] >= boxes - reach:
+                lone += inside[tail]
+                tail -= 1
+            # the last term: boxes that share a given total are a little opposed to each other
+            chance[level, d - 4] += mean * (2 * total - lone) - (n - d) * mean * (mean + 1.0 / n)
+            variance[level, d - 4] += total * (total - 1.0) * (n - d) / (n * n)
+
+
+@jit
+def _few(box, inside, levels, out):
+    """The pairs of the first levels, one by one."""
+    window = np.int64(8) << (levels - 1)
+    for i in range(1, box.size):
+        here = box[i]
+        k = i - 1
+        while k >= 0 and here - box[k] < window:
+            apart = here - box[k]
+            weight = inside[i] * inside[k]
+            # at the first level at which they can be less than 8 boxes apart, and at the next
+            level = max((np.float64(apart).view(np.int64) >> 52) - 1023 - 3, 0)
+            while level < levels and (apart >> level) >= 3:
+                d = (here >> level) - (box[k] >> level)
+                if d >= 4 and d < 8:
+                    out[level, d - 4] += weight
+                level += 1
+            k -= 1
+
+
+@jit
+def _many(filled, size, level, out):
+    """The products of boxes for all levels from `level` on; the boxes are added up in place."""
+    while level < out.shape[0]:
+        for d in range(4, 8):
+            total = np.int64(0)
+            for i in range(size - d):
+                total += np.int64(filled[i]) * np.int64(filled[i + d])
+            out[level, d - 4] += total
+        size >>= 1
+        for i in range(size):
+            filled[i] = filled[2 * i] + filled[2 * i + 1]
+        level += 1
+
+
+def _products(recording: Recording, lags: np.ndarray) -> np.ndarray:
+    """(lags,) sums over pixels and frames of the products of a frame and the one so much later."""
+    out = np.zeros(lags.size, np.int64)
+    longest = int(lags[-1])
+    if recording.modality == "counts":
+        before = np.zeros((longest, recording.pixels), np.uint16)
+        for first, part in recording.chunks():
+            both = np.concatenate([before, part.reshape(len(part), -1)])
+            _multiply(both, longest, first, lags, out)
+            before = both[-longest:]
+        return out
+    before = np.zeros((longest, 0), np.uint64)
+    for first, part in recording.bits():
+        words = as_words(part)
+        if before.shape[1] != words.shape[1]:
+            before = np.zeros((longest, words.shape[1]), np.uint64)
+        _coincide(words, before, first, lags, out)
+        before = np.concatenate([before, words[-longest:]])[-longest:]
+    return out
+
+
+@jit
+def _coincide(words, before, first, lags, out):
+    """Add the ones that words (frames, words) have in common with those so many frames earlier.
+
+    before: the frames in front of them; first: the number of the first frame, before which there is nothing.
+    """
+    for f in range(words.shape[0]):
+        for k in range(lags.size):
+            earlier = f - lags[k]
+            if earlier >= 0:
+                out[k] += count_ones(words[f], words[earlier])
+            elif first + earlier >= 0:
+                out[k] += count_ones(words[f], before[before.shape[0] + earlier])
+
+
+@jit
+def _multiply(frames, behind, first, lags, out):
+    """The same for counts (frames, pixels), of which the first `behind` are the earlier ones."""
+    for f in range(behind, frames.shape[0]):
+        for k in range(lags.size):
+            if first + f - behind - lags[k] >= 0:
+                now, earlier = frames[f], frames[f - lags[k]]
+                total = np.int64(0)
+                for i in range(now.size):
+                    total += np.int64(now[i]) * np.int64(earlier[i])
+                out[k] += total

@@ -1,0 +1,141 @@
+"""Codes of the time-to-digital converter."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import units
+from ..kernels import jit
+from . import Recording, Statistic, Summary
+from ._counting import of_detections, per_cent
+
+# All periods below divide it: a histogram of stamps modulo this number holds those of all of them.
+_PRIMES = (2, 3, 5, 7)
+_COMMON = 2**8 * 3 * 5**3 * 7
+_SHOWN = (256, 140, 100)
+_FOLDS = tuple(p for p in range(2, 1001) if _COMMON % p == 0)
+_COINCIDENCES = 500.0  # pairs of detections with the same code, from which on chi squared has its law
+_TURNS = 16  # periods that an exposure or a frame holds at least, for what is left over at its end to be little
+
+
+class Codes(Statistic):
+    """Code density: how often each code of the converter occurs, stamps being taken modulo 256, 140 and 100 ticks.
+
+    The period of the converter's coarse clock is not known; a histogram modulo 256 has all that repeats after a power
+    of two up to 256, and the lowest eight bits; 140 and 100 have their divisors (140 codes to a period: LinoSPAD2).
+    Other periods: `code_periods`. Detections that know nothing of the clock fall on all codes alike; each count is
+    rare among all: Poisson. Unequal and missing codes show here, and bits that are stuck.
+    """
+
+    modalities = ("tr", "str")
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts of the codes of each period, one after the other."""
+        periods = [period for period in _SHOWN if period in _allowed(recording)]
+        if not periods:
+            return None
+        folded = _folds(recording)
+        values = np.concatenate([folded[period] for period in periods])
+        cells = [(period, code) for period in periods for code in range(period)]
+        rate = of_detections(float(folded[periods[0]].sum()))
+
+        def where(cell: int) -> str:
+            period, code = cells[cell]
+            bits = f" (low bits {code:08b})" if period == 256 else ""
+            return f"code {code} of {period}{bits}"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            _, share = rate(cell, measured, expected)
+            wide = measured / expected - 1 if expected > 0 else 0.0
+            return f"{per_cent(abs(wide))} too {'often' if wide > 0 else 'seldom'}", share
+
+        return Summary(values.astype(np.float64), "poisson", where, size)
+
+
+class CodePeriods(Statistic):
+    """Is there any period after which stamps repeat? For each period one number, how uneven the codes in it are.
+
+    All periods from 2 to 1000 ticks that divide 672,000: 76 of them, with no prime factors but 2, 3, 5 and 7. The
+    number is chi squared of the codes' counts, with one degree of freedom less than codes, made normal by its cube
+    root (Wilson and Hilferty); 0 where there are too few detections for it. What `codes` shows in many cells, this
+    gathers in the one of the right period.
+    """
+
+    modalities = ("tr", "str")
+    unit = "standard deviations"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Normal scores of the periods."""
+        periods = _allowed(recording)
+        if not periods:
+            return None
+        folded = _folds(recording)
+        total = float(folded[periods[0]].sum())
+        values = np.zeros(len(periods))
+        uneven = np.zeros(len(periods))
+        for k, period in enumerate(periods):
+            if total * total < 2 * _COINCIDENCES * period:
+                continue
+            counts = folded[period].astype(np.float64)
+            freedom = period - 1
+            squares = float(counts @ counts) * period / total - total
+            part = 2 / (9 * freedom)
+            values[k] = (np.cbrt(squares / freedom) - (1 - part)) / np.sqrt(part)
+            uneven[k] = (squares - freedom) / total  # squared relative spread of the codes' widths
+
+        def where(cell: int) -> str:
+            period = periods[cell]
+            return f"codes in a period of {period} ticks ({units.show(period * (recording.tick or 0.0), 's')})"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            wide = float(np.sqrt(max(uneven[cell], 0.0)))
+            return f"widths of the codes vary by {per_cent(wide)} (rms)", wide
+
+        axis = np.array(periods, np.float64)
+        return Summary(values, "normal", where, size, np.ones(len(periods)), axis, "period (ticks)", log=True)
+
+
+def _allowed(recording: Recording) -> list[int]:
+    """The periods of which an exposure or a frame holds enough; none without a converter."""
+    if recording.tick is None:
+        return []
+    conditions = recording.conditions
+    length = conditions.exposure if recording.events is not None else conditions.frame_time
+    return [period for period in _FOLDS if period * _TURNS * recording.tick <= length]
+
+
+def _folds(recording: Recording) -> dict[int, np.ndarray]:
+    """Period -> (period,) how many stamps have each code, for all of `_FOLDS`."""
+    known = recording._kept.get("code folds")
+    if known is None:
+        density = np.zeros(_COMMON, np.int64)
+        if recording.events is not None:
+            assert recording.events.ticks is not None
+            _remainders(recording.events.ticks, np.iinfo(np.int64).max, density)
+        else:
+            for _, part in recording.chunks():
+                _remainders(np.ascontiguousarray(part).ravel(), recording.none, density)
+        folded = {_COMMON: density}
+        for period in _FOLDS:
+            _fold(folded, period)
+        known = recording._kept["code folds"] = {period: folded[period] for period in _FOLDS}
+    return known  # type: ignore[return-value]
+
+
+def _fold(folded: dict[int, np.ndarray], period: int) -> np.ndarray:
+    """From a period that is a few times as long, which is folded from a longer one."""
+    if period not in folded:
+        times = next(p for p in reversed(_PRIMES) if _COMMON % (period * p) == 0)
+        folded[period] = _fold(folded, period * times).reshape(times, period).sum(axis=0)
+    return folded[period]
+
+
+@jit
+def _remainders(stamps, none, out):
+    for i in range(stamps.size):
+        stamp = np.int64(stamps[i])
+        if stamp < none:
+            out[np.uint64(stamp) % np.uint64(_COMMON)] += 1

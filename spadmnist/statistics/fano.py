@@ -1,0 +1,349 @@
+"""Variance over mean of the counts in windows of time (Fano factor), from 1 us to a twentieth of the capture."""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the types from the calls; the docstrings give them.
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..kernels import jit
+from ..units import show
+from . import Recording, Statistic, Summary
+from ._frames import as_words, frame_sums, ones_of
+from ._scores import Pairs, minority, number_at, pair_scores, pairs_law, pooled_score, shares
+from ._series import has_data, slots_of_frame, stamps
+
+_ALL = ("tr", "str", "qis", "counts")
+_WINDOWS = 20  # of the longest kind
+_SHORTEST = 1e-6  # s
+_MOST = 2**22  # windows of the array sum that are held at a time
+_GROUP = 6  # up to 2^6 frames, counts are bits of different weight in different words
+_WORDS = 8  # words (of 64 pixels) that are counted at a time: a line of the cache
+
+
+@jit
+def event_pairs(stamps, offsets, factor, levels):
+    """Pairs of events of the same row within windows of 1, 2, 4, ... of the shortest windows.
+
+    factor: shortest windows per unit of the stamps; the longest window is 2^(levels - 1) of them, of which there are
+    20. Returns (pairs (levels,), inside (rows,) events within all windows), int64.
+    """
+    end = np.int64(20) << np.int64(levels - 1)
+    pairs = np.zeros(levels, np.int64)
+    inside = np.zeros(offsets.size - 1, np.int64)
+    before = np.zeros(levels, np.int64)  # events of the row in the present window
+    for row in range(offsets.size - 1):
+        last = np.int64(-1)
+        for i in range(offsets[row], offsets[row + 1]):
+            window = np.int64(stamps[i] * factor)
+            if window >= end:
+                continue
+            inside[row] += 1
+            apart = window ^ last if last >= 0 else end
+            for level in range(levels):
+                if (apart >> level) == 0:
+                    pairs[level] += before[level]
+                    before[level] += 1
+                else:
+                    before[level] = 1
+            last = window
+    return pairs, inside
+
+
+@jit
+def event_sums(stamps, factor, windows):
+    """(windows,) int32 events of the whole array in each window. factor: windows per unit of the stamps."""
+    out = np.zeros(windows, np.int32)
+    for i in range(stamps.size):
+        window = np.int64(stamps[i] * factor)
+        if window < windows:
+            out[window] += 1
+    return out
+
+
+@jit
+def group_squares(frames, levels, squares, counts):
+    """Squares of the pixels' counts in windows of 2, 4, ... 2^levels frames, summed over pixels; one group of frames.
+
+    frames: (2^levels, words) uint64, a bit for each pixel. squares: (levels + 1,) int64, added to. counts: (64 words,)
+    int32, the counts of the whole group. The counts of 64 pixels stand in several words, one for each binary digit;
+    windows are added as in a binary counter, so that every frame is looked at once.
+    """
+    group, words = frames.shape
+    line = 8
+    held = np.zeros((levels + 1, levels + 2, line), np.uint64)  # first halves of windows: level, digit, word
+    now = np.zeros((levels + 2, line), np.uint64)
+    for first in range(0, words, line):
+        width = min(line, words - first)
+        for f in range(group):
+            for w in range(width):
+                now[0, w] = frames[f, first + w]
+            level = 0
+            while (f >> level) & 1:
+                for w in range(width):
+                    carry = np.uint64(0)
+                    for digit in range(level + 1):
+                        a = held[level, digit, w]
+                        b = now[digit, w]
+                        different = a ^ b
+                        now[digit, w] = different ^ carry
+                        carry = (a & b) | (carry & different)
+                    now[level + 1, w] = carry
+                level += 1
+                total = np.int64(0)
+                for i in range(level + 1):
+                    for j in range(i, level + 1):
+                        both = np.uint64(0)
+                        for w in range(width):
+                            both += ones_of(now[i, w] & now[j, w])
+                        total += np.int64(both) << (i + j + (1 if j > i else 0))
+                squares[level] += total
+            for digit in range(level + 1):
+                for w in range(width):
+                    held[level, digit, w] = now[digit, w]
+        for w in range(width):
+            place = 64 * (first + w)
+            for bit in range(64):
+                count = np.int32(0)
+                for digit in range(levels + 1):
+                    count += np.int32((now[digit, w] >> np.uint64(bit)) & np.uint64(1)) << np.int32(digit)
+                counts[place + bit] = count
+
+
+@jit
+def add_window(counts, number, held, squares, totals):
+    """One more window of the shortest kind, for all pixels: it is added as in a binary counter.
+
+    counts: (pixels,); number: of the window, from 0; held: (levels, pixels) int64, first halves of longer windows;
+    squares: (levels,) int64, sums over pixels of the squared counts at each length, added to; totals: (pixels,) int64,
+    added to.
+    """
+    levels, pixels = held.shape
+    done = 1  # so many lengths end with this window
+    while done < levels and (number >> (done - 1)) & 1:
+        done += 1
+    for p in range(pixels):
+        count = np.int64(counts[p])
+        totals[p] += count
+        squares[0] += count * count
+        for level in range(1, done):
+            count += held[level - 1, p]
+            squares[level] += count * count
+        held[done - 1, p] = count
+
+
+def _levels(shortest: int) -> int:
+    """How many doublings there are from one of `shortest` windows to a twentieth of them."""
+    return int(np.log2(max(1.0, shortest / _WINDOWS)) + 1e-9) + 1
+
+
+def _exact_lengths(exposure: float, most: float = np.inf) -> tuple[int, float]:
+    """(lengths, shortest length s) for times: the exposure is 20, 40, 80, ... windows, down to 1 us."""
+    shortest = max(_SHORTEST, exposure / most)
+    levels = _levels(int(exposure / shortest * (1 + 1e-9)))
+    return levels, exposure / (_WINDOWS * 2 ** (levels - 1))
+
+
+def frame_pairs(recording: Recording) -> tuple[np.ndarray, np.ndarray, int]:
+    """For windows of 1, 2, 4, ... frames: (pairs of detections of one pixel in a window, the pixels' detections,
+    frames that are looked at: whole windows of the longest kind).
+    """
+    levels = _levels(recording.n_frames)
+    used = recording.n_frames >> (levels - 1) << (levels - 1)
+    squares = np.zeros(levels, np.int64)
+    if recording.modality == "counts":
+        totals = np.zeros(recording.pixels, np.int64)
+        held = np.zeros((levels, recording.pixels), np.int64)
+        for start, part in recording.chunks():
+            for number, frame in enumerate(part[: max(0, used - start)], start):
+                add_window(np.ascontiguousarray(frame).ravel(), number, held, squares, totals)
+        return (squares - totals.sum()) // 2, totals, used
+    step = min(_GROUP, levels - 1)
+    words = -(-recording.layout.rows * -(-recording.layout.columns // 8) // 8)
+    totals = np.zeros(64 * words, np.int64)  # of the pixels, in the order of their bits
+    held = np.zeros((levels - step, 64 * words), np.int64)
+    counts = np.zeros(64 * words, np.int32)
+    below, above = np.zeros(step + 1, np.int64), np.zeros(levels - step, np.int64)
+    left, number = np.zeros((0, words), np.uint64), 0
+    for start, part in recording.bits():
+        if start >= used:
+            break
+        flat = as_words(part[: used - start])
+        flat = np.concatenate([left, flat]) if len(left) else flat
+        for first in range(0, len(flat) >> step << step, 1 << step):
+            group_squares(flat[first : first + (1 << step)], step, below, counts)
+            add_window(counts, number, held, above, totals)
+            number += 1
+        left = flat[len(flat) >> step << step :].copy()
+    squares[: step + 1] = below
+    squares[step:] = above
+    squares[0] = totals.sum()
+    return (squares - totals.sum()) // 2, totals, used
+
+
+def _summary(
+    scores: list[float],
+    laws: list[Pairs],
+    lengths: np.ndarray,
+    noise: np.ndarray,
+    counts: np.ndarray,
+    of: str,
+) -> Summary:
+    """The scores with their lengths (s). noise: sum of squares that steady rates have; counts: mean in a window."""
+
+    def factor(cell: int, score: float) -> float:
+        if not noise[cell] > 0:
+            return 1.0
+        law = laws[cell]
+        pairs = number_at(score, lambda number, share: pooled_score(number, law, share), float(law.mean))
+        return 1.0 + 2.0 * (pairs - float(law.mean)) / float(noise[cell])
+
+    def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+        found, wanted = factor(cell, measured), factor(cell, expected)
+        change = found - wanted
+        # either detections that come in pairs, or a rate that fluctuates: what takes less of it
+        share = min(abs(change) / 2.0, np.sqrt(abs(change) / max(counts[cell], 1e-12)))
+        text = f"variance {found:.5g} times that of a steady rate, {wanted:.5g} expected"
+        return text, float(np.copysign(share, change))
+
+    return Summary(
+        np.array(scores),
+        "normal",
+        lambda cell: f"counts of {of} in {show(lengths[cell], 's')}",
+        size,
+        axis=lengths,
+        label="window, s",
+        log=True,
+    )
+
+
+class PixelFano(Statistic):
+    """Variance over mean of a pixel's counts in windows of time, all pixels together.
+
+    Windows: times: the exposure over 20, 40, 80, ... down to 1 us; frames: 1, 2, 4, ... up to a twentieth of them.
+    Relative to what steady rates have: 1 for times, 1 - p for frames that hold one bit.
+    Law: normal, as the score of the pairs of detections within a window, given every pixel's number of them; Poisson
+    where there are few pairs.
+    Shows: afterpulsing (more at all lengths), a dead time that differs (less), source noise, flicker, drift and
+    blinking (more with the length).
+    Source: Fano, Phys. Rev. 72 (1947); dead time: Mueller, Nucl. Instr. Meth. 112 (1973).
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording):
+            return None
+        slots = np.inf
+        conditions = recording.conditions
+        if recording.events is not None:
+            levels, shortest = _exact_lengths(conditions.exposure)
+            found, unit = stamps(recording)
+            pairs, detections = event_pairs(found, recording.events.offsets, unit / shortest, levels)
+            boxes = _WINDOWS << np.arange(levels)[::-1]
+            lengths = shortest * 2.0 ** np.arange(levels)
+        else:
+            slots = slots_of_frame(recording)
+            if recording.n_frames < (2 * _WINDOWS if slots == 1 else _WINDOWS):
+                return None
+            pairs, detections, used = frame_pairs(recording)
+            boxes = used >> np.arange(len(pairs))
+            lengths = _frame_length(recording) * 2.0 ** np.arange(len(pairs))
+        share = shares(np.append(pairs, detections), len(pairs))
+        detections, times = np.unique(detections, return_counts=True)
+        total = float((detections * times).sum())
+        scores, laws, noise = [], [], []
+        first = 1 if slots == 1 else 0  # a frame of one bit has no variance of its own
+        for level in range(first, len(pairs)):
+            n, places = int(boxes[level]), slots * 2.0**level
+            offset, few = minority(0.0, detections, n, places)
+            law = pairs_law(few, n, places).pooled(times)
+            scores.append(pooled_score(float(pairs[level] + (offset * times).sum()), law, share[level]))
+            laws.append(law)
+            left = 1.0 - detections / (n * places)
+            noise.append((detections * left * times).sum() * (1.0 - 1.0 / n) * _drawn(n * places))
+        counts = total / (boxes[first:] * recording.pixels)
+        return _summary(scores, laws, lengths[first:], np.array(noise), counts, "a pixel")
+
+
+class ArrayFano(Statistic):
+    """Variance over mean of the counts of the whole array in windows of time, relative to that of steady rates.
+
+    Windows as in `pixel_fano`; in a long exposure of times the shortest are a four millionth of it.
+    Law: normal, as the score of the pairs of detections within a window, given the number of them.
+    Shows: what happens to many pixels at once: flicker, source noise, drift (more with the length), crosstalk and
+    bursts (more at all lengths), a readout that loses events when there are many (less).
+    Source: Fano, Phys. Rev. 72 (1947).
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.pixels == 1:  # of one pixel it says nothing else
+            return None
+        conditions = recording.conditions
+        if recording.events is not None:
+            levels, shortest = _exact_lengths(conditions.exposure, _MOST)
+            found, unit = stamps(recording)
+            sums = event_sums(found, unit / shortest, _WINDOWS << (levels - 1)).astype(np.int64)
+            slots, half = np.inf, 0.0
+            lengths = shortest * 2.0 ** np.arange(levels)
+            scatter = 0.0
+        else:
+            if recording.n_frames < _WINDOWS:
+                return None
+            levels = _levels(recording.n_frames)
+            sums = frame_sums(recording)[: recording.n_frames >> (levels - 1) << (levels - 1)].copy()
+            slots = slots_of_frame(recording)
+            lengths = _frame_length(recording) * 2.0 ** np.arange(levels)
+            # of a frame's detections, which are binomial for a pixel, and for the array the sum of different ones
+            share = recording.totals / (recording.n_frames * slots)
+            scatter = float((share * (1.0 - share)).sum()) * slots * _drawn(recording.n_frames * slots)
+            half = slots * recording.pixels / 2.0
+        total = int(sums.sum())
+        if total > half * len(sums) > 0:  # free slots scatter like those that are taken
+            sums = int(slots) * recording.pixels - sums
+        detections = float(sums.sum())
+        share = shares(np.append(sums[:1000], total), levels)
+        scores, laws, noises = [], [], []
+        for level in range(levels):
+            n = len(sums)
+            number = float((sums * (sums - 1)).sum() // 2)
+            if np.isfinite(slots):
+                one = scatter * 2.0**level
+                noise = n * one * (1.0 - 1.0 / n)
+                variance = (n - 1) * one**2 / 2.0 * max(0.0, 1.0 - 1.0 / max(1.0, detections))
+                mean = (noise + detections**2 / n - detections) / 2.0
+                clumps = max(1.0 - 4.0 / n + 2.0 * one, 1e-3)
+                law = Pairs(*(np.asarray(part) for part in (max(mean, 0.0), variance, variance * clumps)))
+            else:
+                law = pairs_law(np.asarray(detections), n)
+                noise = detections * (1.0 - 1.0 / n)
+            scores.append(_array_score(number, detections, n, law, share[level]))
+            laws.append(law)
+            noises.append(noise)
+            sums = sums.reshape(-1, 2).sum(axis=1) if level + 1 < levels else sums
+        boxes = len(sums) << np.arange(levels)[::-1]
+        return _summary(scores, laws, lengths, np.array(noises), total / boxes, "the array")
+
+
+def _drawn(places: float) -> float:
+    """Of a finite number of slots, the detections that are known in all leave a little less of them free to vary."""
+    return places / (places - 1.0) if 1.0 < places < np.inf else 1.0
+
+
+def _array_score(number: float, detections: float, boxes: int, law: Pairs, share: float) -> float:
+    """By the exact law where there are few detections in few windows, otherwise as a pooled number of pairs."""
+    if detections <= 128 and boxes <= 4 * _WINDOWS:
+        arrays = (np.array([number]), np.array([detections]))
+        return float(pair_scores(*arrays, boxes, np.inf, np.array([share]))[0][0])
+    return pooled_score(number, law, share)
+
+
+def _frame_length(recording: Recording) -> float:
+    """s from one frame of the readout to the next."""
+    conditions = recording.conditions
+    return conditions.frame_period * conditions.frames / max(1, recording.n_frames)

@@ -1,0 +1,81 @@
+"""First arrivals in frames."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..kernels import jit
+from . import Recording, Statistic, Summary
+from ._counting import of_detections, span
+
+_BINS = 40
+_FINE = 8  # parts of the first of them, about what is carried over from the frame before
+_AFTER = ("after an empty frame", "after a frame with an early detection", "after a frame with a late one")
+_LATE = 0.9  # of a frame
+
+
+class FirstArrivals(Statistic):
+    """When in a frame its first detection comes, for frames after an empty one, after an early detection, a late one.
+
+    In 40 cells to a frame, the first of them in eight parts; late: in the last tenth of the frame before. Pooled over
+    the pixels. Counts of rare events: Poisson. Their sum says how many frames have a detection, their shape, which is
+    that of an exponential cut off by the end of the frame, the rate: the two agree where a frame is as long as it
+    should be. Here show pixels that are live for a part of the frame only (nothing at its end or its beginning), what
+    a frame leaves to the next (a dead time: too few at once after a late detection; afterpulses: too many), and a
+    light that changes within a frame.
+    """
+
+    modalities = ("str",)
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts by the time in the frame, for the three kinds of frames one after the other."""
+        tick = recording.tick or 1.0
+        edges = _edges(recording.none)
+        counts = np.zeros((len(_AFTER), edges.size - 1), np.int64)
+        before = np.zeros(0, np.int8)
+        bin_of = np.repeat(np.arange(edges.size - 1), np.diff(edges)) if recording.none <= 1 << 22 else np.zeros(0, int)
+        late = round(_LATE * recording.none)
+        for _, part in recording.chunks():
+            flat = np.ascontiguousarray(part.reshape(len(part), -1))
+            if not before.size:
+                before = np.full(flat.shape[1], -1, np.int8)
+            _arrivals(flat, recording.none, late, edges, bin_of, before, counts)
+        cells = edges.size - 1
+        seconds = edges * tick
+
+        def where(cell: int) -> str:
+            kind, k = divmod(cell, cells)
+            return f"{span(seconds[k], seconds[k + 1])} after the start of the frame, {_AFTER[kind]}"
+
+        size = of_detections(float(recording.totals.sum()))
+        axis = np.tile((seconds[1:] + seconds[:-1]) / 2, len(_AFTER))
+        return Summary(counts.ravel().astype(np.float64), "poisson", where, size, axis=axis, label="time in frame (s)")
+
+
+def _edges(none: int) -> np.ndarray:
+    """(cells + 1,) ticks."""
+    coarse = np.rint(np.linspace(0, none, _BINS + 1))
+    fine = np.rint(np.linspace(0, coarse[1], _FINE + 1))
+    return np.unique(np.concatenate([fine, coarse])).astype(np.int64)
+
+
+@jit
+def _arrivals(frames, none, late, edges, bin_of, before, counts):
+    """Add to `counts` (kinds, cells) the first stamps (frames, pixels); before: kind of each pixel's last frame, or -1.
+
+    bin_of: (none,) cell of each tick, or empty where there are too many of them.
+    """
+    for f in range(frames.shape[0]):
+        for p in range(frames.shape[1]):
+            stamp = np.int64(frames[f, p])
+            kind = before[p]
+            if stamp >= none:
+                before[p] = 0
+                continue
+            before[p] = 2 if stamp >= late else 1
+            if kind >= 0:
+                k = bin_of[stamp] if bin_of.size else np.searchsorted(edges, stamp, side="right") - 1
+                counts[kind, k] += 1

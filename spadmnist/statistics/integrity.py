@@ -1,0 +1,332 @@
+"""Whether the data are whole: frames that repeat, blank frames, stamps that cannot be, silence, full counters."""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the types from the calls; the docstrings give them.
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..kernels import jit
+from ..units import show
+from . import Recording, Statistic, Summary
+from ._frames import frame_sums
+from ._series import has_data, slots_of_frame, stamps
+
+_SURE_CHANCE = 1e-9  # a repeated frame for which all chances of a capture together are less is no chance
+_RARE_CHANCE = 1e-3  # one whose own chance is less is rare
+_PLAIN = 30.0  # detections per pixel from which a pixel that has none is dead
+
+
+@jit
+def same_as_before(frames, before, first):
+    """(frames,) bool: is a frame, or the part of it that was read, the same as the one before?
+
+    frames: (frames, n) of any type; before: (n,) the frame before the first of them; first: there is none.
+    """
+    count, n = frames.shape
+    out = np.zeros(count, np.bool_)
+    for f in range(count):
+        if f == 0 and first:
+            continue
+        same = True
+        for i in range(n):
+            if frames[f, i] != (frames[f - 1, i] if f else before[i]):
+                same = False
+                break
+        out[f] = same
+    return out
+
+
+@jit
+def chance_of_bits(frame, likely, log_best, loss, least):
+    """Logarithm of the chance of one frame of bits, or anything below `least`.
+
+    frame, likely: (bytes,) uint8, the frame and the most likely one; log_best: the logarithm of that one's chance;
+    loss: (8 bytes,) what each bit takes from it that is not as in the likely frame.
+    """
+    chance = log_best
+    for i in range(frame.size):
+        different = frame[i] ^ likely[i]
+        if different:
+            for bit in range(8):
+                if (different >> (7 - bit)) & 1:
+                    chance -= loss[8 * i + bit]
+            if chance < least:
+                break
+    return chance
+
+
+@jit
+def faults(stamps, offsets, end):
+    """(stamps that are smaller than the one before in the same row, equal to it, and those not below `end`)."""
+    smaller = 0
+    equal = 0
+    late = 0
+    for row in range(offsets.size - 1):
+        for i in range(offsets[row], offsets[row + 1]):
+            if not stamps[i] < end:
+                late += 1
+            if i > offsets[row]:
+                smaller += stamps[i] < stamps[i - 1]
+                equal += stamps[i] == stamps[i - 1]
+    return smaller, equal, late
+
+
+@jit
+def longest_gap(stamps, end, bins):
+    """(longest gap between neighbouring stamps of the whole array, the ends of the exposure taken as stamps; number of
+    stamps before `end`; whether a longer one may be hidden within one of the bins).
+
+    Two stamps in the same bin are less than a bin apart, so only the gaps between bins need to be looked at.
+    """
+    low = np.full(bins, np.inf)
+    high = np.full(bins, -1.0)
+    factor = bins / end
+    count = 0
+    for i in range(stamps.size):
+        t = np.float64(stamps[i])
+        if t < end:
+            count += 1
+            b = min(np.int64(t * factor), bins - 1)
+            low[b] = min(low[b], t)
+            high[b] = max(high[b], t)
+    longest = 0.0
+    last = 0.0
+    for b in range(bins):
+        if high[b] >= 0.0:
+            longest = max(longest, low[b] - last)
+            last = high[b]
+    longest = max(longest, end - last)
+    return longest, count, longest < end / bins
+
+
+class RepeatedFrames(Statistic):
+    """Frames that are the same as the one before, where chance cannot make them so.
+
+    A repetition counts where its chance, by the pixels' own shares of detections, is below 1e-9 over the capture;
+    with few pixels, or hardly a detection, frames repeat by themselves (see `rare_frames`). STR: stamp by stamp.
+    Law: exact. There are none.
+    Shows: frames that were read out or stored twice.
+    """
+
+    modalities = ("str", "qis", "counts")
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.n_frames < 2:
+            return None
+        frames = recording.n_frames
+        number = (_chances_of_repeats(recording) < np.log(_SURE_CHANCE / frames)).sum()
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            text = f"{measured:g} frames are the same as the one before, {expected:.3g} expected"
+            return text, float((measured - expected) / frames)
+
+        return Summary(np.array([float(number)]), "exact", lambda cell: "successive frames", size)
+
+
+def _chances_of_repeats(recording: Recording) -> np.ndarray:
+    """Logarithm of the chance of each frame that is the same as the one before, by the pixels' own detections."""
+    chance_of = _chance_of_counts(recording) if recording.modality == "counts" else _chance_of_frame(recording)
+    found: list[float] = []
+    before: np.ndarray | None = None
+    for _, part in recording.chunks():
+        flat = np.ascontiguousarray(part).reshape(len(part), -1)
+        same = same_as_before(flat, flat[0] if before is None else before, before is None)
+        found += [chance_of(part[f]) for f in np.flatnonzero(same)]
+        before = flat[-1].copy()
+    return np.array(found)
+
+
+def _chance_of_frame(recording: Recording) -> Callable[[np.ndarray], float]:
+    """Of a frame of bits or of stamps."""
+    frames, columns = recording.n_frames, recording.layout.columns
+    # of a share a little off 0 and 1, since it is measured
+    share = ((recording.totals + 0.5) / (frames + 1.0)).reshape(recording.layout.shape)
+    likely = np.packbits(share > 0.5, axis=1)
+    missing = 8 * likely.shape[1] - columns
+    loss = np.pad(np.abs(np.log(share / (1.0 - share))), ((0, 0), (0, missing))).ravel()
+    best = float(np.log(np.maximum(share, 1.0 - share)).sum())
+    least = float(np.log(_SURE_CHANCE / frames))
+
+    def of_bits(frame: np.ndarray) -> float:
+        return float(chance_of_bits(np.ascontiguousarray(frame).ravel(), likely.ravel(), best, loss, least))
+
+    if recording.modality == "qis":
+        return of_bits
+    # a stamp is the same by chance in about one of so many cases
+    same_stamp = float(np.log(max(1.0, -np.log(1.0 - share.max())) / recording.none))
+
+    def of_stamps(frame: np.ndarray) -> float:
+        bits = frame < recording.none
+        return of_bits(np.packbits(bits, axis=1)) + same_stamp * int(bits.sum())
+
+    return of_stamps
+
+
+def _chance_of_counts(recording: Recording) -> Callable[[np.ndarray], float]:
+    """Of a frame of counts: binomial, or Poisson up to where counters are full."""
+    from scipy import special
+
+    frames, slots = recording.n_frames, slots_of_frame(recording)
+    mean = (recording.totals + 0.5) / (frames + 1.0)
+    full = recording.conditions.largest_count
+
+    def of_counts(frame: np.ndarray) -> float:
+        k = frame.ravel().astype(np.float64)
+        if not np.isfinite(slots):
+            return float(np.where(k >= full, 0.0, special.xlogy(k, mean) - mean - special.gammaln(k + 1.0)).sum())
+        p = np.minimum(mean / slots, 1.0 - 0.5 / (frames * slots))
+        ways = -np.log(slots + 1.0) - special.betaln(slots - k + 1.0, k + 1.0)
+        return float((ways + special.xlogy(k, p) + special.xlog1py(slots - k, -p)).sum())
+
+    return of_counts
+
+
+class RareFrames(Statistic):
+    """Frames without any detection, with every pixel full, or the same as the one before against odds of 1000.
+
+    Pixels that are dead, or always on, are left out of the first two; for the odds see `repeated_frames`.
+    Law: Poisson where they are rare; where they are not, they scatter less.
+    Shows: frames that were lost, overwritten or stored twice, a light source that stops.
+    """
+
+    modalities = ("str", "qis", "counts")
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording):
+            return None
+        frames, totals = recording.n_frames, recording.totals
+        most = 1 if recording.modality != "counts" else recording.conditions.largest_count
+        room = frames * most
+        dead = (totals == 0) & (totals.mean() >= _PLAIN)
+        stuck = (totals == room) & (room - totals.mean() >= _PLAIN)
+        sums = frame_sums(recording)
+        empty = (sums == most * int(stuck.sum())).sum()
+        full = (sums == most * int((~dead).sum())).sum()
+        repeated = (_chances_of_repeats(recording) < np.log(_RARE_CHANCE)).sum()
+        names = ("without a detection", "with every pixel full", "the same as the one before")
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            text = f"{measured:g} of {frames} frames, {expected:.4g} expected"
+            return text, float((measured - expected) / frames)
+
+        values = np.array([empty, full, repeated], np.float64)
+        return Summary(values, "poisson", lambda cell: f"frames {names[cell]}", size)
+
+
+class Disorder(Statistic):
+    """Time stamps that are smaller than the one before in the same pixel.
+
+    Law: exact. There are none.
+    Shows: stamps that were mixed up, a coarse counter that ran over.
+    """
+
+    modalities = ("tr",)
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.events is None:
+            return None
+        smaller = faults(stamps(recording)[0], recording.events.offsets, np.inf)[0]
+        events = max(1, len(recording.events))
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            text = f"{measured:g} stamps go back in time, {expected:.3g} expected"
+            return text, float((measured - expected) / events)
+
+        return Summary(np.array([float(smaller)]), "exact", lambda cell: "successive stamps of a pixel", size)
+
+
+class EqualStamps(Statistic):
+    """Time stamps that the pixel already has, and stamps from the end of the exposure on.
+
+    Law: Poisson, rare things. With a dead time longer than a tick there are no equal stamps at all.
+    Shows: events that were stored twice, a dead time or an exposure that is not what it should be.
+    """
+
+    modalities = ("tr",)
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.events is None:
+            return None
+        found, unit = stamps(recording)
+        _, equal, late = faults(found, recording.events.offsets, recording.conditions.exposure / unit)
+        events = max(1, len(recording.events))
+        names = ("equal stamps of a pixel", "stamps behind the end of the exposure")
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            return f"{measured:g} events, {expected:.4g} expected", float((measured - expected) / events)
+
+        return Summary(np.array([equal, late], np.float64), "poisson", lambda cell: names[cell], size)
+
+
+class Gaps(Statistic):
+    """The longest time in which the whole array is silent.
+
+    Law: normal, as the score of the longest of n + 1 spacings of n events that fall anywhere: it is shorter than x
+    with probability exp(-(n + 1) (1 - x)^n), x as a share of the exposure.
+    Shows: readout that stops or loses a stretch of data, light that goes out, bunched light.
+    Source: longest spacing (Darling, Ann. Math. Stat. 24, 1953).
+    """
+
+    modalities = ("tr",)
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.events is None:
+            return None
+        from scipy import special
+
+        found, unit = stamps(recording)
+        exposure = recording.conditions.exposure
+        end = exposure / unit
+        gap, events, hidden = longest_gap(found, end, max(1, len(found) // 8))
+        if hidden:  # as good as never: the longest gap is shorter than eight mean ones
+            gap = float(np.diff(np.sort(found[found < end].astype(np.float64)), prepend=0.0, append=end).max())
+        log_expected = np.log(events + 1.0) + events * np.log1p(-min(gap / end, 1.0 - 1e-15))
+        expected_longer = np.exp(min(log_expected, 700.0))
+        if expected_longer > 0.7:
+            score = special.ndtri_exp(-expected_longer)
+        else:
+            longer = np.log(-np.expm1(-expected_longer)) if log_expected > -700 else log_expected
+            score = -special.ndtri_exp(longer)
+
+        def length(value: float) -> float:
+            """The gap (s) that has a score."""
+            log_of = np.log(np.maximum(-special.log_ndtr(value), 1e-300))
+            return float(-np.expm1((log_of - np.log(events + 1.0)) / max(1, events)) * exposure)
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            was, wanted = length(measured), length(expected)
+            return f"{show(was, 's')}, {show(wanted, 's')} expected", (was - wanted) / exposure
+
+        return Summary(np.array([float(score)]), "normal", lambda cell: "longest silence of the array", size)
+
+
+class FullCounters(Statistic):
+    """Counts that stand at the largest number that the readout has.
+
+    Law: Poisson where they are rare; where they are not, they scatter less.
+    Shows: counters that are full, or have fewer bits than they should.
+    """
+
+    modalities = ("counts",)
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording):
+            return None
+        largest = recording.conditions.largest_count
+        full = sum(int((part >= largest).sum()) for _, part in recording.chunks())
+        number = recording.n_frames * recording.pixels
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            return f"{measured:g} of {number} counts, {expected:.5g} expected", float((measured - expected) / number)
+
+        return Summary(np.array([float(full)]), "poisson", lambda cell: f"counts of {largest}", size)

@@ -1,0 +1,249 @@
+"""Intervals between successive detections of a pixel."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .. import units
+from ..kernels import jit
+from . import Recording, Statistic, Summary
+from ._counting import (
+    exposure_in,
+    guide,
+    logarithmic,
+    of_detections,
+    place,
+    span,
+    tick_of,
+    whole_ticks,
+)
+
+_BEFORE, _BEHIND = 10e-9, 20e-9  # s: what belongs to the edge, before and behind the dead time
+_FINEST = 0.5e-9  # s
+_LONGEST = 100e-3  # s
+_PER_DECADE = 10
+_KNOWN = 16  # intervals from which on a pixel's own rate is known well enough
+_LEVELS = 20
+_LAGS = (1, 2, 3, 5, 10, 20)
+_FEWEST = 300  # products from which on a correlation is a normal variable
+
+
+def _edge(recording: Recording) -> np.ndarray:
+    """(bins + 1,) ticks, evenly from 10 ns before the dead time to 20 ns behind it."""
+    tick = tick_of(recording)
+    step = max(1, math.floor(_FINEST / tick * (1 + 1e-9)))
+    first = max(0, round((recording.dead_time - _BEFORE) / tick))
+    bins = max(1, round((round((recording.dead_time + _BEHIND) / tick) - first) / step))
+    return first + step * np.arange(bins + 1)
+
+
+class EdgeIntervals(Statistic):
+    """Intervals between successive detections of a pixel about the dead time, in steps of 0.5 ns (or of a tick).
+
+    From 10 ns before the dead time to 20 ns behind it, and one cell for all that is shorter; pooled over the pixels.
+    Counts of rare events, each in one cell: Poisson. Here show another dead time, one that differs from pixel to
+    pixel or is extended by hidden arrivals, a slow recovery (too few at first), detections at the very end of the dead
+    time, short-lived traps, and the jitter that blurs the edge.
+    """
+
+    modalities = ("tr",)
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts, the first cell being shorter intervals where there can be any."""
+        edges = _edge(recording)
+        counts = np.zeros(edges.size, np.int64)
+        assert recording.events is not None
+        stamps, _ = whole_ticks(recording)
+        _about_edge(stamps, recording.events.offsets, edges[0], edges[1] - edges[0], counts)
+        skipped = 0 if edges[0] > 0 else 1
+        seconds = edges * tick_of(recording)
+
+        def where(cell: int) -> str:
+            k = cell + skipped
+            return f"intervals below {units.show(seconds[0], 's')}" if k == 0 else f"intervals of {_within(seconds, k)}"
+
+        middles = np.concatenate([[seconds[0]], (seconds[1:] + seconds[:-1]) / 2])
+        size = of_detections(float(recording.totals.sum()))
+        return Summary(
+            counts[skipped:].astype(np.float64),
+            "poisson",
+            where,
+            size,
+            axis=middles[skipped:],
+            label="interval (s)",
+        )
+
+
+class Intervals(Statistic):
+    """Intervals between successive detections of a pixel, in logarithmic bins behind the edge of the dead time.
+
+    From 20 ns behind the dead time to 100 ms, ten bins to a decade, and one for all that is longer; pooled over the
+    pixels. Counts, each interval in one cell: Poisson (the few cells that hold many of all intervals scatter less).
+    Here show afterpulsing with its lifetimes (an excess that does not depend on the light), slow traps, echoes,
+    source noise, and detections that are lost.
+    """
+
+    modalities = ("tr",)
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts; the last cell is all that is longer."""
+        tick = tick_of(recording)
+        first = int(_edge(recording)[-1])
+        edges = logarithmic(first, min(exposure_in(recording, tick), round(_LONGEST / tick)), _PER_DECADE)
+        counts = np.zeros(edges.size, np.int64)
+        assert recording.events is not None
+        stamps, _ = whole_ticks(recording)
+        _lengths(stamps, recording.events.offsets, *guide(edges), counts)
+        seconds = edges * tick
+
+        def where(cell: int) -> str:
+            if cell == edges.size - 1:
+                return f"intervals beyond {units.show(seconds[-1], 's')}"
+            return f"intervals of {_within(seconds, cell + 1)}"
+
+        axis = np.concatenate([np.sqrt(seconds[1:] * seconds[:-1]), seconds[-1:]])
+        size = of_detections(float(recording.totals.sum()))
+        return Summary(counts.astype(np.float64), "poisson", where, size, axis=axis, label="interval (s)", log=True)
+
+
+class Rescaled(Statistic):
+    """Intervals measured by the pixel's own rate: u = 1 - exp(-rate (interval - dead time)), which should be even.
+
+    In 20 cells from 0 to 1, pooled over the pixels; intervals that are shorter than the dead time count as 0. The
+    rate is the pixel's own, from its intervals. Pixels with fewer than 16 intervals tell too little of it and are left
+    out; the model's recordings leave them out by the same rule, so nothing is biased by it. Counts: Poisson (a little
+    less, for the rate is fitted to them). Whatever makes a pixel's detections come otherwise than by chance shows
+    here, known or not, while maps, levels and gradients do not.
+    Source: time rescaling, Brown et al., Neural Computation 14 (2002) 325.
+    """
+
+    modalities = ("tr",)
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts of u."""
+        counts, _, _ = _rescale(recording)
+        size = of_detections(float(recording.totals.sum()))
+
+        def where(cell: int) -> str:
+            low, high = (-math.log1p(-min(k / _LEVELS, 1 - 1e-12)) for k in (cell, cell + 1))
+            bound = f"{low:.3g} to {high:.3g}" if cell < _LEVELS - 1 else f"more than {low:.3g}"
+            return f"intervals of {bound} times the pixel's mean, beyond the dead time"
+
+        axis = (np.arange(_LEVELS) + 0.5) / _LEVELS
+        return Summary(counts.astype(np.float64), "poisson", where, size, axis=axis, label="rescaled interval")
+
+
+class RescaledLag(Statistic):
+    """Correlation of a pixel's rescaled intervals (see `rescaled`) 1, 2, 3, 5, 10 and 20 apart.
+
+    Intervals of a Poisson process with a dead time are independent. The mean product of many independent bounded
+    numbers is normal, its spread 1/sqrt(products); nothing is said below 300 products. A rate that changes slowly
+    (blinking, drift, source noise) makes neighbours alike; so do afterpulses, which come in pairs.
+    """
+
+    modalities = ("tr",)
+    unit = "standard errors"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Correlations in units of their spread."""
+        _, sums, products = _rescale(recording)
+        if products[0] < _FEWEST:
+            return None
+        spread = 1 / np.sqrt(np.maximum(products, 1))
+        values = 12 * sums * spread
+
+        def where(cell: int) -> str:
+            return "an interval and the next" if cell == 0 else f"intervals {_LAGS[cell]} apart"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, usual = measured * spread[cell], expected * spread[cell]
+            return f"correlation {found:+.3g}, {usual:+.3g} expected", found - usual
+
+        lags = np.array(_LAGS, np.float64)
+        return Summary(values, "normal", where, size, np.ones(len(_LAGS)), lags, "intervals apart")
+
+
+def _within(seconds: np.ndarray, k: int) -> str:
+    return span(float(seconds[k - 1]), float(seconds[k]))
+
+
+@jit
+def _about_edge(stamps, offsets, first, step, out):
+    """Add to `out` (bins + 1,) the intervals below `first`, and in bins of `step` from there on; what is longer not."""
+    bins = out.size - 1
+    per_step = 1.0 / step
+    for row in range(offsets.size - 1):
+        if offsets[row] == offsets[row + 1]:
+            continue
+        before = np.int64(stamps[offsets[row]])
+        for i in range(offsets[row] + 1, offsets[row + 1]):
+            now = np.int64(stamps[i])
+            # half a tick off the edges, so that rounding is of no matter
+            x = (now - before - first + 0.5) * per_step
+            before = now
+            if x < bins:
+                out[np.int64(x) + 1 if x > 0.0 else 0] += 1
+
+
+@jit
+def _lengths(stamps, offsets, edges, start, out):
+    """Add to `out` the intervals between `edges`; see `guide`."""
+    for row in range(offsets.size - 1):
+        if offsets[row] == offsets[row + 1]:
+            continue
+        before = np.int64(stamps[offsets[row]])
+        for i in range(offsets[row] + 1, offsets[row + 1]):
+            now = np.int64(stamps[i])
+            k = place(now - before, edges, start)
+            before = now
+            if k >= 0:
+                out[k] += 1
+
+
+def _rescale(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((levels,) counts of u, (lags,) sums of products of u - 1/2, (lags,) their number)."""
+    known = recording._kept.get("rescaled")
+    if known is None:
+        assert recording.events is not None
+        stamps, tick = whole_ticks(recording)
+        counts = np.zeros(_LEVELS, np.int64)
+        lags = np.array(_LAGS)
+        sums, products = np.zeros(len(lags)), np.zeros(len(lags), np.int64)
+        dead = recording.dead_time / tick
+        _rescaled(stamps, recording.events.offsets, dead, _KNOWN, lags, counts, sums, products)
+        known = recording._kept["rescaled"] = counts, sums, products
+    return known  # type: ignore[return-value]
+
+
+@jit
+def _rescaled(stamps, offsets, dead, least, lags, counts, sums, products):
+    levels = counts.size
+    longest = lags[lags.size - 1]
+    recent = np.empty(longest)
+    for row in range(offsets.size - 1):
+        start, stop = offsets[row], offsets[row + 1]
+        n = stop - start - 1
+        if n < least:
+            continue
+        live = np.float64(np.int64(stamps[stop - 1]) - np.int64(stamps[start])) - n * dead
+        if live <= 0:
+            continue
+        rate = n / live
+        for k in range(n):
+            gap = np.float64(np.int64(stamps[start + k + 1]) - np.int64(stamps[start + k])) - dead
+            u = 1.0 - math.exp(-rate * gap) if gap > 0 else 0.0
+            counts[min(np.int64(u * levels), levels - 1)] += 1
+            u -= 0.5
+            for m in range(lags.size):
+                if k >= lags[m]:
+                    sums[m] += u * recent[(k - lags[m]) % longest]
+            recent[k % longest] = u
+        for m in range(lags.size):
+            products[m] += max(n - lags[m], 0)

@@ -1,0 +1,349 @@
+"""Maps: how many detections each pixel, row and column has, and how the pixels differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..events import Layout
+from . import Recording, Statistic, Summary
+from ._counting import per_cent
+from ._scores import Pairs, number_at, pooled_score, shares
+from ._series import has_data, slots_of_frame
+
+_ALL = ("tr", "str", "qis", "counts")
+_BELOW, _ABOVE = (0.25, 0.5, 0.75), (1.33, 2.0, 4.0, 10.0)
+_BLIND = 0.9  # share of blind time up to which a dead time's law is followed
+_TAIL = 16  # pixels in a tail, at least
+
+
+class _Counting:
+    """The law of a pixel's number of detections in a capture, as far as the conditions fix it.
+
+    slots: that a pixel can fill at most (binomial); blind: share of the exposure that one detection takes from it.
+    """
+
+    def __init__(self, recording: Recording):
+        conditions = recording.conditions
+        self.slots = recording.n_frames * slots_of_frame(recording) if recording.events is None else np.inf
+        live = conditions.exposure if recording.events is not None else recording.n_frames * conditions.frame_time
+        self.blind = 0.0 if np.isfinite(self.slots) else recording.dead_time / live
+
+    def as_poisson(self, counts: np.ndarray) -> np.ndarray:
+        """Numbers that scatter like Poisson counts of their size; a few detections stay as they are.
+
+        Twice the root of it has the spread 1: that of a binomial number is an arcsine (Anscombe, Biometrika 35, 1948),
+        that of one with a dead time, variance n (1 - n blind)^2 (Mueller, NIM 112, 1973), an inverse hyperbolic
+        tangent. Three slots more than there are: the few that are left free in saturation are no normal variable, and
+        so they weigh less.
+        """
+        if np.isfinite(self.slots):
+            return np.asarray((self.slots + 3.0) * np.arcsin(np.sqrt(counts / (self.slots + 3.0))) ** 2)
+        if self.blind <= 0:
+            return np.asarray(counts, np.float64)
+        root = np.sqrt(counts * self.blind)
+        edge = np.sqrt(_BLIND)
+        beyond = np.maximum(root - edge, 0.0) / (1.0 - _BLIND)
+        return np.asarray((np.arctanh(np.minimum(root, edge)) + beyond) ** 2 / self.blind)
+
+    def detections(self, value: float) -> float:
+        """The inverse of `as_poisson`."""
+        value = max(0.0, value)
+        if np.isfinite(self.slots):
+            return float((self.slots + 3.0) * np.sin(min(np.sqrt(value / (self.slots + 3.0)), np.pi / 2)) ** 2)
+        if self.blind <= 0:
+            return value
+        root, edge = np.sqrt(value * self.blind), np.arctanh(np.sqrt(_BLIND))
+        return float((np.tanh(min(root, edge)) + max(root - edge, 0.0) * (1.0 - _BLIND)) ** 2 / self.blind)
+
+    def variance(self, counts: np.ndarray) -> np.ndarray:
+        """What counting alone scatters."""
+        if np.isfinite(self.slots):
+            return np.asarray(counts * (1.0 - counts / self.slots))
+        return np.asarray(counts * (1.0 - np.minimum(counts * self.blind, _BLIND)) ** 2)
+
+    def rates(self, counts: np.ndarray) -> np.ndarray:
+        """What would have been detected without saturation and dead time, per pixel over the capture.
+
+        With a slot and a half more than there are, so that a full pixel has a rate, too.
+        """
+        if np.isfinite(self.slots):
+            return -self.slots * np.log((self.slots - counts + 1.5) / (self.slots + 1.5))
+        return np.asarray(counts / (1.0 - np.minimum(counts * self.blind, 0.95)))
+
+
+def place_of(layout: Layout, pixel: int) -> str:
+    """Where a pixel lies, for people; rows and columns count from 0."""
+    if layout.positions is None:
+        return f"row {pixel // layout.columns}, column {pixel % layout.columns}"
+    x, y = layout.positions[pixel] * 1e6
+    return f"pixel {pixel} at x = {x:.4g} um, y = {y:.4g} um"
+
+
+class PixelMap(Statistic):
+    """Detections of each pixel.
+
+    Law: Poisson. Frames fill slots (binomial) and a dead time takes part of the exposure, so the counts are first
+    brought to numbers with the scatter of Poisson counts; small counts stay what they are.
+    Shows: pixels with another PDP, hot and dead pixels, gradients and patterns, crosstalk around hot pixels.
+    Source: photon response and dark signal non-uniformity, EMVA standard 1288.
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording):
+            return None
+        law, layout = _Counting(recording), recording.layout
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, wanted = law.detections(measured), law.detections(expected)
+            return f"{found:.6g} detections, {wanted:.6g} expected", float((found - wanted) / max(wanted, 1.0))
+
+        return Summary(
+            np.rint(law.as_poisson(recording.totals)),
+            "poisson",
+            lambda cell: place_of(layout, cell),
+            size,
+            axis=np.arange(layout.pixels, dtype=np.float64),
+            label="pixel",
+            shape=layout.shape if layout.positions is None else None,
+        )
+
+
+def _lines(recording: Recording, axis: int) -> Summary | None:
+    """Sums over the rows (axis 0 of the result) or the columns (axis 1) of a grid."""
+    layout = recording.layout
+    if not has_data(recording) or layout.positions is not None or min(layout.shape) < 2:
+        return None
+    law = _Counting(recording)
+    per_line = layout.shape[1 - axis]
+    name = ("row", "column")[axis]
+
+    def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+        found, wanted = (per_line * law.detections(value / per_line) for value in (measured, expected))
+        share = float((found - wanted) / max(wanted, 1.0))
+        return f"{found:.7g} detections, {wanted:.7g} expected ({per_cent(share)})", share
+
+    values = law.as_poisson(recording.totals).reshape(layout.shape).sum(axis=1 - axis)
+    cells = np.arange(layout.shape[axis], dtype=np.float64)
+    return Summary(np.rint(values), "poisson", lambda cell: f"{name} {cell}", size, axis=cells, label=name)
+
+
+class Rows(Statistic):
+    """Detections of each row of a grid.
+
+    Law: Poisson, sums of the pixels' numbers (see `pixel_map`).
+    Shows: row patterns, a gradient, a rolling shutter, rows that read out late.
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        return _lines(recording, 0)
+
+
+class Columns(Statistic):
+    """Detections of each column of a grid.
+
+    Law: Poisson, sums of the pixels' numbers (see `pixel_map`).
+    Shows: column patterns, a gradient, columns whose readout differs.
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        return _lines(recording, 1)
+
+
+_TERMS: tuple[tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray]], ...] = (
+    ("gradient from the first to the last column (x)", lambda x, y: x),
+    ("gradient from the first to the last row (y)", lambda x, y: y),
+    ("rise from the middle to the edges along x", lambda x, y: 4.0 * x * x),
+    ("rise from the middle to the corners along the diagonal (xy)", lambda x, y: 4.0 * x * y),
+    ("rise from the middle to the edges along y", lambda x, y: 4.0 * y * y),
+)
+
+
+def _basis(layout: Layout) -> tuple[np.ndarray, list[str]]:
+    """((1 + terms, pixels), names of the terms): 1 and those terms that the places tell apart."""
+    x, y = layout.centred.T
+    terms = np.stack([np.ones(layout.pixels), *(term(x, y) for _, term in _TERMS)])
+    products = terms @ terms.T / layout.pixels
+    taken = [0]
+    for k in range(1, len(terms)):
+        tried = [*taken, k]
+        if np.linalg.eigvalsh(products[np.ix_(tried, tried)])[0] > 1e-6:
+            taken = tried
+    return terms[taken], [_TERMS[k - 1][0] for k in taken[1:]]
+
+
+def _fit(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients of the least squares."""
+    return np.asarray(np.linalg.solve(basis @ basis.T, basis @ values))
+
+
+class Surface(Statistic):
+    """Gradient and curvature of the map: a polynomial in x, y, x2, xy, y2, relative to the mean rate.
+
+    Each coefficient is the relative change over the array: from edge to edge for x and y, from the middle to the edge
+    for the others. Rates are free of saturation and dead time, so that a gradient is as large in every light.
+    Law: normal, sums over the array.
+    Shows: illumination gradients, vignetting, a temperature gradient in the dark. PDP spread does not, or hardly.
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        basis, names = _basis(recording.layout)
+        if not has_data(recording) or not names:
+            return None
+        rates = _Counting(recording).rates(recording.totals.astype(np.float64))
+        mean = rates.mean()
+        fitted = _fit(basis, rates / mean if mean > 0 else np.ones_like(rates))
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            text = f"{per_cent(measured)} of the mean rate, {per_cent(expected)} expected"
+            return text, float(measured - expected)
+
+        return Summary(fitted[1:], "normal", lambda cell: names[cell], size)
+
+
+def _dithered(recording: Recording) -> tuple[np.ndarray, float]:
+    """(sorted rates of the pixels, mean without the lowest and the highest tenth, at least 2).
+
+    Every count is spread over (-1/2, 1/2) about itself: whole numbers would jump over a threshold all at once.
+    """
+    counts = recording.totals
+    share = shares(counts, counts.size)
+    rates = np.sort(_Counting(recording).rates(counts + share - 0.5))
+    tenth = -(-counts.size // 10)
+    return rates, max(2.0, float(rates[tenth : counts.size - tenth].mean()))
+
+
+class Outliers(Statistic):
+    """How many pixels lie far below or above the middle of the array.
+
+    Below 1/4, 1/2 and 3/4 and above 1.33, 2, 4 and 10 times the mean without the lowest and the highest tenth of the
+    pixels (at least two detections); rates free of saturation and dead time.
+    Law: Poisson where it is a matter of counting noise; pixels that always are there, by a map, scatter less.
+    Shows: lazy and dead pixels (below), hot pixels (above), a PDP spread of tens of per cent.
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.pixels < 4:
+            return None
+        rates, middle = _dithered(recording)
+        low = np.searchsorted(rates, np.array(_BELOW) * middle)
+        high = rates.size - np.searchsorted(rates, np.array(_ABOVE) * middle)
+        edges = [f"below {level:g}" for level in _BELOW] + [f"above {level:g}" for level in _ABOVE]
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            return f"{measured:g} pixels, {expected:.4g} expected", float((measured - expected) / rates.size)
+
+        return Summary(
+            np.concatenate([low, high]).astype(np.float64),
+            "poisson",
+            lambda cell: f"pixels {edges[cell]} times the middle of the array",
+            size,
+        )
+
+
+class Tails(Statistic):
+    """The mean rate of the lowest and of the highest pixels, relative to the middle of the array.
+
+    The lowest and highest quarter, twelfth, and so on by threes, of at least 16 pixels each. Middle: the mean
+    without the lowest and the highest tenth (at least two detections). Rates are free of saturation and dead time.
+    Law: normal, means of many pixels; of the highest the logarithm, for they are skewed.
+    Shows: PDP spread (both sides), lazy pixels (low side), dark count rates that spread or hot pixels (high side).
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        pixels = recording.pixels
+        sizes = [many for k in range(12) if (many := pixels // (4 * 3**k)) >= _TAIL]
+        if not has_data(recording) or not sizes:
+            return None
+        rates, middle = _dithered(recording)
+        upto = np.concatenate([[0.0], np.cumsum(rates)])
+        low = [upto[many] / many for many in sizes]
+        high = [(upto[-1] - upto[-1 - many]) / many for many in sizes]
+        values = np.append(np.array(low) / middle, np.log(np.maximum(np.array(high[::-1]) / middle, 1e-3)))
+        names = [f"the lowest {many} of {pixels} pixels" for many in sizes]
+        names += [f"the highest {many} of {pixels} pixels" for many in sizes[::-1]]
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            if cell >= len(sizes):
+                measured, expected = np.exp(measured), np.exp(expected)
+            return f"{measured:.4g} times the middle, {expected:.4g} expected", float(measured - expected)
+
+        return Summary(values, "normal", lambda cell: names[cell], size)
+
+
+class Spread(Statistic):
+    """How much more the pixels differ than counting alone makes them: the variance of the map beyond its noise.
+
+    Once of the map as it is, once behind its surface (see `surface`), so that a gradient shows in the first only.
+    Law: normal, as the score of the variance among those of equal pixels (the index of dispersion of the counts).
+    Shows: PDP spread, hot and lazy pixels, patterns; the first also a gradient.
+    Source: index of dispersion (Fisher, Biometrics 6, 1950).
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        pixels, layout = recording.pixels, recording.layout
+        basis, _ = _basis(layout)
+        free = pixels - np.array([1, len(basis)])
+        if not has_data(recording) or free[1] < 8:
+            return None
+        counting = _Counting(recording)
+        counts = recording.totals.astype(np.float64)
+        mean = float(counts.mean())
+        smooth = _fit(basis, counts - mean) @ basis
+        squares = np.array([((counts - mean) ** 2).sum(), ((counts - mean - smooth) ** 2).sum()])
+        noise = float(counting.variance(counts).mean())
+        # as pairs of detections (or of free slots, where these are fewer) in the same pixel
+        few = min(mean, counting.slots - mean)
+        known = pixels * few * (few - 1.0) / 2.0
+        shape = (1.0 - 2.0 * mean / counting.slots) ** 2 + 2.0 * noise - 4.0 / pixels
+        variance = free * noise**2 / 2.0 * max(0.0, 1.0 - 1.0 / max(1.0, pixels * few))
+        laws = [
+            Pairs(np.maximum(known + f * noise / 2.0, 0.0), v, v * max(shape, 1e-3))
+            for f, v in zip(free, variance, strict=True)
+        ]
+        share = shares(recording.totals, 2)
+        scores = [pooled_score(known + s / 2.0, law, u) for s, law, u in zip(squares, laws, share, strict=True)]
+
+        def relative(cell: int, score: float) -> float:
+            """Relative variance between pixels beyond noise."""
+            law = laws[cell]
+            pairs = number_at(score, lambda number, part: pooled_score(number, law, part), float(law.mean))
+            excess = 2.0 * (pairs - known) / free[cell] - noise
+            return float(excess / mean**2) if mean > 0 else 0.0
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, wanted = relative(cell, measured), relative(cell, expected)
+            text = (
+                f"pixels differ by {per_cent(_root(found))} beyond counting noise, {per_cent(_root(wanted))} expected"
+            )
+            return text, _root(found - wanted)
+
+        names = ("differences between pixels", "differences between pixels, smooth part removed")
+        return Summary(np.array(scores), "normal", lambda cell: names[cell], size)
+
+
+def _root(value: float) -> float:
+    """The square root with the sign of the value."""
+    return float(np.copysign(np.sqrt(abs(value)), value))

@@ -1,0 +1,75 @@
+"""Detections of the whole array in the order of time: intervals between them, and clusters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import Recording, Statistic, Summary
+from ._counting import of_detections, span, tick_of
+from ._walk import SIZES, gaps, spacing_edges, walk
+
+
+class Spacing(Statistic):
+    """Intervals between successive detections of the whole array, whichever pixels they are of.
+
+    In logarithmic bins from one tick on, ten to a decade, and one cell for those with the same stamp. First stamps of
+    frames (STR): within a frame. Counts, each interval in one cell: Poisson (cells that hold many of all intervals
+    scatter less). Too many short ones: light that spreads, or bursts; too few: a readout that needs time between
+    detections, whichever pixels they come from.
+    """
+
+    modalities = ("tr", "str")
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts; the first cell is for intervals of 0."""
+        if recording.pixels < 2:
+            return None
+        edges = spacing_edges(recording)
+        values = walk(recording).spacings
+        seconds = edges * tick_of(recording)
+
+        def where(cell: int) -> str:
+            if cell == 0:
+                return "the whole array, two at the same tick"
+            if cell == edges.size:
+                return f"the whole array, more than {span(0, seconds[-1]).partition(' to ')[2]} apart"
+            return f"the whole array, {span(seconds[cell - 1], seconds[cell])} apart"
+
+        axis = np.concatenate([[seconds[0] / 2], np.sqrt(seconds[1:] * seconds[:-1]), seconds[-1:]])
+        size = of_detections(float(recording.totals.sum()))
+        return Summary(values.astype(np.float64), "poisson", where, size, axis=axis, label="spacing (s)", log=True)
+
+
+class Multiplicity(Statistic):
+    """Clusters of detections anywhere on the array, each within 1 ns, or 10 ns, of the one before: how many, how large?
+
+    Of 2, 3, 4, 5 to 8, 9 to 16 and more detections. First stamps of frames (STR): within a frame. Rare and
+    independent of each other, their numbers are Poisson. Bursts of many pixels at once show here, which in other
+    statistics drown.
+    """
+
+    modalities = ("tr", "str")
+    unit = "clusters"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Numbers of clusters by size, for both gaps."""
+        if recording.pixels < 2:
+            return None
+        values = walk(recording).clusters
+        tick = tick_of(recording)
+        within = [span(0, gap * tick).partition(" to ")[2] for gap in gaps(tick)]
+        rate = of_detections(float(recording.totals.sum()))
+
+        def where(cell: int) -> str:
+            gap, k = divmod(cell, len(SIZES))
+            low, high = SIZES[k]
+            number = str(low) if low == high else f"{low} to {high}" if high else f"{low} or more"
+            return f"clusters of {number} detections of the whole array, each within {within[gap]} of the next"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            number = SIZES[cell % len(SIZES)][0]
+            share = rate(cell, measured * number, expected * number)[1]
+            return f"{measured:.6g} clusters, {expected:.4g} expected", share
+
+        return Summary(values.ravel().astype(np.float64), "poisson", where, size)
