@@ -31,7 +31,7 @@ LAYERS = [
     {"measurement"},
     {"factory", "reference", "template", "twin"},
     {"criticism"},
-    {"plan", "verify", "report", "testing"},
+    {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
     {"exporters"},
     {"cli"},
@@ -105,7 +105,8 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
 @pytest.mark.parametrize(
     ("package", "owners"),
     [
-        ("matplotlib", {"report.py"}),
+        ("matplotlib", {"report.py", "pages.py"}),
+        ("jinja2", {"pages.py"}),
         ("click", {"cli.py"}),
         ("tqdm", {"cli.py"}),
         ("yaml", {"document.py"}),

@@ -1,0 +1,278 @@
+"""Captures in files that other programs read. Each says how it was recorded, so that `import` gives the capture back.
+
+One class writes one kind of file (`Target`), and is found by being defined. The places of pixels that are no grid are
+not written; an import takes them from --positions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import io
+import os
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import numpy as np
+
+from . import __version__, capture_files, disk
+from .errors import SpadError
+from .importers.captures import safe_name
+from .measurement import Measurement
+from .recording import Recording
+
+
+def facts(recording: Recording) -> dict[str, float | int]:
+    """How a capture was recorded, by the names that `importers.FACTS` knows; in SI."""
+    c, lit, layout = recording.conditions, recording.capture.light, recording.layout
+    known: dict[str, float | int | None] = {"rows": layout.rows, "columns": layout.columns, "tick": recording.tick}
+    if recording.modality == "tr":
+        known |= {"exposure": c.exposure}
+    else:
+        known |= {"frame_time": c.frame_time, "frame_period": c.frame_period}
+    if recording.modality == "qis":
+        known |= {"width": layout.columns}
+    if recording.modality == "counts":
+        known |= {"bits": c.bits, "counter": int(c.counting == "counter")}
+    known |= {"wavelength": lit.wavelength, lit.kind_of_level: lit.level}
+    known |= {"relative_uncertainty": lit.relative_uncertainty, "own_uncertainty": lit.own_uncertainty}
+    return {name: value for name, value in known.items() if value is not None}
+
+
+class Target:
+    """Writes one kind of file.
+
+    name: what `--format` calls it; suffix: of its files; modalities: what it can hold; again: what an import of it must
+    be told, since the file does not say it.
+    """
+
+    every: ClassVar[dict[str, type[Target]]] = {}
+    name: ClassVar[str]
+    suffix: ClassVar[str]
+    modalities: ClassVar[tuple[str, ...]] = ("tr", "str", "qis", "counts")
+
+    def __init_subclass__(cls) -> None:
+        Target.every[cls.name] = cls
+
+    @classmethod
+    def put(cls, recording: Recording, file: IO[bytes]) -> None:
+        """Write the capture."""
+        raise NotImplementedError
+
+
+def export(measurement: Measurement, out: Path, format: str, ids: tuple[str, ...] = ()) -> list[Path]:
+    """Write captures (`ids`; all that have data, without them) to a file, or to files in a folder; their paths.
+
+    `out` is a file where it ends as such files do, otherwise a folder. What is there already is not written over.
+    Raises SpadError with a sentence.
+    """
+    target = Target.every[format]
+    chosen = [measurement.capture(id) for id in ids] or [c for c in measurement.captures if c.mean is None]
+    if not chosen:
+        raise SpadError(f"{measurement.source}: of its captures only means are known; there are no data to export")
+    paths = [out]
+    if out.suffix.lower() != target.suffix:
+        names: list[str] = []
+        for capture in chosen:
+            names.append(safe_name(capture.id, names))
+        paths = [out / f"{name}{target.suffix}" for name in names]
+    elif len(chosen) > 1:
+        known = ", ".join(capture.id for capture in chosen[:12])
+        raise SpadError(f"{out} holds one capture; choose it with --capture ({known}), or name a folder with -o")
+    for capture, path in zip(chosen, paths, strict=True):
+        if capture.modality not in target.modalities:
+            others = ", ".join(name for name, other in Target.every.items() if capture.modality in other.modalities)
+            raise SpadError(f"{capture.id} is {capture.modality}, which {format} cannot hold; take one of {others}")
+        if path.exists():
+            raise SpadError(f"{path}: is there already, and is not written over; remove it, or name another with -o")
+    for capture, path in zip(chosen, paths, strict=True):
+        with _whole(path) as file:
+            target.put(measurement.recording(capture.id), file)
+    return paths
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[IO[bytes]]:
+    """A new file that is there as a whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    with disk.writing(path, 0):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with open(part, "xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def _events(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+    """(ticks, pixel, tick in s) of all detections, pixel after pixel."""
+    events = recording.events
+    if events is None or events.ticks is None or events.tick is None:
+        raise SpadError(f"{recording.capture.id}: its stamps are no whole ticks; simulate it with a converter (tdc)")
+    pixels = recording.pixels
+    return events.ticks, events.pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), events.tick
+
+
+class PlainHdf5(Target):
+    """HDF5: time and pixel, or frames, as a measurement stores them, and attributes that say how it was recorded."""
+
+    name = "hdf5"
+    suffix = ".h5"
+
+    @classmethod
+    def put(cls, recording: Recording, file: IO[bytes]) -> None:
+        """Made in memory, packed: HDF5 itself never touches the disk (it crashes on a full one)."""
+        import h5py
+
+        image = io.BytesIO(capture_files.file_image(recording))
+        with h5py.File(image, "r+") as made:
+            made.attrs.update(facts(recording))
+        file.write(image.getbuffer())
+
+
+class Npz(Target):
+    """NumPy archive: time and pixel, or frames (QIS packed along columns, the high bit first), and numbers."""
+
+    name = "npz"
+    suffix = ".npz"
+
+    @classmethod
+    def put(cls, recording: Recording, file: IO[bytes]) -> None:
+        """Stored without a date, so that the same capture gives the same bytes."""
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, value in facts(recording).items():
+                cls._member(archive, name, np.asarray(value))
+            if recording.events is not None:
+                time, pixel, _ = _events(recording)
+                cls._member(archive, "time", time)
+                cls._member(archive, "pixel", pixel)
+            else:
+                with archive.open(zipfile.ZipInfo("frames.npy"), "w", force_zip64=True) as member:
+                    _put_frames(recording, member)
+
+    @staticmethod
+    def _member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
+        with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+class Npy(Target):
+    """NumPy array of frames; QIS: (frames, rows, ceil(columns / 8)) uint8, as np.packbits(bits, axis=2) gives it.
+
+    It does not say how it was recorded: an import is told --packed --columns, --frame-time, ...
+    """
+
+    name = "npy"
+    suffix = ".npy"
+    modalities = ("qis", "str", "counts")
+
+    @classmethod
+    def put(cls, recording: Recording, file: IO[bytes]) -> None:
+        """Piece by piece."""
+        _put_frames(recording, file)
+
+
+def _put_frames(recording: Recording, file: IO[bytes]) -> None:
+    """Frames as an `.npy` stream, piece by piece."""
+    assert recording.frames is not None
+    kind = np.asarray(recording.frames[0:1]).dtype.newbyteorder("<")
+    header = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": recording.frames.shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    for _, part in recording.chunks():
+        file.write(np.ascontiguousarray(part, kind).data)
+
+
+class PhotonHdf5(Target):
+    """Photon-HDF5 0.5: time stamps in order, with the pixel of each as its detector. Source: photon-hdf5.org."""
+
+    name = "photon-hdf5"
+    suffix = ".hdf5"
+    modalities = ("tr",)
+
+    @classmethod
+    def put(cls, recording: Recording, file: IO[bytes]) -> None:
+        """What the format asks for, each field with the description that it prescribes; our own part in /user."""
+        import h5py
+
+        ticks, pixel, tick = _events(recording)
+        order = np.argsort(ticks, kind="stable")
+        lit = recording.capture.light
+        values: dict[str, Any] = {
+            "acquisition_duration": recording.conditions.exposure,
+            "description": recording.capture.id,
+            "photon_data/timestamps": ticks[order].astype(np.int64),
+            "photon_data/timestamps_specs/timestamps_unit": tick,
+            "photon_data/detectors": pixel[order],
+            "setup/num_pixels": recording.pixels,
+            **dict.fromkeys(_ONE, 1),
+            **dict.fromkeys(_NO, 0),
+            "setup/excitation_alternated": np.zeros(1, np.int64),
+            "identity/creation_time": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
+            "identity/software": "spadmnist",
+            "identity/software_version": __version__,
+            **{f"{place}format_name": "Photon-HDF5" for place in ("", "identity/")},
+            **{f"{place}format_version": "0.5" for place in ("", "identity/")},
+            "identity/format_url": "http://photon-hdf5.org/",
+        }
+        if lit.wavelength is not None:
+            values["setup/excitation_wavelengths"] = np.array([lit.wavelength])
+        with h5py.File("photons.hdf5", "w", driver="core", backing_store=False) as made:
+            for name, value in values.items():
+                filters = {}
+                if np.ndim(value) and np.size(value):
+                    filters = {"chunks": (min(len(value), 1 << 16),), "compression": 1, "shuffle": True}
+                data = np.bytes_(value) if isinstance(value, str) else value
+                made.create_dataset(name, data=data, track_times=False, **filters)
+            made.create_group("user/spadmnist").attrs.update(facts(recording))
+            made.attrs["TITLE"] = np.bytes_(_TITLES["/"])
+            made.visititems(
+                lambda name, node: node.attrs.update(TITLE=np.bytes_(_TITLES.get(name.split("/")[-1], " ")))
+            )
+            for name, value in (("format_name", "Photon-HDF5"), ("format_version", "0.5")):
+                made.attrs[name] = np.bytes_(value)
+            made.flush()
+            file.write(made.id.get_file_image())
+
+
+_ONE = tuple(f"setup/num_{what}" for what in ("spots", "spectral_ch", "polarization_ch", "split_ch"))
+_NO = ("setup/modulated_excitation", "setup/lifetime")
+
+# prescribed by the format, to the letter
+_TITLES = {
+    "/": "A file format for photon-counting detector based single-molecule spectroscopy experiments.",
+    "acquisition_duration": "Measurement duration in seconds.",
+    "description": "A user-defined comment describing the data file.",
+    "format_name": "Name of the file format.",
+    "format_version": "Version for the Photon-HDF5 format.",
+    "format_url": "Official URL for the Photon-HDF5 format.",
+    "photon_data": "Group containing arrays of photon-data.",
+    "timestamps": "Array of photon timestamps. Units specified in timestamps_units (defined in timestamps_specs/).",
+    "detectors": "Array of pixel IDs for each timestamp.",
+    "timestamps_specs": "Specifications for timestamps.",
+    "timestamps_unit": "Value of 1-unit timestamp-increment in seconds.",
+    "setup": "Information about the experimental setup.",
+    "num_pixels": "Total number of detector pixels.",
+    "num_spots": 'Number of excitation (or detection) "spots" in the sample.',
+    "num_spectral_ch": "Number of distinct spectral bands which are acquired.",
+    "num_polarization_ch": "Number of distinct polarization states which are acquired.",
+    "num_split_ch": "Number of distinct detection channels detecting the same spectral band and polarization. This "
+    "value is > 1 when using a non-polarizing beam splitter.",
+    "modulated_excitation": "True (i.e. 1) if there is any form of excitation modulation of excitation wavelength (as "
+    "in us-ALEX or PAX) or polarization. This field is also True for pulse-interleaved excitation (PIE) or ns-ALEX "
+    "measurements.",
+    "excitation_alternated": "New in version 0.5. Indicates whether each excitation source is alternated (True, or 1) "
+    "or not alternated (False, or 0).",
+    "excitation_wavelengths": "List of excitation wavelengths (center wavelength if broad-band) in increasing order "
+    "(unit: meter).",
+    "lifetime": "True (i.e. 1) if the measurement includes a nanotimes array of photon arrival times with respect to a "
+    "laser pulse (as in TCSPC measurements).",
+    "identity": "Information about the Photon-HDF5 data file.",
+    "creation_time": "Creation time of the current Photon-HDF5 file.",
+    "software": "Name of the software used to create the current Photon-HDF5 file.",
+    "software_version": "Version of the software used to create current the Photon-HDF5 file.",
+}

@@ -1,0 +1,119 @@
+"""LinoSPAD2, a line of 256 pixels."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from .. import image_files, units
+from ..errors import InputError
+from . import PICOSECOND, Format, Found, Said, ask, frames_in_file
+
+_CLOCK, _CODES = 2500, 140  # ps, codes in it
+_AT_ONCE = 1 << 22  # words
+_LARGEST_TABLE = 1 << 24  # bytes of a calibration
+
+
+class LinoSpad2(Format):
+    """LinoSPAD2, firmware 2212: 32-bit little-endian words, 256 pixels at 64 converters, cycle after cycle.
+
+    A word: bit 31, it is valid; bits 28-29, the pixel's address at its converter; bits 0-27, codes since the start of
+    the cycle, 140 to a clock of 2.5 ns. A cycle has --timestamps words of each of 65 converters, one after the other,
+    the last of which belongs to no pixel. Pixel at converter k with address a: 4 k + a (2212b), k + 64 a (2212s).
+    Calibrated: 2500 ps * (word // 140) + tdc[pixel, word % 140] + offset[pixel], rounded to --tick (1 ps); without
+    --tdc the codes are kept as ticks of 2.5 ns / 140.
+
+    The cycles are joined without the pauses between them, which the file does not hold.
+
+    Source: the daplis package (github.com/rngKomorebi/daplis), unpack.py, delta_t.py and its introduction; read there,
+    not tried on a recording of the sensor.
+    """
+
+    about = "LinoSPAD2 .dat"
+    ends = (".dat",)
+
+    @classmethod
+    def read(cls, path: Path, said: Said) -> Found:
+        """The firmware may also stand in the name of the calibration, as in TDC_NL11_#33_2212b.csv."""
+        named = [name for name in ("2212b", "2212s") if said.tdc is not None and name in said.tdc.stem]
+        firmware = said.firmware or (named[0] if named else None)
+        known = {"firmware": firmware, "timestamps": said.timestamps, "cycle": said.cycle}
+        if missing := [name for name, value in known.items() if value is None]:
+            raise ask(path, missing)
+        assert said.timestamps is not None and said.cycle is not None
+        size, each = path.stat().st_size, 65 * said.timestamps
+        cycles = size // (4 * each)
+        if size % (4 * each):
+            raise InputError(
+                f"{path}: {size:,} bytes are no whole cycles of 65 x {said.timestamps} words; give another "
+                "--timestamps (recordings with absolute time stamps are not read)"
+            )
+        if said.offsets is not None and said.tdc is None:
+            raise InputError("--offsets: they are added to calibrated time stamps; give --tdc as well")
+        ends = None if said.tdc is None else _calibration(said.tdc)
+        offsets = np.zeros(256) if said.offsets is None else _offsets(said.offsets)
+        tick = _CLOCK / _CODES * PICOSECOND if ends is None else said.tick or PICOSECOND
+        length = round(said.cycle / tick)
+        if abs(said.cycle / tick - length) > 1e-6 * max(1.0, 1e-6 * length):
+            raise InputError(
+                f"--cycle: {units.show(said.cycle, 's')} is no whole number of ticks of {units.show(tick, 's')}"
+            )
+        words = frames_in_file(path, 0, "<u4", (cycles, 65, said.timestamps))
+        channels, ticks, outside, full = [np.zeros(0, np.uint8)], [np.zeros(0, np.uint64)], 0, 0
+        step = max(1, _AT_ONCE // each)
+        for start in range(0, cycles, step):
+            some = words[start : start + step][:, :64]
+            valid = some >> 31 == 1
+            full += int(valid.all(axis=2).sum())
+            cycle, converter, _ = np.nonzero(valid)
+            word = some[valid].astype(np.int64)
+            address, codes = word >> 28 & 3, word & 0xFFFFFFF
+            pixel = 4 * converter + address if firmware == "2212b" else converter + 64 * address
+            if ends is not None:
+                time = codes // _CODES * _CLOCK + ends[pixel, codes % _CODES] + offsets[pixel]
+                codes = np.rint(time * (PICOSECOND / tick)).astype(np.int64)
+            inside = (codes >= 0) & (codes < length)
+            outside += int((~inside).sum())
+            channels.append(pixel[inside].astype(np.uint8))
+            ticks.append((codes + (start + cycle) * length)[inside].astype(np.uint64))
+        notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
+        if full:
+            notes.append(f"{full:,} of {64 * cycles:,} times a converter was full, and blind for the rest of its cycle")
+        if outside:
+            notes.append(f"{outside:,} time stamps lie outside their cycle and were left out")
+        facts = {"tick": tick, "exposure": cycles * said.cycle, "rows": 1, "columns": 256}
+        return Found(facts, np.concatenate(channels), np.concatenate(ticks), notes=tuple(notes))
+
+
+@functools.lru_cache(maxsize=1)
+def _calibration(path: Path) -> np.ndarray:
+    """(256, 140) ps, the end of each code; equal codes for a pixel that was not calibrated (all zero)."""
+    try:
+        if path.stat().st_size > _LARGEST_TABLE:
+            raise ValueError("it is too large")
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        if table.shape != (256, 1 + _CODES) or (table[:, 0] != np.arange(256)).any():
+            raise ValueError(f"it holds {table.shape[0]} x {table.shape[1]} numbers")
+        ends = table[:, 1:]
+        if not ((ends >= 0) & (ends <= _CLOCK + 1e-6)).all() or (np.diff(ends, axis=1) < 0).any():
+            raise ValueError("its times do not rise from 0 to 2500 ps")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: is no calibration of codes ({image_files.reason(error)}); it has a line of headings, then for "
+            "each of 256 pixels its number and 140 times in ps"
+        ) from None
+    ends[~ends.any(axis=1)] = np.arange(1, 1 + _CODES) * (_CLOCK / _CODES)
+    return ends
+
+
+def _offsets(path: Path) -> np.ndarray:
+    try:
+        with open(path, "rb") as file:
+            found = image_files.read_npy(file, path.stat().st_size, str(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None
+    if found.shape != (256,) or not np.isfinite(found).all():
+        raise InputError(f"{path}: has the shape {found.shape}; offsets are 256 finite numbers, in ps")
+    return found.astype(np.float64)
