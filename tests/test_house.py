@@ -94,7 +94,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         if name.startswith("spadmnist"):
             assert ours(name) in allowed, f"{file}:{line} imports {name}"
         else:
-            assert name.split(".")[0] in {"__future__", "numpy", "math", "numba"}, f"{file}:{line} imports {name}"
+            assert name.split(".")[0] in {"__future__", "numpy", "math", "typing"}, f"{file}:{line} imports {name}"
     names = {n.removeprefix("spadmnist.effects.").split(".")[0] for _, n in imports(file) if ".effects." in n}
     # a law that several effects share stands in a module of its own, whose name begins with an underscore
     shared = {name for name in names if name.startswith("_") and f"effects/{name}.py" in MODULES}

@@ -289,9 +289,8 @@ class ArrayFano(Statistic):
             levels, shortest = _exact_lengths(conditions.exposure, _MOST)
             found, unit = stamps(recording)
             sums = event_sums(found, unit / shortest, _WINDOWS << (levels - 1)).astype(np.int64)
-            slots, half = np.inf, 0.0
+            slots = np.inf
             lengths = shortest * 2.0 ** np.arange(levels)
-            scatter = 0.0
         else:
             if recording.n_frames < _WINDOWS:
                 return None
@@ -299,15 +298,16 @@ class ArrayFano(Statistic):
             sums = frame_sums(recording)[: recording.n_frames >> (levels - 1) << (levels - 1)].copy()
             slots = slots_of_frame(recording)
             lengths = _frame_length(recording) * 2.0 ** np.arange(levels)
-            # of a frame's detections, which are binomial for a pixel, and for the array the sum of different ones
-            share = recording.totals / (recording.n_frames * slots)
-            scatter = float((share * (1.0 - share)).sum()) * slots * _drawn(recording.n_frames * slots)
-            half = slots * recording.pixels / 2.0
-        total = int(sums.sum())
-        if total > half * len(sums) > 0:  # free slots scatter like those that are taken
-            sums = int(slots) * recording.pixels - sums
+        total, scatter = int(sums.sum()), 0.0
+        if np.isfinite(slots):
+            # a pixel's number is binomial, the array's the sum of different ones
+            places = recording.n_frames * slots
+            taken = recording.totals / places
+            scatter = float((taken * (1.0 - taken)).sum()) * slots * _drawn(places)
+            if total > slots * recording.pixels / 2.0 * len(sums):  # free slots scatter like those that are taken
+                sums = int(slots) * recording.pixels - sums
         detections = float(sums.sum())
-        share = shares(np.append(sums[:1000], total), levels)
+        share = shares(np.append(recording.totals, levels), levels)
         scores, laws, noises = [], [], []
         for level in range(levels):
             n = len(sums)

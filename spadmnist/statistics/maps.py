@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 
@@ -169,22 +170,37 @@ _TERMS: tuple[tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray]], ...] =
 )
 
 
-def _basis(layout: Layout) -> tuple[np.ndarray, list[str]]:
-    """((1 + terms, pixels), names of the terms): 1 and those terms that the places tell apart."""
-    x, y = layout.centred.T
-    terms = np.stack([np.ones(layout.pixels), *(term(x, y) for _, term in _TERMS)])
-    products = terms @ terms.T / layout.pixels
-    taken = [0]
-    for k in range(1, len(terms)):
-        tried = [*taken, k]
-        if np.linalg.eigvalsh(products[np.ix_(tried, tried)])[0] > 1e-6:
-            taken = tried
-    return terms[taken], [_TERMS[k - 1][0] for k in taken[1:]]
+class _Basis:
+    """1 and those terms that the places of an array tell apart: functions (1 + terms, pixels), and their names."""
+
+    def __init__(self, layout: Layout):
+        x, y = layout.centred.T
+        functions = np.stack([np.ones(layout.pixels), *(term(x, y) for _, term in _TERMS)])
+        products = functions @ functions.T
+        taken = [0]
+        for k in range(1, len(functions)):
+            tried = [*taken, k]
+            if np.linalg.eigvalsh(products[np.ix_(tried, tried)])[0] > 1e-6 * layout.pixels:
+                taken = tried
+        self.functions = functions[taken]
+        self.inverse = np.linalg.inv(products[np.ix_(taken, taken)])
+        self.names = [_TERMS[k - 1][0] for k in taken[1:]]
+
+    def fit(self, values: np.ndarray) -> np.ndarray:
+        """Coefficients of the least squares."""
+        return np.asarray(self.inverse @ (self.functions @ values))
 
 
-def _fit(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Coefficients of the least squares."""
-    return np.asarray(np.linalg.solve(basis @ basis.T, basis @ values))
+@lru_cache(maxsize=4)
+def _basis_of(rows: int, columns: int, positions: bytes | None) -> _Basis:
+    places = None if positions is None else np.frombuffer(positions).reshape(-1, 2)
+    return _Basis(Layout(rows, columns, 1.0, 1.0, places))
+
+
+def _basis(layout: Layout) -> _Basis:
+    """It is made once for all recordings of an array."""
+    positions = None if layout.positions is None else np.asarray(layout.positions, np.float64).tobytes()
+    return _basis_of(layout.rows, layout.columns, positions)
 
 
 class Surface(Statistic):
@@ -200,12 +216,13 @@ class Surface(Statistic):
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        basis, names = _basis(recording.layout)
+        basis = _basis(recording.layout)
+        names = basis.names
         if not has_data(recording) or not names:
             return None
         rates = _Counting(recording).rates(recording.totals.astype(np.float64))
         mean = rates.mean()
-        fitted = _fit(basis, rates / mean if mean > 0 else np.ones_like(rates))
+        fitted = basis.fit(rates / mean if mean > 0 else np.ones_like(rates))
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             text = f"{per_cent(measured)} of the mean rate, {per_cent(expected)} expected"
@@ -304,14 +321,14 @@ class Spread(Statistic):
 
     def reduce(self, recording: Recording) -> Summary | None:
         pixels, layout = recording.pixels, recording.layout
-        basis, _ = _basis(layout)
-        free = pixels - np.array([1, len(basis)])
+        basis = _basis(layout)
+        free = pixels - np.array([1, len(basis.functions)])
         if not has_data(recording) or free[1] < 8:
             return None
         counting = _Counting(recording)
         counts = recording.totals.astype(np.float64)
         mean = float(counts.mean())
-        smooth = _fit(basis, counts - mean) @ basis
+        smooth = basis.fit(counts - mean) @ basis.functions
         squares = np.array([((counts - mean) ** 2).sum(), ((counts - mean - smooth) ** 2).sum()])
         noise = float(counting.variance(counts).mean())
         # as pairs of detections (or of free slots, where these are fewer) in the same pixel

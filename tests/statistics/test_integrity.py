@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from simple_sensor import (
+    capture,
     counted,
     counts_of,
     grid,
@@ -27,7 +28,14 @@ from simple_sensor import (
     tr_of,
 )
 
-from spadmnist.recording import Recording
+from spadmnist.effects import Conditions
+from spadmnist.effects.dark_counts import DarkCounts
+from spadmnist.effects.dead_time import DeadTime
+from spadmnist.effects.detection import Detection
+from spadmnist.effects.tdc import Tdc
+from spadmnist.recording import Recording, of_image
+from spadmnist.sensor import Sensor
+from spadmnist.statistics.fano import ArrayFano, PixelFano
 from spadmnist.statistics.integrity import (
     Disorder,
     EqualStamps,
@@ -38,6 +46,9 @@ from spadmnist.statistics.integrity import (
     chance_of_bits,
     longest_gap,
 )
+from spadmnist.statistics.maps import PixelMap, Spread, Surface
+from spadmnist.statistics.slow import SlowSeries, Trend
+from spadmnist.streams import Streams
 
 
 def bits_of(recording: Recording) -> np.ndarray:
@@ -299,3 +310,21 @@ def test_empty_and_full_data_have_the_same_cells(statistic: type) -> None:
         if "counts" in statistic.modalities:
             cells.add(len(reduced(statistic, counts_of(np.full((50, 3, 4), value), 4)).values))
     assert len(cells) == 1
+
+
+@pytest.mark.parametrize("modality", ["tr", "qis", "str", "counts"])
+def test_what_the_sensor_makes_is_whole(modality: str) -> None:
+    """The package's own sensor, with all of its classes for data: nothing is out of order, repeated or silent."""
+    effects = [Detection(pdp=0.4), DarkCounts(rate=100.0), DeadTime(duration=50e-9), Tdc(resolution=1e-10)]
+    sensor = Sensor(grid(8, 8), effects, "device").settled()
+    conditions = Conditions(4e-3, 400, 1e-5, 1e-5, 500e-9, 3 if modality == "counts" else 0, "counter")
+    streams = Streams(1, "level", "train", np.arange(40, dtype=np.uint64))
+    recorded = sensor.expose(np.full((40, 64), 5e5), conditions, streams, [modality])
+    made = [of_image(recorded, i, capture(modality, conditions), sensor.layout, 50e-9) for i in range(40)]
+    for statistic in (RepeatedFrames, RareFrames, Disorder, EqualStamps, Gaps, FullCounters):
+        if modality in statistic.modalities:
+            values = many(statistic, lambda seed: made[seed - 1000], 40)
+            assert np.abs(values).max() < 5 or statistic is FullCounters
+            assert reduced(statistic, made[0]).values.size == values.shape[1]
+    for statistic in (PixelMap, Surface, Spread, Trend, SlowSeries, PixelFano, ArrayFano):
+        assert reduced(statistic, made[1]).values.size == reduced(statistic, made[2]).values.size
