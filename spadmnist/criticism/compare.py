@@ -13,6 +13,7 @@ import functools
 import json
 import math
 import pickle
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -553,10 +554,10 @@ def table(comparison: Comparison) -> str:
     if failing:
         lines.append(f"The model fails {len(failing)} of {len(comparison.checks)} checks. The clearest first:")
         lines.append("")
-        lines += _columns(
-            [("statistic", "capture", "p", "where", "measured against expected")]
-            + [(c.statistic, c.capture or "all", f"{c.p_value:.1g}", c.where, c.size) for c in failing[:12]]
-        )
+        for c in failing[:12]:
+            head = f"  p = {c.p_value:.1g}"
+            text = f"{c.statistic}, {c.capture or 'all captures'}: {c.where}; {c.size}"
+            lines += textwrap.wrap(text, 100, initial_indent=f"{head:<13}", subsequent_indent=" " * 13)
         if len(failing) > 12:
             lines.append(f"... and {len(failing) - 12} more (--json FILE or -o REPORT holds all)")
     else:
@@ -575,11 +576,6 @@ def table(comparison: Comparison) -> str:
         interval = f"95 %: {n.low:.4f} to {n.high:.4f}"
         lines.append(f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}")
     return "\n".join(lines)
-
-
-def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 __all__ = ["Check", "Comparison", "Nuisance", "canonical", "compare", "table"]
