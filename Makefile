@@ -5,10 +5,10 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify bench lint clean
+.PHONY: help demo test verify bench challenge lint clean
 
 help:  ## say what there is
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(VENV)/installed: pyproject.toml
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
@@ -39,6 +39,16 @@ lint: $(VENV)/installed
 
 bench: $(VENV)/installed  ## measure the README's table on this machine (about 4 minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
+
+# CASES=all QUICK= for the whole list (hours); what is there is not made again, and only missing answers are asked for
+CASES ?= all
+QUICK ?= --quick
+CHALLENGE ?= $(DEMO)/challenge
+
+challenge: $(VENV)/installed  ## hidden effects of an independent generator, diagnosed blind, then scored
+	@test -d $(CHALLENGE)/cases || $(RUN)/python scripts/challenge.py make $(CASES) -o $(CHALLENGE) $(QUICK)
+	@$(RUN)/python scripts/challenge.py run $(CHALLENGE) $(QUICK) || true
+	@$(RUN)/python scripts/challenge.py score $(CHALLENGE)
 
 clean:  ## remove what was made here
 	rm -rf $(VENV) $(DEMO) benchmarks.md .pytest_cache .mypy_cache .ruff_cache .hypothesis

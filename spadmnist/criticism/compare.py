@@ -36,6 +36,8 @@ FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
 REPLICATES = 96
 _SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
 _LEAST_SPREAD = 0.01
+_SHARES = {"light": 0.25, "rate": 0.25}  # of the false alarms that are allowed
+_REST = 0.5
 _LEAST_P = 1e-300  # a p-value is never 0
 _EVENTS_AT_ONCE = 4_000_000
 
@@ -529,12 +531,18 @@ def _light(
 
 def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
     """Holm's correction: which checks fail so clearly that a right model shows one only once in a hundred times."""
-    order = sorted(range(len(checks)), key=lambda i: checks[i].p_value)
+    # one question about the light, one about the captures' totals, one about all that they contain: a share each, lest
+    # a power meter that is off drowns among a hundred statistics
+    kinds = [c.statistic if c.statistic in _SHARES else "" for c in checks]
+    weights = [_SHARES.get(kind, _REST) / kinds.count(kind) for kind in kinds]
+    order = sorted(range(len(checks)), key=lambda i: checks[i].p_value / weights[i])
     failing: set[int] = set()
-    for rank, i in enumerate(order):
-        if checks[i].p_value > FALSE_ALARM / (len(checks) - rank):
+    left = sum(weights)
+    for i in order:
+        if checks[i].p_value > FALSE_ALARM * weights[i] / max(left, 1e-12):
             break
         failing.add(i)
+        left -= weights[i]
     out = []
     for i, check in enumerate(checks):
         material = i in failing and (tolerance is None or not abs(check.relative) < tolerance)

@@ -1,0 +1,464 @@
+"""The hidden-effect challenge: its generator against closed forms, its seals, its score.
+
+The generator is the convergence gate of the challenge: where it disagrees with a formula, a benchmark made with it
+says nothing. Statistical assertions fail by chance once in a million (`laws`); seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import laws
+import numpy as np
+import pytest
+import yaml
+
+from spadmnist import measurement
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+def loaded(name: str) -> Any:
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+        assert spec and spec.loader
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return sys.modules[name]
+
+
+generator = loaded("challenge_generator")
+hidden = loaded("challenge_cases")
+challenge = loaded("challenge")
+World, Capture, Traps = generator.World, generator.Capture, generator.Traps
+
+
+def world(side: int = 16, **settings: Any) -> Any:
+    return World(side, side, 25e-12, {500e-9: 0.5}, **settings)
+
+
+def counts(made: Any, capture: Any, seed: int = 1) -> np.ndarray:
+    """Detections of each pixel."""
+    _, pixels = generator.expose(made, capture, np.random.default_rng(seed))
+    return np.bincount(pixels, minlength=made.pixels)
+
+
+def renewal_mean(rate: float, dead: float, length: float) -> float:
+    """Expected detections of a pixel that is live at the start (non-paralyzable, long exposure)."""
+    x = rate * dead
+    return rate * length / (1 + x) + x**2 / (2 * (1 + x) ** 2)
+
+
+# ---- the generator against closed forms -------------------------------------------------------------------
+
+
+def test_light_becomes_detections() -> None:
+    """120 nW/cm^2 of 500 nm on 25 um^2: 75.5e3 photons/s, half of them detected."""
+    flat = Capture("flat", "tr", irradiance=1.2e-3, exposure=0.02)
+    photons = 1.2e-3 * 25e-12 / (6.62607015e-34 * 299792458 / 500e-9)
+    seen = counts(world(), flat)
+    laws.poisson_mean(int(seen.sum()), 256 * 0.02 * 0.5 * photons)
+    laws.variance_is(counts(world(32), flat), 0.02 * 0.5 * photons)
+
+
+@pytest.mark.parametrize("rate", [2e5, 5e6])
+def test_dead_time_rate(rate: float) -> None:
+    length = 2500 / rate
+    made = world(dark_rate=rate, dead_time=45e-9)
+    seen = counts(made, Capture("dark", "tr", exposure=length))
+    laws.mean_is(seen, renewal_mean(rate, 45e-9, length))
+
+
+def test_a_wrong_dead_time_is_seen() -> None:
+    made = world(dark_rate=5e6, dead_time=48e-9)
+    seen = counts(made, Capture("dark", "tr", exposure=1e-3))
+    with pytest.raises(AssertionError):
+        laws.mean_is(seen, renewal_mean(5e6, 45e-9, 1e-3))
+
+
+def test_dead_time_fano() -> None:
+    """Fano factor 1 / (1 + lambda tau)^2; the law's next term is below a hundredth here."""
+    rate, dead, length = 6e6, 50e-9, 50e-6
+    seen = counts(world(64, dark_rate=rate, dead_time=dead), Capture("dark", "tr", exposure=length))
+    x = rate * dead
+    laws.variance_is(seen, rate * length / (1 + x) ** 3)
+    with pytest.raises(AssertionError):
+        laws.variance_is(seen, rate * length / (1 + x) ** 2)
+
+
+def test_no_interval_is_shorter_than_the_dead_time() -> None:
+    made = world(dark_rate=5e6, dead_time=45e-9, traps=[Traps(0.1, 30e-9, 30e-9)], crosstalk={(1, 0): 0.1})
+    times, pixels = generator.expose(made, Capture("dark", "tr", exposure=1e-4), np.random.default_rng(2))
+    assert times == sorted(times)
+    order = np.lexsort((times, pixels))
+    gaps = np.diff(np.array(times)[order])[np.diff(np.array(pixels)[order]) == 0]
+    assert gaps.min() > 45e-9
+    assert (gaps < 50e-9).sum() > 10
+
+
+def test_paralyzable_rate() -> None:
+    """r = lambda exp(-lambda tau)."""
+    made = world(dark_rate=8e6, dead_time=50e-9, paralyzable=True)
+    seen = counts(made, Capture("dark", "tr", exposure=1e-3))
+    x = 8e6 * 50e-9
+    laws.mean_is(seen, 8e6 * math.exp(-x) * 1e-3 + 1 - math.exp(-x) * (1 + x))
+
+
+@pytest.mark.parametrize("traps", [Traps(0.2, 25e-9, 25e-9, single=True), Traps(0.05, 20e-9, 200e-9)])
+def test_afterpulses_have_afterpulses(traps: Any) -> None:
+    """Whatever fires fills traps: the mean is lambda T / (1 - p), dead time apart; of a band of lifetimes as well."""
+    seen = counts(world(dark_rate=2e3, dead_time=50e-9, traps=[traps]), Capture("dark", "tr", exposure=0.3))
+    # two releases of one avalanche seldom meet within a dead time: p^2 / 2 of all, below 5e-4 after the dead time
+    laws.mean_is(seen, 600 / (1 - traps.mean) * (1 - 2e3 * 50e-9), error=600 * 3e-4)
+    if traps.single:
+        with pytest.raises(AssertionError):  # without afterpulses of afterpulses
+            laws.mean_is(seen, 600 * (1 + traps.mean), error=600 * 3e-4)
+
+
+def test_afterpulse_delays() -> None:
+    """Gaps beyond the dead time are an exponential of the lifetime, where a pixel is quiet otherwise."""
+    made = world(dark_rate=50.0, dead_time=50e-9, traps=[Traps(0.9, 25e-9, 25e-9, single=True)])
+    times, pixels = generator.expose(made, Capture("dark", "tr", exposure=0.3), np.random.default_rng(3))
+    order = np.lexsort((times, pixels))
+    gaps = np.diff(np.array(times)[order])[np.diff(np.array(pixels)[order]) == 0]
+    gaps = gaps[(gaps > 0) & (gaps < 2e-6)] - 50e-9
+    laws.distribution_is(gaps, lambda u: -np.expm1(-u / 25e-9))
+
+
+def test_crosstalk_rate() -> None:
+    """At a low rate avalanches multiply along the table: (1 - C)^-1."""
+    made = world(8, dark_rate=100.0, crosstalk={(1, 0): 0.03, (-1, 0): 0.03, (0, 1): 0.03, (1, 1): 0.01})
+    matrix = np.zeros((64, 64))
+    for y in range(8):
+        for x in range(8):
+            for (dx, dy), chance in made.crosstalk.items():
+                if 0 <= x + dx < 8 and 0 <= y + dy < 8:
+                    matrix[(y + dy) * 8 + x + dx, y * 8 + x] = chance
+    expected = np.linalg.solve(np.eye(64) - matrix, np.full(64, 100.0)).sum()
+    times, _ = generator.expose(made, Capture("dark", "tr", exposure=20.0), np.random.default_rng(4))
+    blocks = np.histogram(times, bins=400, range=(0, 20.0))[0]
+    laws.mean_is(blocks, expected * 20.0 / 400)
+    with pytest.raises(AssertionError):
+        laws.mean_is(blocks, 6400 * 20.0 / 400)
+
+
+def test_binary_frames_are_binomial() -> None:
+    frames = Capture("flat", "qis", irradiance=1.2e-3, frames=200, frame_time=10e-6, frame_period=10e-6)
+    made = world(32, dark_rate=2e4)
+    rate = 2e4 + 0.5 * generator.photon_rate(1.2e-3, 500e-9, 25e-12)
+    times, pixels = generator.expose(made, frames, np.random.default_rng(5))
+    bits = generator.bits(made, frames, times, pixels)
+    assert bits.sum() == len(times)  # a pixel fires once a frame
+    fires = -math.expm1(-rate * 10e-6)
+    n = np.arange(201)
+    law = [math.comb(200, int(k)) * fires**k * (1 - fires) ** (200 - k) for k in n]
+    laws.histogram_is(bits.reshape(200, -1).sum(axis=0), lambda k: np.where(k <= 200, np.array(law)[k.clip(0, 200)], 0))
+    with pytest.raises(AssertionError):
+        laws.share_is(int(bits.sum()), bits.size, -math.expm1(-rate * 9.8e-6))
+
+
+def test_nothing_fires_between_frames_and_first_stamps_are_exponential() -> None:
+    made = world(dark_rate=1e5, tick=100e-12, traps=[Traps(0.0, 1e-6, 1e-6)])
+    frames = Capture("dark", "str", frames=400, frame_time=8e-6, frame_period=10e-6)
+    times, pixels = generator.expose(made, frames, np.random.default_rng(6))
+    assert max(t % 10e-6 for t in times) < 8e-6
+    first = generator.first_stamps(made, frames, times, pixels)
+    seen = first[first < 80_000] * 100e-12
+    laws.share_is(seen.size, first.size, -math.expm1(-0.8))
+    laws.distribution_is(seen, lambda t: np.expm1(-1e5 * t) / math.expm1(-0.8))
+
+
+def test_releases_cross_frames() -> None:
+    """The excess of the next frame after a detection: p (tau / T_f) (1 - exp(-T_f / tau))^2 (1 - P) to first order."""
+    rate, tau, p = 2e3, 4e-6, 0.2
+    made = world(dark_rate=rate, traps=[Traps(p, tau, tau, single=True)])
+    frames = Capture("dark", "qis", frames=20_000, frame_time=10e-6, frame_period=10e-6)
+    times, pixels = generator.expose(made, frames, np.random.default_rng(7))
+    bits = generator.bits(made, frames, times, pixels).reshape(20_000, -1)
+    after = bits[1:][bits[:-1] == 1]
+    share = p * (tau / 10e-6) * -(math.expm1(-10e-6 / tau) ** 2) if False else p * 0.4 * (1 - math.exp(-2.5)) ** 2
+    assert abs(after.mean() - rate * 10e-6 - share) < 0.1 * share
+
+
+def test_lamp_and_blinking_keep_their_means() -> None:
+    lamp = generator.Lamp(swing=0.5, frequency=1000.0, warming=0.3, contrast=0.05, hold=2e-5)
+    flat = Capture("flat", "tr", irradiance=1.2e-3, exposure=0.02)
+    made = world(lamp=lamp)
+    times, _ = generator.expose(made, flat, np.random.default_rng(8))
+    expected = 256 * 0.02 * 0.5 * generator.photon_rate(1.2e-3, 500e-9, 25e-12)
+    # the lamp's own noise: 5 % variance over 20 ms / 40 us independent levels
+    assert abs(len(times) / expected - 1) < 5 * math.sqrt(0.05 / 500 + 1 / expected)
+    late, early = sum(t > 0.01 for t in times), sum(t <= 0.01 for t in times)
+    assert late > 1.1 * early
+    defects = [(pixel, 2000.0, 3000.0, 1000.0) for pixel in range(256)]
+    seen = counts(world(dark_rate=500.0, defects=defects), Capture("dark", "tr", exposure=0.3))
+    laws.mean_is(seen, 0.3 * (500 + 2000 * 0.75))
+
+
+def test_the_generator_shares_no_code_with_the_package() -> None:
+    for name in ("challenge_generator", "challenge_cases", "challenge"):
+        tree = ast.parse((SCRIPTS / f"{name}.py").read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                assert all(not alias.name.startswith("spadmnist") for alias in node.names)
+            if isinstance(node, ast.ImportFrom):
+                assert not (node.module or "").startswith("spadmnist")
+
+
+# ---- strengths and their significance ---------------------------------------------------------------------
+
+
+def test_every_case_can_be_built_and_meets_its_tier() -> None:
+    for case in hidden.all_cases(4):
+        if case.tier in ("obvious", "moderate", "below"):
+            continue  # the others suffice
+        lab, found = hidden.built(case, 11)
+        assert bool(found) == (case.kind != "null")
+        low, high = {"clear": (11, 18), "faint": (4.2, 5.8), "five-per-cent": (3.33, 3.34)}.get(case.tier, (3, 1e3))
+        for name, strength, what in found if case.kind != "double" else []:
+            limits = {**hidden.EFFECTS, **hidden.OUTSIDE, **hidden.SETUP}[name]
+            at_the_end = limits.solved and strength > 0.99 * limits.high
+            assert at_the_end or 0.98 * low <= what.z <= 1.02 * high, (case.name, what.z)
+        assert abs(lab.scale - 1) <= 2.5 * 0.015 or case.kind == "setup"
+
+
+def test_the_oracle_significance_of_a_sine_is_what_a_sine_shows() -> None:
+    """A matched filter that knows phase and frequency, on generated data, has the stated Z within its scatter of 1."""
+    lab = hidden.Lab("tr", 5)
+    what = hidden.flicker(lab, 0.1)
+    squares = 0.0
+    for capture in lab.real:
+        if not capture.dark and capture.length * lab.world.lamp.frequency > 1:
+            times, _ = generator.expose(lab.world, capture, np.random.default_rng(12))
+            turn = np.exp(2j * np.pi * lab.world.lamp.frequency * np.array(times)).sum()
+            squares += abs(turn) ** 2 / (len(times) / 2)
+    assert abs(math.sqrt(squares) - what.z) < 0.1 * what.z + 4
+
+
+# ---- seals and score --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """Laboratories with little data."""
+    kept = {family: dict(kind) for family, kind in hidden.FAMILIES.items()}
+    for kind in hidden.FAMILIES.values():
+        kind["captures"] = [(name, w, rate, length / 100) for name, w, rate, length in kind["captures"]]
+    yield
+    hidden.FAMILIES.update(kept)
+
+
+CASES = (
+    "null-*",
+    "tr-crosstalk-clear",
+    "outside-qis-copied-frames-clear",
+    "setup-tr-wavelength",
+    "str-converter-faint",
+)
+
+
+@pytest.fixture
+def made(small: Any, tmp_path: Path) -> Path:
+    folder = tmp_path / "out"
+    assert challenge.main(["make", *CASES, "-o", str(folder), "--seed", "2", "--nulls", "4", "--jobs", "1"]) == 0
+    return folder
+
+
+def test_cases_are_measurements_and_say_nothing_of_their_truth(made: Path) -> None:
+    folders = sorted(path for path in (made / "cases").iterdir() if path.is_dir())
+    assert [path.name for path in folders] == [f"case-{k:03d}" for k in range(1, 9)]
+    for folder in folders:
+        opened = measurement.open(folder)
+        assert len(opened.captures) >= 5
+        told = (folder / "measurement.yaml").read_text() + (folder / "sensor.yaml").read_text()
+        assert yaml.safe_load(told.split("sensor:")[0])["name"] == folder.name
+        assert not any(word in told for word in ("crosstalk", "null", "hidden", "copied", "truth"))
+
+
+def test_a_case_is_the_same_whichever_others_are_made(made: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    assert challenge.main(["make", "tr-crosstalk-clear", "-o", str(alone), "--seed", "2", "--jobs", "1"]) == 0
+    truths = [json.loads(path.read_text()) for path in (made / "sealed").glob("*.json")]
+    before = next(truth for truth in truths if truth["name"] == "tr-crosstalk-clear")
+    after = json.loads((alone / "sealed" / "case-001.json").read_text())
+    assert after["hidden"] == before["hidden"]
+    assert challenge.main(["make", "tr-crosstalk-clear", "-o", str(alone), "--seed", "2", "--jobs", "1"]) == 2
+
+
+def test_seals_detect_every_change(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = made / "sealed" / "case-003.json"
+    text = truth.read_text()
+    truth.write_text(text.replace('"irradiance_scale": ', '"irradiance_scale": 1'))
+    assert challenge.main(["score", str(made)]) == 1
+    assert "case-003: the truth is not the one that was sealed" in capsys.readouterr().err
+    truth.write_text(text)
+
+    sheet = made / "cases" / "case-002" / "sensor.yaml"
+    sheet.write_text(sheet.read_text() + "# changed\n")
+    assert challenge.main(["score", str(made)]) == 1
+    assert "case-002: the data are not those" in capsys.readouterr().err
+    sheet.write_text(sheet.read_text().replace("# changed\n", ""))
+
+    truth.unlink()
+    assert challenge.main(["score", str(made)]) == 1
+    assert "case-003: data, seal or truth is missing" in capsys.readouterr().err
+    truth.write_text(text)
+
+    assert not (made / "score.md").exists()
+    assert challenge.main(["score", str(made)]) == 0
+    table = (made / "score.md").read_text()
+    assert "## No answer: 8" in table
+    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - | <= 2.7 % | 4 |" in table
+
+
+def truth_of(kind: str, name: str = "x", **more: Any) -> dict[str, Any]:
+    plain = {"name": name, "case": name, "class": kind, "family": "tr", "z": [15.0], "truth": [], "setup": None}
+    return {**plain, "parameters": {}, "near": {}, "files": {}, **more}
+
+
+def answer(verdict: str, *steps: tuple[str, str, str | None], **more: Any) -> dict[str, Any]:
+    told = [{"change": c, "effect": e, "parameter": p, "values": {}, "alternatives": []} for c, e, p in steps]
+    return {"verdict": verdict, "steps": told, "setup": [], "unexplained": [], **more}
+
+
+CROSSTALK = {"change": "add", "effect": "crosstalk", "parameter": None}
+SPREAD = {"change": "per_pixel", "effect": "detection", "parameter": "pdp"}
+ADD, MAP = ("add", "crosstalk", None), ("per_pixel", "detection", "pdp")
+
+
+def judge(truth: dict[str, Any], told: dict[str, Any] | None, compared: str | None = None) -> Any:
+    return challenge.judged(truth, told, 10.0, compared)
+
+
+def test_singles_are_judged() -> None:
+    truth = truth_of("single", truth=[CROSSTALK], parameters={"crosstalk.probability": 0.005})
+    told = answer("explained", ADD)
+    told["steps"][0]["values"] = {"probability": {"value": 0.005, "low": 0.004, "high": 0.0049}}
+    right = judge(truth, told)
+    assert right.first_right and right.class_right and right.exact and not right.confident_wrong
+    assert right.intervals == [("crosstalk.probability", False, True)]
+    more = judge(truth, answer("explained", ADD, MAP))
+    assert more.first_right and not more.exact and not more.confident_wrong
+    wrong = judge(truth, answer("explained", MAP))
+    assert wrong.detected and not wrong.first_right and wrong.confident_wrong and not wrong.class_right
+    told = answer("confused", MAP)
+    told["steps"][0]["alternatives"] = [{**CROSSTALK, "misfit": 1.0}]
+    unsure = judge(truth, told)
+    assert unsure.class_right and not unsure.first_right and not unsure.confident_wrong
+    told["steps"][0]["alternatives"] += [{"change": "add", "effect": str(k), "parameter": None} for k in range(3)]
+    assert not judge(truth, told).class_right
+    assert not judge(truth, answer("adequate")).detected
+    silent = judge(truth, None)
+    assert not silent.detected and silent.given == "no answer"
+    # the same effect is not the same finding
+    assert not judge(truth_of("single", truth=[SPREAD]), answer("explained", ("set", "detection", "pdp"))).first_right
+
+
+def test_doubles_unknowns_and_set_up_are_judged() -> None:
+    double = truth_of("double", truth=[CROSSTALK, SPREAD])
+    both = judge(double, answer("explained", MAP, ADD))
+    assert both.both and both.exact and both.first_right
+    assert not judge(double, answer("partly_explained", ADD)).both
+
+    outside = truth_of("outside", truth=hidden.UNKNOWN)
+    rest = [{"statistic": "coincidences", "capture": "dark", "significance": 40.0}]
+    assert judge(outside, answer("unexplained", unexplained=rest)).flagged
+    assert judge(outside, answer("partly_explained", ADD, unexplained=rest)).flagged
+    bluff = judge(outside, answer("explained", ADD))
+    assert bluff.confident_wrong and not bluff.flagged
+    assert not judge(outside, answer("unexplained")).flagged  # it must say what
+
+    wanted = {"captures": ["flat-700nm"], "quantities": ["wavelength", "light"], "factor": 1.6}
+    trap = truth_of("setup", setup=wanted)
+    found = answer("setup", setup=[{"capture": "flat-700nm", "quantity": "light", "factor": {}}])
+    assert judge(trap, found).setup_right and not judge(trap, found).confident_wrong
+    assert judge(trap, {**found, "verdict": "confused"}).setup_right
+    elsewhere = answer("setup", setup=[{"capture": "dark", "quantity": "dark", "factor": {}}])
+    assert judge(trap, elsewhere).confident_wrong
+    assert judge(trap, answer("explained", MAP)).confident_wrong
+    assert judge(truth_of("null", z=[]), answer("setup", setup=[])).confident_wrong
+
+
+def test_the_table_counts_everything() -> None:
+    single = truth_of("single", "single-a", truth=[CROSSTALK], parameters={"crosstalk.probability": 0.005})
+    told = answer("explained", ADD)
+    told["steps"][0]["values"] = {"probability": {"value": 0.005, "low": 0.004, "high": 0.006}}
+    cases = [judge(truth_of("null", f"null-{k}", z=[]), answer("adequate"), "adequate") for k in range(19)]
+    cases += [
+        judge(truth_of("null", "null-x", z=[]), answer("explained", MAP), "fails"),
+        judge(single, told, "fails"),
+        judge({**single, "name": "single-b", "z": [8.0]}, answer("explained", MAP), "fails"),
+        judge({**single, "name": "single-c", "z": [2.0]}, answer("adequate"), "adequate"),
+        judge({**single, "name": "single-d", "z": [5.0]}, None),
+        judge(truth_of("outside", "out", truth=hidden.UNKNOWN), answer("explained", ADD)),
+    ]
+    text = challenge.report(cases)
+    for line in (
+        "25 cases.",
+        "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % | <= 2.7 % | 0 |",
+        "| nulls: false alarm of `compare` | 1 of 20 | 5 % | 1-24 % | 1 % | 0 |",
+        "| single, Z >= 10: detected | 1 of 1 | 100 % | 21-100 % | >= 98 % | 0 |",
+        "| single, Z 6-10: right effect first | 0 of 1 | 0 % | 0-79 % | >= 80 % | 0 |",
+        "| single, Z 4-6: right effect first | 0 of 1 | 0 % | 0-79 % | >= 55 % | 1 |",
+        "| single, Z below 3: detected | 0 of 1 | 0 % | 0-79 % | <= 20 % | 0 |",
+        "| outside the catalogue: confidently wrong | 1 of 1 | 100 % | 21-100 % | <= 5 % | 0 |",
+        "| 95 % intervals that cover the truth, by the catalogue's law | 1 of 1 | 100 % | 21-100 % | 90-98 % | 0 |",
+        "## Confident wrong answers: 3",
+        "- null-x null-x (Z 0.0): explained, per_pixel detection.pdp; true: (null)",
+        "## No answer: 1",
+    ):
+        assert line in text, text
+
+
+def test_wilson() -> None:
+    """The textbook's 10 of 100: 5.5 to 17.4 %."""
+    low, high = challenge.wilson(10, 100)
+    assert (round(low, 4), round(high, 4)) == (0.0552, 0.1744)
+    assert challenge.wilson(0, 0) == (0.0, 1.0)
+
+
+def test_answers_are_kept_and_asked_for_once(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a program in the place of spadmnist that finds crosstalk in everything but fails once."""
+    stub = made / "stub.py"
+    stub.write_text(
+        "import json, sys\n"
+        "if '--help' in sys.argv: sys.exit(0)\n"
+        "if 'case-002' in sys.argv[2] and sys.argv[1] == 'diagnose': sys.exit('no memory')\n"
+        f"told = {answer('explained', ADD)!r} if sys.argv[1] == 'diagnose' else dict(verdict='fails')\n"
+        "json.dump(told, open(sys.argv[sys.argv.index('--json') + 1], 'w'))\n"
+    )
+    monkeypatch.setattr(challenge, "program", lambda: [sys.executable, str(stub)])
+    assert challenge.main(["run", str(made)]) == 1
+    failed = json.loads((made / "answers" / "case-002.diagnose.json").read_text())
+    assert failed["answer"] is None and "no memory" in failed["error"]
+    first = (made / "answers" / "case-001.diagnose.json").read_text()
+
+    stub.write_text(stub.read_text().replace("sys.exit('no memory')", "pass"))
+    assert challenge.main(["score", str(made)]) == 0
+    assert "## No answer: 1" in (made / "score.md").read_text()
+    assert "no longer blind" not in (made / "score.md").read_text()
+    assert challenge.main(["run", str(made)]) == 0  # only what is missing
+    assert (made / "answers" / "case-001.diagnose.json").read_text() == first
+    assert challenge.main(["score", str(made)]) == 0
+    table = (made / "score.md").read_text()
+    assert "1 cases were answered after the truth had been opened" in table
+    assert "| nulls: false alarm of `compare` | 4 of 4 |" in table
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["null-tr-1", "null-qis-1", "null-str-1"])
+def test_the_package_agrees_with_the_generator(case: str, tmp_path: Path) -> None:
+    """Two programs that share nothing make the same sensor. A right model is called wrong once in a hundred."""
+    folder = tmp_path / "out"
+    assert challenge.main(["make", case, "-o", str(folder), "--seed", "4", "--nulls", "4", "--jobs", "1"]) == 0
+    place = folder / "cases" / "case-001"
+    command = [sys.executable, "-m", "spadmnist.cli", "compare", str(place / "sensor.yaml"), str(place)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
