@@ -630,6 +630,10 @@ def compare(
         except ValueError as error:
             raise InputError(f"--tolerance: {error}") from None
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    if output is not None:
+        from . import pages
+
+        pages.check_place(output)
     with _terminal() as progress:
         progress.start("comparing", 100, 0)
         done = [0.0]
@@ -644,13 +648,119 @@ def compare(
         with _writing(json_file):
             disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
     if output is not None:
-        from . import pages
-
         page = pages.comparison(found, output)
         _say(f"Report: {page}")
     click.echo(criticism.table(found))
     if found.verdict != "adequate":
         sys.exit(1)
+
+
+@cli.command(short_help="Which physical effect does a model lack?")
+@click.argument("sensor", type=click.Path(path_type=Path))
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
+)
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Folder for the next sensor.yaml and its maps.",
+)
+@click.option("--max-steps", type=click.IntRange(1, 12), default=4, metavar="N", help="At most so many.  [default: 4]")
+@click.option("--quick", is_flag=True, help="Fewer simulations: a first answer.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
+)
+@_jobs
+@_plugin
+def diagnose(
+    sensor: Path,
+    measurement: Path,
+    json_file: Path | None,
+    output: Path | None,
+    max_steps: int,
+    quick: bool,
+    seed: int,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+) -> None:
+    """Find out which effect the model SENSOR lacks beside MEASUREMENT, add it, and watch the error fall.
+
+    Every registered effect is tried, those of --plugin files too, every listed number at another value, every
+    per-pixel parameter as a map.
+
+    \b
+    spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
+    spadmnist diagnose sensor.yaml lab/2025-03-01 --plugin echo.py --json answer.json
+    """
+    from . import config as configs
+    from . import disk
+    from . import measurement as measurements
+    from .criticism import diagnose as criticism
+    from .criticism import next_sensor
+
+    _load(plugin_files)
+    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
+    if output is not None:
+        with _writing(output):
+            found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, criticism.notes(found)))
+    if json_file is not None:
+        with _writing(json_file):
+            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
+    click.echo(criticism.table(found))
+
+
+@cli.command(short_help="Settle parameters of a model.")
+@click.argument("sensor", type=click.Path(path_type=Path))
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option("--output", "-o", type=click.Path(path_type=Path), metavar="NEXT.yaml", required=True, help="New file.")
+@click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and settle it.")
+@click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a parameter.")
+@click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a map.")
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
+)
+@_jobs
+@_plugin
+def fit(
+    sensor: Path,
+    measurement: Path,
+    output: Path,
+    added: tuple[str, ...],
+    freed: tuple[str, ...],
+    mapped: tuple[str, ...],
+    json_file: Path | None,
+    seed: int,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+) -> None:
+    """Settle parameters of the model SENSOR against MEASUREMENT, with 95 % intervals.
+
+    \b
+    spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml
+    spadmnist fit sensor.yaml lab/2025-03-01 --free dead_time.duration --per-pixel detection.pdp -o next.yaml
+    """
+    from . import config as configs
+    from . import disk
+    from . import measurement as measurements
+    from .criticism import diagnose as criticism
+    from .criticism import next_sensor
+
+    _load(plugin_files)
+    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
+    with _writing(output):
+        found.file = str(next_sensor.write(sensor, output, found.values, criticism.notes(found)))
+    if json_file is not None:
+        with _writing(json_file):
+            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
+    click.echo(criticism.table(found))
 
 
 @cli.command("methods", short_help="List flux reconstructions, or describe one.")

@@ -44,7 +44,10 @@ _EVENTS_AT_ONCE = 4_000_000
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A quantity that the measurement does not know exactly: its fitted value, 95 % interval, and pull in sigmas."""
+    """A quantity that the measurement does not know exactly: its fitted value, 95 % interval, and pull in sigmas.
+
+    stated: its standard deviation as the measurement has it.
+    """
 
     capture: str | None
     name: str
@@ -52,12 +55,14 @@ class Nuisance:
     low: float
     high: float
     pull: float
+    stated: float = 0.0
 
 
 @dataclass(frozen=True)
 class Check:
     """One statistic of one capture. misfit: mean squared standardized residual, 1 being the model's own.
 
+    significant: it lies outside the model's scatter; material: and is larger than the tolerance, so that it fails.
     summary, judgement: what was measured and what the model expects, for pictures; None for checks of totals.
     """
 
@@ -70,6 +75,7 @@ class Check:
     relative: float
     passes: bool = True
     material: bool = False
+    significant: bool = False
     summary: Summary | None = field(default=None, repr=False)
     judgement: Judgement | None = field(default=None, repr=False)
 
@@ -501,7 +507,9 @@ def _light(
     pull = own / math.hypot(common, own_error)
     name = "light"
     nuisances = [
-        Nuisance(None, name, math.exp(best), math.exp(best - 1.96 * spread), math.exp(best + 1.96 * spread), pull)
+        Nuisance(
+            None, name, math.exp(best), math.exp(best - 1.96 * spread), math.exp(best + 1.96 * spread), pull, common
+        )
     ]
     checks = [
         Check(
@@ -521,7 +529,15 @@ def _light(
         z = (log - mean) / math.sqrt(e**2 + 1 / others)
         if capture.light.own_uncertainty > 0:
             nuisances.append(
-                Nuisance(capture.id, name, math.exp(log), math.exp(log - 1.96 * e), math.exp(log + 1.96 * e), z)
+                Nuisance(
+                    capture.id,
+                    name,
+                    math.exp(log),
+                    math.exp(log - 1.96 * e),
+                    math.exp(log + 1.96 * e),
+                    z,
+                    capture.light.own_uncertainty,
+                )
             )
         change = math.expm1((log - mean) * elasticity)
         size = f"{change:+.2%} detections beside the other captures"
@@ -546,7 +562,7 @@ def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
     out = []
     for i, check in enumerate(checks):
         material = i in failing and (tolerance is None or not abs(check.relative) < tolerance)
-        out.append(replace(check, passes=not material, material=material))
+        out.append(replace(check, passes=not material, material=material, significant=i in failing))
     return out
 
 
