@@ -202,8 +202,9 @@ def _standardized(
         return np.asarray(poisson_scores(values, np.maximum(expected, 0.5 / recordings)) / widened)
     if law == "exponential":
         ratio = values / np.maximum(expected, _LEAST)
-        # the mean is known from so many recordings only
-        log_tail = -recordings * np.log1p(np.maximum(ratio, 0.0) / recordings)
+        # the mean is known from so many recordings only. Hardly any power says nothing: of few detections the sum at a
+        # simple fraction of the clock may be exactly 0
+        log_tail = -recordings * np.log1p(np.maximum(ratio, 1e-3) / recordings)
         return _score_of_tail(log_tail)
     z = (values - expected) / np.where(spread > 0, spread, 1.0) / widened
     if scaled:
