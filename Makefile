@@ -27,10 +27,10 @@ demo: $(VENV)/installed  ## set up, and run the main job in seconds: digits, fou
 	@echo "  $(RUN)/python -c \"import spadmnist; print(spadmnist.open('$(DEMO)/quick')['2560 mlux', 'train'].tr[0])\""
 
 test: $(VENV)/installed lint  ## set up, and run the tests (a few minutes)
-	$(RUN)/python -m pytest -m "not slow" -q
+	$(RUN)/python -m pytest -m "not slow" -q -n 2 --dist loadfile
 
 verify: $(VENV)/installed  ## the slow statistical and fault tests
-	$(RUN)/python -m pytest -m slow -q
+	$(RUN)/python -m pytest -m slow -q -n 2 --dist loadfile
 
 lint: $(VENV)/installed
 	$(RUN)/ruff check spadmnist scripts tests

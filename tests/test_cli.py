@@ -254,7 +254,8 @@ def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
         "reconstruct": [made[1], "--method", "countz"],
         "effects": ["dead_tme"],
         "methods": ["countz"],
-        "simulate": ["/nonexistent/nothing", made[1], "-o", "/nonexistent/out"],
+        **dict.fromkeys(("simulate", "fit"), ["/nonexistent/nothing", made[1], "-o", "/nonexistent/out"]),
+        **dict.fromkeys(("compare", "diagnose"), ["/nonexistent/nothing", made[1]]),
     }.get(verb, ["/nonexistent/nothing"])
     result = run(verb, *arguments)
     assert_sentence(result)
