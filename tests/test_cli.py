@@ -254,8 +254,8 @@ def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
         "reconstruct": [made[1], "--method", "countz"],
         "effects": ["dead_tme"],
         "methods": ["countz"],
-        **dict.fromkeys(("simulate", "fit"), ["/nonexistent/nothing", made[1], "-o", "/nonexistent/out"]),
-        **dict.fromkeys(("compare", "diagnose"), ["/nonexistent/nothing", made[1]]),
+        **{key: ["/nonexistent/nothing", made[1], "-o", "/nonexistent/out"] for key in ("simulate", "fit")},
+        **{key: ["/nonexistent/nothing", made[1]] for key in ("compare", "diagnose")},
     }.get(verb, ["/nonexistent/nothing"])
     result = run(verb, *arguments)
     assert_sentence(result)

@@ -150,7 +150,7 @@ def test_a_wrong_model_fails_at_the_right_place(
     assert all(c.where and c.size and not c.passes and c.material for c in found.failing)
     data = json.loads(criticism.canonical(found))
     assert data["format"] == "spadmnist-comparison/1" and data["verdict"] == "fails"
-    assert "fails" in criticism.table(found) and max(map(len, criticism.table(found).splitlines())) <= 110
+    assert "fails" in criticism.table(found) and max(map(len, criticism.table(found).splitlines())) <= 100
 
 
 def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:

@@ -588,17 +588,19 @@ def table(comparison: Comparison) -> str:
         lines.append(f"The model is adequate: none of {len(comparison.checks)} checks fails.")
         closest = sorted(comparison.checks, key=lambda c: c.p_value)[:3]
         near = ", ".join(f"{c.statistic} of {c.capture or 'all'} (p = {c.p_value:.2g})" for c in closest)
-        lines.append(f"Nearest to failing: {near}.")
+        lines += textwrap.wrap(f"Nearest to failing: {near}.", 100)
     lines.append("")
-    lines.append(
+    about = (
         f"misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
-        f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture;"
+        f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture; a right model is "
+        f"called wrong in {comparison.false_alarm_rate:.0%} of comparisons."
     )
-    lines.append(f"a right model is called wrong in {comparison.false_alarm_rate:.0%} of comparisons.")
+    lines += textwrap.wrap(about, 100)
     for n in comparison.nuisances:
         where = n.capture or "all lit captures"
         interval = f"95 %: {n.low:.4f} to {n.high:.4f}"
-        lines.append(f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}")
+        told = f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}"
+        lines += textwrap.wrap(told, 100)
     return "\n".join(lines)
 
 

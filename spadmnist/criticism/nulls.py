@@ -81,6 +81,8 @@ class Null:
             return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
         square = float(np.mean(z**2))
         mean, variance = max(float(self.own.mean()), 0.05), float(self.own.var(ddof=1))
+        # a variance of so many recordings may be too small by about so much; then rare values would look too rare
+        variance *= 1 + math.sqrt(5 / self.recordings)
         shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
         p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
         worst = int(np.argmax(np.abs(z)))

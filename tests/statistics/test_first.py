@@ -1,0 +1,77 @@
+"""First arrivals: against a literal version, their law, and frames that are not what they should be."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import partial
+
+import null_laws
+import numpy as np
+import pytest
+from simple_sensor import FRAME, many, reduced, sigmas, stamped, str_of
+
+from spadmnist import recording as recordings
+from spadmnist.recording import Recording
+from spadmnist.statistics.first import FirstArrivals
+
+STEADY = partial(stamped, shape=(500, 8, 8), share=0.3, tick=1e-9)
+
+
+@pytest.mark.parametrize(("share", "tick"), [(0.3, 1e-9), (0.97, 1e-10), (0.02, 1e-8), (0.3, 1e-12), (0.3, 5e-7)])
+def test_a_small_recording(share: float, tick: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = stamped(3, (203, 5, 7), share, tick)
+    none = round(FRAME / tick)
+    stamps = np.asarray(recording.frames[:]).reshape(203, 35).astype(np.int64)  # type: ignore[index]
+    coarse = np.rint(np.linspace(0, none, 41))
+    edges = np.unique([*np.rint(np.linspace(0, coarse[1], 9)), *coarse])
+    counts = np.zeros((3, len(edges) - 1))
+    for before, now in itertools.pairwise(stamps):
+        for a, b in zip(before, now, strict=True):
+            if b < none:
+                kind = 0 if a == none else 2 if a >= round(0.9 * none) else 1
+                counts[kind, np.searchsorted(edges, b, side="right") - 1] += 1
+    summary = reduced(FirstArrivals, recording)
+    assert summary.values.tolist() == counts.ravel().tolist()
+    if tick == 1e-9:
+        assert len(summary.values) == 141
+        assert summary.where(46) == "9.75 to 10 us after the start of the frame, after an empty frame"
+        assert summary.where(47) == "0 to 31 ns after the start of the frame, after a frame with an early detection"
+        assert summary.where(140).endswith("after a frame with a late one")
+        assert math.isclose(summary.size(0, 12.0, 10.0)[1], 2 / recording.totals.sum())
+    monkeypatch.setattr(recordings, "_CHUNK", 1)
+    again = Recording(**{**recording.__dict__, "_kept": {}})
+    assert np.array_equal(reduced(FirstArrivals, again).values, summary.values)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.97])
+def test_law_of_steady_light(share: float) -> None:
+    null_laws.poisson(many(FirstArrivals, partial(stamped, shape=(500, 8, 8), share=share, tick=1e-9), 120), 0.9)
+
+
+def test_the_law_fails_where_detections_are_copied() -> None:
+    def copied(seed: int) -> Recording:
+        stamps = np.asarray(STEADY(seed).frames[:]).copy()  # type: ignore[index]
+        stamps[:, 4:] = stamps[:, :4]
+        return str_of(stamps, 1e-9)
+
+    with pytest.raises(AssertionError):
+        null_laws.poisson(many(FirstArrivals, copied, 60), 0.9)
+
+
+def test_a_short_gate_and_what_a_frame_leaves_to_the_next_are_seen() -> None:
+    stamps = np.asarray(STEADY(1).frames[:])  # type: ignore[index]
+    late = np.where(stamps >= 9000, 10_000, stamps)  # nothing in the last tenth
+    found = sigmas(FirstArrivals, str_of(late, 1e-9), STEADY).reshape(3, 47)
+    assert found[0, -4:].max() < -8 and found[1, -4:].max() < -4 and found[0, :-4].min() > -5
+    # blind for 200 ns after a detection within the last 100 ns of the frame before
+    held = stamps.copy()
+    held[1:][(stamps[:-1] >= 9900) & (stamps[:-1] < 10_000) & (stamps[1:] < 200)] = 10_000
+    found = sigmas(FirstArrivals, str_of(held, 1e-9), STEADY).reshape(3, 47)
+    assert np.abs(found[:2]).max() < 5
+    # afterpulses of the frame before: 5 % come within 200 ns
+    early = np.where(np.random.default_rng(1).random(stamps[1:].shape) < 0.05 * (stamps[:-1] < 10_000), 150, 10_000)
+    pulses = stamps.copy()
+    pulses[1:] = np.minimum(stamps[1:], early)
+    found = sigmas(FirstArrivals, str_of(pulses, 1e-9), STEADY).reshape(3, 47)
+    assert found[1, 4] > 10 and np.abs(found[0]).max() < 5

@@ -1,0 +1,132 @@
+"""Intervals of a pixel: against literal versions, their laws, and what they are made to see."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import null_laws
+import numpy as np
+import pytest
+from simple_sensor import grid, live, many, one_of_each, reduced, sigmas, tr, tr_of
+
+from spadmnist.recording import Recording
+from spadmnist.statistics.intervals import EdgeIntervals, Intervals, Rescaled, RescaledLag
+
+ALL = (EdgeIntervals, Intervals, Rescaled, RescaledLag)
+
+
+def ticks_of(recording: Recording) -> tuple[list[np.ndarray], float]:
+    """(the ticks of each pixel, the tick); where there is none it is 10 ps."""
+    assert recording.events is not None
+    tick = recording.tick or 1e-11
+    rows = [recording.events.row(p) for p in range(recording.pixels)]
+    return [np.rint(row / tick).astype(np.int64) for row in rows], tick
+
+
+@pytest.mark.parametrize("kind", ["tr", "tr without ticks"])
+def test_intervals_of_a_small_recording(kind: str) -> None:
+    recording = one_of_each()[kind]
+    rows, tick = ticks_of(recording)
+    gaps = np.concatenate([np.diff(row) for row in rows])
+
+    steps = np.rint((40e-9 + 0.5e-9 * np.arange(61)) / tick)
+    summary = reduced(EdgeIntervals, recording)
+    wanted = [(gaps < steps[0]).sum(), *np.histogram(gaps, steps - 0.5)[0]]
+    assert summary.values.tolist() == wanted and summary.values.sum() > 0
+    assert summary.where(0) == "intervals below 40 ns" and summary.where(60) == "intervals of 69.5 to 70 ns"
+
+    edges = np.unique(np.rint(np.geomspace(70e-9, 3e-3, 47) / tick))
+    summary = reduced(Intervals, recording)
+    assert summary.values.tolist() == np.histogram(gaps, [*(edges - 0.5), np.inf])[0].tolist()
+    assert summary.where(0).startswith("intervals of 70 to 88") and summary.where(46) == "intervals beyond 3 ms"
+    assert summary.size(3, 12.0, 10.0)[1] == 2 / len(np.concatenate(rows))
+
+    # each pixel by its own rate
+    counts, sums, products = np.zeros(20), np.zeros(6), np.zeros(6)
+    for row in rows:
+        gap = np.diff(row) - 50e-9 / tick
+        if len(gap) >= 16:
+            u = 1 - np.exp(-np.maximum(gap, 0) / gap.mean())
+            counts += np.histogram(u, 20, (0, 1))[0]
+            for k, lag in enumerate((1, 2, 3, 5, 10, 20)):
+                if len(u) > lag:
+                    sums[k] += ((u[lag:] - 0.5) * (u[:-lag] - 0.5)).sum()
+                    products[k] += len(u) - lag
+    assert reduced(Rescaled, recording).values.tolist() == counts.tolist()
+    summary = reduced(RescaledLag, recording)
+    np.testing.assert_allclose(summary.values, 12 * sums / np.sqrt(products), rtol=1e-9)
+    text, difference = summary.size(0, float(summary.values[0]), 0.0)
+    assert math.isclose(difference, 12 * sums[0] / products[0]) and text.startswith("correlation ")
+
+
+def test_cells_belong_to_the_conditions() -> None:
+    """Not finer than a tick, nothing below 0, and there for recordings without a detection."""
+    for tick, dead_time, cells in ((1e-9, 50e-9, 31), (1e-8, 50e-9, 4), (1e-10, 0.0, 40), (1e-10, 4e-9, 48)):
+        made = [tr(1, grid(1, 4), rate, 1e-3, dead_time, tick=tick) for rate in (0.0, 1e5)]
+        for recording in made:
+            assert len(reduced(EdgeIntervals, recording).values) == cells
+        assert len({len(reduced(Intervals, r).values) for r in made}) == 1
+        assert EdgeIntervals().reduce(made[0]).values.sum() == 0  # type: ignore[union-attr]
+        assert reduced(Rescaled, made[0]).values.tolist() == [0.0] * 20
+        assert RescaledLag().reduce(made[0]) is None
+    assert reduced(EdgeIntervals, tr(1, grid(1, 4), 1e5, 1e-3, 0.0)).where(0) == "intervals of 0 to 500 ps"
+
+
+BRIGHT = partial(tr, layout=grid(4, 6), rates=2e6, exposure=1e-3, dead_time=50e-9)
+DIM = partial(tr, layout=grid(4, 6), rates=2e4, exposure=2e-2, dead_time=50e-9)
+MIXED = partial(tr, layout=grid(4, 6), rates=np.geomspace(2e2, 2e5, 24), exposure=2e-2, dead_time=50e-9)
+
+
+@pytest.mark.parametrize("steady", [BRIGHT, DIM, MIXED], ids=["bright", "dim", "mixed"])
+def test_laws_of_steady_light(steady: partial[Recording]) -> None:
+    for statistic, least in ((EdgeIntervals, 0.8), (Intervals, 0.6), (Rescaled, 0.9)):
+        null_laws.poisson(many(statistic, steady, 120), least)
+    null_laws.normal(many(RescaledLag, steady, 120), spread=None)
+    # the rate is fitted, so that u is not quite even where a pixel has few intervals; here it is, to 1 %
+    share = many(Rescaled, steady, 60).sum(axis=0)
+    assert np.abs(share / share.mean() - 1).max() < 5 / math.sqrt(share.mean()) + 0.02
+
+
+def test_laws_fail_where_detections_come_in_clumps() -> None:
+    def clumped(seed: int) -> Recording:
+        rng = np.random.default_rng(seed)
+        rows = []
+        for _ in range(24):
+            starts = np.repeat(rng.random(rng.poisson(20)) * 1.9e-2, 20)
+            rows.append(live(np.sort(starts + rng.random(len(starts)) * 2e-5), 50e-9))
+        return tr_of(rows, grid(4, 6), 2e-2, 1e-10, 50e-9)
+
+    with pytest.raises(AssertionError):
+        null_laws.poisson(many(Intervals, clumped, 60))
+
+
+def with_afterpulses(seed: int, share: float = 0.02, lifetime: float = 30e-9) -> Recording:
+    rng = np.random.default_rng(seed)
+    rows = []
+    for _ in range(24):
+        times = rng.random(rng.poisson(400)) * 2e-2
+        late = times[rng.random(len(times)) < share]
+        times = np.sort(np.concatenate([times, late + 50e-9 + rng.exponential(lifetime, len(late))]))
+        rows.append(live(times[times < 2e-2], 50e-9))
+    return tr_of(rows, grid(4, 6), 2e-2, 1e-10, 50e-9)
+
+
+def test_afterpulses_and_another_dead_time_are_seen() -> None:
+    found = {s: sigmas(s, with_afterpulses(1), DIM) for s in (EdgeIntervals, Intervals, Rescaled)}
+    # 9600 detections with 192 afterpulses, of which half come within 20 ns; and none by chance
+    assert found[EdgeIntervals][21:].sum() / math.sqrt(40) > 9
+    assert found[Intervals][0] > 6 and np.abs(found[Intervals][10:]).max() < 5
+    assert found[Rescaled][0] > 5
+    longer = tr(1, grid(4, 6), 2e6, 1e-3, 52e-9)
+    found = {s: sigmas(s, Recording(**{**longer.__dict__, "dead_time": 50e-9, "_kept": {}}), BRIGHT) for s in ALL[:2]}
+    assert found[EdgeIntervals][21:25].max() < -9 and np.abs(found[EdgeIntervals][26:]).max() < 5
+    assert np.abs(found[Intervals]).max() < 5
+
+
+def test_a_pixel_that_blinks_has_intervals_alike() -> None:
+    def blinking(t: np.ndarray) -> np.ndarray:
+        return np.where(np.floor(t / 1e-3) % 2 == 0, 1.0, 0.5)
+
+    changed = tr(1, grid(4, 6), 2.7e4, 2e-2, 50e-9, change=blinking)
+    assert sigmas(RescaledLag, changed, DIM)[:3].min() > 5
