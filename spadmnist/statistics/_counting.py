@@ -7,16 +7,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from .. import units
 from ..kernels import inline, jit
 from ..recording import Recording
+from ._scores import poisson_score, shares
 
 _FREE_RUNNING = 1e-11  # s: the tick that stands in where stamps are seconds
 _OCTAVE = 16  # entries of a guide for each octave
-_MANY = 1e5  # pairs
 
 
 def whole_ticks(recording: Recording) -> tuple[np.ndarray, float]:
@@ -124,21 +125,43 @@ def sort_ticks(raw, count, low, span, out, first, spare, heads):
             break
 
 
-def beyond_chance(
-    pairs: np.ndarray, chance: np.ndarray, variance: np.ndarray, power: float = 0.5
-) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of pairs as counts with a Poisson law that hardly depend on the light level, and (pairs per count).
+class Surplus(NamedTuple):
+    """Numbers of pairs, cell by cell; how many of them chance makes of the pixels' totals, and its variance."""
 
-    chance: pairs that the pixels' totals make by chance; variance: of the number of pairs, given those totals.
-    Few pairs are what they are. Of many, the part that chance explains is not known better than by the totals, and
-    wanders with them; so it is kept small: m = variance / (1 + variance / 1e5)^power counts stand for it, and what is
-    beyond chance is added in the same measure, sqrt(m / variance), which makes the variance of the whole m again.
-    """
-    pairs, chance = np.asarray(pairs, np.float64), np.asarray(chance, np.float64)
-    variance = np.asarray(variance, np.float64)
-    counts = variance / (1 + variance / _MANY) ** power
-    measure = np.sqrt((1 + variance / _MANY) ** -power)
-    return counts + (pairs - chance) * measure, 1 / measure
+    number: np.ndarray
+    chance: np.ndarray
+    variance: np.ndarray
+
+    def scores(self, totals: np.ndarray) -> np.ndarray:
+        """(cells,) normal scores of what is beyond chance, given the pixels' totals.
+
+        Neither the light level nor a map of the pixels changes them, and they have the same law whether many pairs
+        are expected or none: see `_scores`.
+        """
+        # a little above 0, for where no pairs are possible
+        mean = np.maximum(self.variance, 1e-6)
+        count = np.maximum(self.number - self.chance + mean, 0.0)
+        # few are whole numbers, but for a little that chance and its variance differ by
+        count = np.where(mean < 100.0, np.rint(count), count)
+        share = shares(np.append(totals, len(mean)), len(mean))
+        return poisson_score(count, mean, share)
+
+    def beyond(self, cell: int, score: float) -> float:
+        """The pairs beyond chance that this score of a cell means."""
+        mean = max(float(self.variance[cell]), 1e-6)
+        low, high = 0.0, 10.0 * (mean + score * score + 10.0)
+        for _ in range(100):
+            middle = (low + high) / 2
+            if _wilson_hilferty(middle, mean) < score:
+                low = middle
+            else:
+                high = middle
+        return high - mean
+
+
+def _wilson_hilferty(count: float, mean: float) -> float:
+    a = count + 0.5
+    return float(3.0 * math.sqrt(a) * (1.0 - 1.0 / (9.0 * a) - math.cbrt(mean / a)))
 
 
 def per_cent(share: float) -> str:
@@ -156,16 +179,13 @@ def of_detections(total: float) -> Callable[[int, float, float], tuple[str, floa
     return size
 
 
-def of_pairs(
-    values: np.ndarray, pairs: np.ndarray, chance: np.ndarray, each: np.ndarray, total: float
-) -> Callable[[int, float, float], tuple[str, float]]:
-    """The `size` of cells made by `beyond_chance`: values and pairs per count `each`."""
+def of_pairs(pairs: Surplus, total: float) -> Callable[[int, float, float], tuple[str, float]]:
+    """The `size` of cells that are scores of pairs, as a share of the `total` detections."""
 
     def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-        number = max(float(total), 1.0)
-        found = float(pairs[cell] - chance[cell] + (measured - values[cell]) * each[cell]) / number
-        share = float((measured - expected) * each[cell]) / number
-        return f"{per_cent(found)} of detections beyond chance, {per_cent(found - share)} expected", share
+        found = float(pairs.number[cell] - pairs.chance[cell]) / max(float(total), 1.0)
+        usual = pairs.beyond(cell, expected) / max(float(total), 1.0)
+        return f"{per_cent(found)} of detections beyond chance, {per_cent(usual)} expected", float(found - usual)
 
     return size
 

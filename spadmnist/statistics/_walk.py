@@ -24,6 +24,7 @@ _LATER = 30e-9  # s: up to here one neighbour is asked to fire after the other
 _GAPS = (1e-9, 10e-9)  # s
 _PER_DECADE = 10
 _AT_ONCE = 65536  # events that are sorted together: they fit into the cache
+_FEW = 32  # stamps of a pixel in 100 ns that are looked at one by one
 _NEVER = -(1 << 62)
 
 
@@ -332,19 +333,44 @@ def _near_pairs(
             e = hits[h]
             there = around + step[e]
             k = passed[there]
-            oldest = offsets[row_of[there]]
-            while k >= oldest:
+            oldest = max(offsets[row_of[there]], k - _FEW)
+            while k >= oldest and now - np.int64(stamps[k]) < longest:
                 lag = now - np.int64(stamps[k])
-                if lag >= longest:
-                    break
                 b = 0
                 for j in range(lags.size - 1):
                     b += lag >= lags[j]
                 found[kind[e], b] += 1
                 later[kind[e]] += second[e] & (lag > 0) & (lag < latest)
                 k -= 1
+            if k < oldest and k >= offsets[row_of[there]]:
+                _many_before(stamps, offsets[row_of[there]], k, now, lags, found[kind[e]])
+                if second[e]:
+                    before = _since(stamps, offsets[row_of[there]], k + 1, now - latest)
+                    later[kind[e]] += _since(stamps, before, k + 1, now - 1) - before
         recent[here] = now
         passed[here] += 1
+
+
+@jit
+def _since(stamps, begin, end, time):
+    """The first of the stamps from `begin` to `end` that is later than `time`."""
+    while begin < end:
+        middle = (begin + end) // 2
+        if np.int64(stamps[middle]) > time:
+            end = middle
+        else:
+            begin = middle + 1
+    return begin
+
+
+@jit
+def _many_before(stamps, begin, k, now, lags, out):
+    """Add the stamps from `begin` to `k` to the bins of their lags, however many there are."""
+    until = k + 1
+    for b in range(lags.size):
+        first = _since(stamps, begin, until, now - lags[b])
+        out[b] += until - first
+        until = first
 
 
 @jit

@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from ..kernels import jit
 from . import Recording, Statistic, Summary
-from ._counting import beyond_chance, exposure_in, of_pairs, span, whole_ticks
+from ._counting import Surplus, exposure_in, of_pairs, span, whole_ticks
 from ._frames import as_words, at_ends, count_ones, moments
 
 _SHORTEST, _LONGEST = 10e-9, 10e-3  # s
@@ -26,24 +27,24 @@ class Autocorrelation(Statistic):
     for lags of 4 to 8 boxes of time, products of the numbers of detections in boxes 4, 5, 6 and 7 apart, and then in
     boxes twice as long. Frames: products of a pixel's frames 1, 2, 3, 5, 10, 20, 50 and 100 apart. Pooled over the
     pixels.
-    Counts of pairs: given the pixels' totals, their variance is the number that chance makes (of frames: (1 - p)^2
-    times it, p the share of frames with a detection), and with few of them their law is Poisson's; many are measured
-    from what chance makes of the totals, so that neither the light level nor a map of the pixels is seen here. Slow
-    traps, source noise, flicker and blinking show, and in frames what one leaves to the next.
+    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
+    variance is the number by chance (of frames: (1 - p)^2 times it, p the share of frames with a detection), and their
+    law Poisson's. So neither the light level nor a map of the pixels is seen here. Slow traps, source noise, flicker
+    and blinking show, and in frames what one leaves to the next.
     Source: Schätzel, Quantum Opt. 2 (1990) 287, for the correlator.
     """
 
     modalities = ("tr", "str", "qis", "counts")
-    unit = "pairs"
+    unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        """Pairs beyond chance, as counts (see `beyond_chance`)."""
+        """Scores of pairs beyond chance."""
         return self._stamps(recording) if recording.events is not None else self._frames(recording)
 
     def _stamps(self, recording: Recording) -> Summary | None:
         stamps, tick = whole_ticks(recording)
         end = exposure_in(recording, tick)
-        box = max(1, math.ceil(max(recording.dead_time, _SHORTEST) / tick / 3))
+        box = max(1, math.ceil(max(recording.dead_time, _SHORTEST) / tick / 3 - 1e-6))
         longest = min(round(_LONGEST / tick), end // 4)
         levels = int(math.log2(longest / box)) - 2 if longest >= 8 * box else 0
         if levels < 1:
@@ -54,7 +55,6 @@ class Autocorrelation(Statistic):
         pairs = np.zeros((levels, _PER_OCTAVE), np.int64)
         chance, variance = np.zeros(pairs.shape), np.zeros(pairs.shape)
         _correlate(stamps, recording.events.offsets, 1.0 / box, boxes, pairs, chance, variance)
-        total = float(recording.totals.sum())
         lags = (np.arange(4, 8) * box * tick) * 2.0 ** np.arange(levels)[:, None]
         width = (lags / np.arange(4, 8)).ravel()
         lags = lags.ravel()
@@ -62,7 +62,7 @@ class Autocorrelation(Statistic):
         def where(cell: int) -> str:
             return f"the same pixel, {span(lags[cell], lags[cell] + width[cell])} later"
 
-        return _summary(pairs.ravel(), chance.ravel(), variance.ravel(), total, where, lags, "lag (s)")
+        return _summary(recording, Surplus(pairs.ravel(), chance.ravel(), variance.ravel()), where, lags, "lag (s)")
 
     def _frames(self, recording: Recording) -> Summary | None:
         frames = recording.n_frames
@@ -75,20 +75,24 @@ class Autocorrelation(Statistic):
         first, last = at_ends(recording, mean, int(lags[-1]))
         lone = np.cumsum(first + last)[lags - 1]  # frames at the ends have one partner instead of two
         chance = 2 * (n @ mean) - lone - (frames - lags) * (mean @ mean + variance.sum() / frames)
-        spread = (variance @ variance) * (frames - lags)
+        # squared variances, which few detections, or few frames without, overestimate by one in their number
+        squared = variance**2 * np.maximum(n - 1, 0) / np.maximum(n, 1)
+        if recording.modality != "counts":
+            squared *= np.maximum(frames - n - 1, 0) / np.maximum(frames - n, 1)
+        spread = squared.sum() * (frames - lags)
 
         def where(cell: int) -> str:
             return "the same pixel, the next frame" if lags[cell] == 1 else f"the same pixel, {lags[cell]} frames later"
 
-        return _summary(pairs, chance, spread, n.sum(), where, lags.astype(np.float64), "lag (frames)")
+        return _summary(recording, Surplus(pairs, chance, spread), where, lags.astype(np.float64), "lag (frames)")
 
 
 def _summary(
-    pairs: np.ndarray, chance: np.ndarray, variance: np.ndarray, total: float, where, axis: np.ndarray, label: str
+    recording: Recording, pairs: Surplus, where: Callable[[int], str], axis: np.ndarray, label: str
 ) -> Summary:
-    values, each = beyond_chance(pairs, chance, variance)
-    size = of_pairs(values, pairs, chance, each, total)
-    return Summary(values, "poisson", where, size, axis=axis, label=label, log=True)
+    totals = recording.totals
+    size = of_pairs(pairs, float(totals.sum()))
+    return Summary(pairs.scores(totals), "normal", where, size, axis=axis, label=label, log=True)
 
 
 @jit
@@ -110,7 +114,8 @@ def _correlate(stamps, offsets, per_box, boxes, pairs, chance, variance):
         n = 0
         total = 0
         for i in range(offsets[row], offsets[row + 1]):
-            b = np.int64(np.float64(stamps[i]) * per_box)
+            # half a tick off the edges, so that rounding is of no matter
+            b = np.int64((np.float64(stamps[i]) + 0.5) * per_box)
             if b >= boxes:
                 break
             total += 1

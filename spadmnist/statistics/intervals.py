@@ -163,7 +163,7 @@ class RescaledLag(Statistic):
             return "an interval and the next" if cell == 0 else f"intervals {_LAGS[cell]} apart"
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            found, usual = measured * spread[cell], expected * spread[cell]
+            found, usual = float(measured * spread[cell]), float(expected * spread[cell])
             return f"correlation {found:+.3g}, {usual:+.3g} expected", found - usual
 
         lags = np.array(_LAGS, np.float64)

@@ -12,9 +12,11 @@ import numpy as np
 
 from ..kernels import jit
 from . import Recording, Statistic, Summary
-from ._counting import beyond_chance, exposure_in, of_pairs, per_cent, span, tick_of
+from ._counting import Surplus, exposure_in, of_pairs, per_cent, span, tick_of
 from ._frames import at_ends, frame_sums, moments, ones_of, some_frames
 from ._walk import Near, lag_edges, latest, near, walk
+
+_PARTS = 64  # of a frame, in which the times of first stamps are counted
 
 
 class Neighbours(Statistic):
@@ -24,28 +26,28 @@ class Neighbours(Statistic):
     the nearest, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart, whichever is the first, and
     for each direction one cell for the second one being later. Frames: the same frame, and the next. First stamps of
     frames (STR): both.
-    Counts of pairs: given the pixels' totals, their variance is the number that chance makes (of frames: (1 - p)
-    (1 - p') times it), and with few of them their law is Poisson's; many are measured from what chance makes of the
-    totals. Light that spreads from pixel to pixel shows here and not in `far_pairs`: an excess in the dark, too, and
-    per detection the same at every light level.
+    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
+    variance is the number by chance (of frames: (1 - p)(1 - p') times it, p the share of frames with a detection), and
+    their law Poisson's. Light that spreads from pixel to pixel shows here and not in `far_pairs`: an excess, per
+    detection the same at every light level and in the dark.
     Source: Ingargiola et al., bioRxiv 207118 (2017), for coincidences by distance.
     """
 
     modalities = ("tr", "str", "qis", "counts")
-    unit = "pairs"
+    unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        """Pairs beyond chance, as counts (see `beyond_chance`)."""
+        """Scores of pairs beyond chance."""
         near_by = near(recording.layout)
         if not near_by.names:
             return None
         parts = [_near_stamps(recording, near_by)] if recording.modality == "tr" else [_near_frames(recording, near_by)]
         if recording.modality == "str":
             parts.append(_near_first(recording, near_by))
-        where, pairs, chance, variance = zip(*(row for part in parts for row in part), strict=True)
-        values, each = beyond_chance(np.array(pairs), np.array(chance), np.array(variance))
-        size = of_pairs(values, np.array(pairs), np.array(chance), each, float(recording.totals.sum()))
-        return Summary(values, "poisson", lambda cell: where[cell], size)
+        rows = [row for part in parts for row in part]
+        pairs = Surplus(*np.array([row[1:] for row in rows]).T)
+        size = of_pairs(pairs, float(recording.totals.sum()))
+        return Summary(pairs.scores(recording.totals), "normal", lambda cell: rows[cell][0], size)
 
 
 _Row = tuple[str, float, float, float]  # where, pairs, of these by chance, their variance
@@ -54,19 +56,20 @@ _Row = tuple[str, float, float, float]  # where, pairs, of these by chance, thei
 class FarPairs(Statistic):
     """Detections of different pixels anywhere on the array that come together: what the whole array has in common.
 
-    All pairs of pixels more than 3 pitches apart. Time stamps: less than 1, 3, 10, 30 and 100 ns apart; frames: the
-    same frame, and the next (where only the nearest 3 pitches are left out of the first).
-    Counts of pairs: given the pixels' totals, their variance is the number that chance makes (of frames: (1 - p)
-    (1 - p') times it), and their law Poisson's; from frames they are found as the variance of the array's sums less
-    that of each pixel. A source that fluctuates, flickers or drifts shows here as it does between neighbours; so do
-    bursts over the array, and a readout that loses detections when many come (too few).
+    All pairs of pixels more than 3 pitches apart. Time stamps: up to 1, 3, 10, 30 and 100 ns apart; frames: the same
+    frame, and the next (there of all pairs of different pixels).
+    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
+    variance is the number by chance (of frames: (1 - p)(1 - p') times it), and their law Poisson's; from frames they
+    are found as the variance of the array's sums less that of each pixel. A source that fluctuates, flickers or drifts
+    shows here as it does between neighbours; so do bursts over the array, and a readout that loses detections when
+    many come (too few).
     """
 
     modalities = ("tr", "str", "qis", "counts")
-    unit = "pairs"
+    unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        """Pairs beyond chance, as counts (see `beyond_chance`)."""
+        """Scores of pairs beyond chance."""
         near_by = near(recording.layout)
         if recording.pixels * (recording.pixels - 1) // 2 == near_by.number:
             return None
@@ -76,26 +79,25 @@ class FarPairs(Statistic):
             tick = tick_of(recording)
             edges = lag_edges(tick)
             counted = walk(recording)
-            pairs = counted.pairs - counted.same - counted.near.sum(axis=0)
-            chance = variance = far * _lags_in(edges) / exposure_in(recording, tick)
+            chance = far * _lags_in(edges) / exposure_in(recording, tick)
+            pairs = Surplus(counted.pairs - counted.same - counted.near.sum(axis=0), chance, chance)
             seconds = np.concatenate([[0.0], edges * tick])
             names = [f"pixels more than 3 pitches apart, {span(a, b)}" for a, b in itertools.pairwise(seconds)]
         else:
-            pairs, chance, variance = _far_frames(recording, near_by, far)
+            pairs = _far_frames(recording, near_by, far)
             names = ["pixels more than 3 pitches apart, the same frame", "different pixels, the next frame"]
-        values, each = beyond_chance(pairs, chance, variance, power=1.0)
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            part = max(float(chance[cell]), 1.0)
-            found = float(pairs[cell] - chance[cell] + (measured - values[cell]) * each[cell]) / part
-            usual = found - float((measured - expected) * each[cell]) / part
+            part = max(float(pairs.chance[cell]), 1.0)
+            found = float(pairs.number[cell] - pairs.chance[cell]) / part
+            usual = pairs.beyond(cell, float(expected)) / part
             rate = math.sqrt(abs(found - usual))
             text = f"coincidences {_signed(found)} beside chance, {_signed(usual)} expected"
-            if found > usual:
+            if 0 < found - usual < 1:
                 text += f"; as of a light that fluctuates by {per_cent(rate)}"
             return text, math.copysign(rate, found - usual)
 
-        return Summary(values, "poisson", lambda cell: names[cell], size)
+        return Summary(pairs.scores(recording.totals), "normal", lambda cell: names[cell], size)
 
 
 def _signed(share: float) -> str:
@@ -159,7 +161,7 @@ def _near_frames(recording: Recording, near_by: Near) -> list[_Row]:
     return rows
 
 
-def _far_frames(recording: Recording, near_by: Near, far: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _far_frames(recording: Recording, near_by: Near, far: float) -> Surplus:
     frames = recording.n_frames
     sums = frame_sums(recording).astype(np.float64)
     n, squares, variance = moments(recording)
@@ -173,7 +175,7 @@ def _far_frames(recording: Recording, near_by: Near, far: float) -> tuple[np.nda
     chance = np.array([far / frames, of_all - of_own])
     spread = variance.sum() ** 2 - variance @ variance
     far_spread = (spread / 2 - near_by.sums(variance, variance).sum()) * frames
-    return pairs, chance, np.maximum([far_spread, spread * (frames - 1)], 0.0)
+    return Surplus(pairs, chance, np.maximum([far_spread, spread * (frames - 1)], 0.0))
 
 
 def _near_common(recording: Recording, near_by: Near) -> tuple[np.ndarray, int]:
@@ -287,20 +289,35 @@ def _meet(a, b, i, j, count, shift):
 
 
 def _near_first(recording: Recording, near_by: Near) -> list[_Row]:
-    """Pairs of first stamps of the same frame by lag: counts as they are, for they are few."""
+    """Pairs of first stamps of the same frame by lag."""
     tick = tick_of(recording)
     edges = lag_edges(tick)
-    pairs = np.zeros((len(near_by.names), edges.size), np.int64)
+    number = np.zeros((len(near_by.names), edges.size), np.int64)
+    times = np.zeros(_PARTS, np.int64)
     for _, part in recording.chunks():
         values = np.ascontiguousarray(part.reshape(len(part), -1))
+        _when(values, recording.none, times)
         for kind, first, second in near_by.pairs:
-            _close(values, recording.none, first, second, edges, pairs[kind])
+            _close(values, recording.none, first, second, edges, number[kind])
+    n = recording.totals.astype(np.float64)
+    # by chance: both in the same frame, and so near if each comes at any time of those at which detections do
+    density = times / max(1, times.sum())
+    both = near_by.sums(n, n) / recording.n_frames * (density @ density) * _PARTS / recording.none
     seconds = np.concatenate([[0.0], edges * tick])
     return [
-        (f"{name}, {span(seconds[b], seconds[b + 1])}", float(pairs[k, b]), 0.0, 0.0)
+        (f"{name}, {span(seconds[b], seconds[b + 1])}", float(number[k, b]), both[k] * lags, both[k] * lags)
         for k, name in enumerate(near_by.names)
-        for b in range(edges.size)
+        for b, lags in enumerate(_lags_in(edges))
     ]
+
+
+@jit
+def _when(stamps, none, times):
+    per_part = times.size / none
+    for f in range(stamps.shape[0]):
+        for p in range(stamps.shape[1]):
+            if stamps[f, p] < none:
+                times[min(np.int64(stamps[f, p] * per_part), times.size - 1)] += 1
 
 
 @jit
