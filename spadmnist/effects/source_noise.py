@@ -68,8 +68,8 @@ def levels(
                     before[count] = power[up]
                     count += 1
                     up += -1 if choices[k] < up else 1
-            # `first`: of all flips, the first one in a bucket of time or behind it, `_FINE` buckets to a flip. Flips and
-            # events find their buckets by one formula, so that rounding cannot put one on the wrong side of another
+            # `first`: the first flip in a bucket of time or behind it, `_FINE` buckets to a flip. Flips
+            # and events find their buckets by one formula: rounding cannot put one on the wrong side of another
             fine = _FINE * count / (now - begin)
             last = _FINE * count - 1
             first[: last + 1] = 0

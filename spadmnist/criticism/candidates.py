@@ -1,0 +1,220 @@
+"""What a sensor might lack: every registered effect, every listed number at another value, every map.
+
+A candidate is a `Change` with its dials: the numbers that settle it. Nothing here names an effect: what can be turned,
+and how far, is read from the parameters that the effects declare (`off`, `search`, `per`), those of users' files too.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..effects import Effect
+from ..plugins import ByWavelength, Parameter
+from ..sensor import Sensor
+
+Key = tuple[str, str]  # effect, parameter
+Values = Mapping[Key, Any]
+
+_SHAPES = 4  # values of a shape that are tried between the ends of where it is looked for
+_MOST = 10  # templates of one candidate
+
+
+@dataclass(frozen=True)
+class Dial:
+    """A number that may be turned: where it is looked for, and whether on a scale of ratios.
+
+    off: where the effect vanishes, None for a shape. whole: there are whole numbers of it only.
+    """
+
+    effect: str
+    parameter: str
+    unit: str
+    low: float
+    high: float
+    off: float | None
+    whole: bool = False
+
+    @property
+    def key(self) -> Key:
+        return self.effect, self.parameter
+
+    @property
+    def log(self) -> bool:
+        return self.low > 0
+
+    def coordinate(self, value: float) -> float:
+        return math.log(max(value, 1e-300)) if self.log else value
+
+    def value(self, coordinate: float) -> float:
+        value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
+        value = float(round(value)) if self.whole else value
+        return min(max(value, self.low), self.high)
+
+    def scaled(self, value: float, factor: float) -> float:
+        """The value whose distance from `off` is so many times that of `value`."""
+        off = self.off or 0.0
+        return min(max(off + (value - off) * factor, self.low), self.high)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A way to alter a sensor. kind: "add", "set" or "map"; parameter: of "set" and "map".
+
+    strengths: the dials that make the effect vanish; shapes: those that say what it looks like; phases: parameters
+    (in rad) that begin anew in every capture. fixed: what else it sets.
+    """
+
+    kind: str
+    effect: str
+    parameter: str | None
+    strengths: tuple[Dial, ...]
+    shapes: tuple[Dial, ...] = ()
+    phases: tuple[Key, ...] = ()
+    fixed: tuple[tuple[Key, Any], ...] = ()
+    per: str = ""
+    carrier: Key | None = None  # of a map: the parameter that holds it
+    relative: bool = False  # the map multiplies
+
+    @property
+    def dials(self) -> tuple[Dial, ...]:
+        return self.strengths + self.shapes
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} {self.effect}" + (f".{self.parameter}" if self.parameter else "")
+
+
+def with_values(sensor: Sensor, values: Values) -> Sensor:
+    """The sensor with some parameters set, effects that it lacks among them."""
+    given: dict[str, dict[str, Any]] = {}
+    for (name, parameter), value in values.items():
+        given.setdefault(name, {})[parameter] = value
+    effects = []
+    for effect in sensor.effects:
+        own = {name: getattr(effect, name) for name in effect.parameters}
+        effects.append(type(effect)(**{**own, **given.pop(effect.name, {})}))
+    for name, own in given.items():
+        effects.append(Effect.registry.find(name)(**own))
+    return Sensor(sensor.layout, effects, sensor.rules, sensor.chip_seed, sensor.name).settled()
+
+
+def _dial(effect: str, declared: Parameter, off: float | None) -> Dial:
+    assert declared.search is not None
+    low, high = map(float, declared.search)
+    ends = (low, high, float(declared.default))
+    whole = not declared.unit and low >= 1 and declared.bounds[0] is not None and all(x == int(x) for x in ends)
+    return Dial(effect, declared.name, declared.unit, low, high, off, whole)
+
+
+def _numeric(declared: Parameter) -> bool:
+    return declared.unit != "bool" and not declared.choices and declared.search is not None
+
+
+def changes(sensor: Sensor) -> list[Change]:
+    """Every candidate, in the order of names."""
+    out: list[Change] = []
+    listed = {effect.name: effect for effect in sensor.effects}
+    for name in Effect.registry:
+        kind = Effect.registry.find(name)
+        if name not in listed:
+            out += _additions(name, kind.parameters)
+    for name in sorted(listed):
+        out += _settings(listed[name])
+        out += _maps(listed[name])
+    return out
+
+
+def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Change]:
+    wholes = {k: p for k, p in parameters.items() if _numeric(p) and p.per in ("", "pixel")}
+    phases = tuple((name, k) for k, p in wholes.items() if p.unit == "rad")
+    off = {k: p for k, p in wholes.items() if p.off is not None and (name, k) not in phases}
+    shapes = tuple(_dial(name, p, None) for k, p in wholes.items() if k not in off and (name, k) not in phases)
+    lines = [p for p in parameters.values() if p.per in ("row", "column") and p.off is not None]
+    if lines:
+        one = lines[0]
+        yield Change("add", name, None, (), per=one.per, carrier=(name, one.name), relative=one.off == 1.0)
+    if not off:
+        return
+    signed = {k: p for k, p in off.items() if p.search is not None and p.search[0] < 0}
+    kept = signed or dict(itertools.islice(off.items(), 1))
+    others = {k: p for k, p in off.items() if k not in kept}
+    if signed:  # directions side by side: they may all be there
+        strengths = tuple(_dial(name, p, float(p.off or 0)) for p in off.values())
+        fixed = tuple(((name, k), float(p.off or 0)) for k, p in off.items())
+        yield Change("add", name, None, strengths, shapes, phases, fixed)
+        return
+    strengths = tuple(_dial(name, p, float(p.off or 0)) for p in kept.values())
+    # what is off by itself already is no part of the question, unless the effect vanishes with it
+    for p in others.values():
+        if p.default == p.off:
+            continue
+        shapes += (_dial(name, p, None),)
+    yield Change("add", name, None, strengths, shapes, phases)
+
+
+def _settings(effect: Effect) -> Iterator[Change]:
+    for name, declared in effect.parameters.items():
+        value = getattr(effect, name)
+        if declared.unit == "bool" and declared.off is not None:
+            yield Change("set", effect.name, name, (), fixed=(((effect.name, name), not value),))
+        if not _numeric(declared) or declared.per not in ("", "pixel") or not isinstance(value, (int, float)):
+            continue
+        if declared.unit == "rad" or effect.stage in ("light", "detection"):
+            continue  # a common factor on the light is no matter of the sensor
+        low, high = declared.search  # type: ignore[misc]
+        low, high = min(low, value) if value > 0 else low, max(high, value)
+        dial = Dial(effect.name, name, declared.unit, float(low), float(high), float(value))
+        yield Change("set", effect.name, name, (dial,))
+
+
+def _maps(effect: Effect) -> Iterator[Change]:
+    whole = {k: p for k, p in effect.parameters.items() if p.per_pixel}
+    for name, declared in whole.items():
+        value = getattr(effect, name)
+        multipliers = [k for k, p in whole.items() if p.off == 1.0 and k != name and not p.by_wavelength]
+        if declared.off == 1.0 and not declared.by_wavelength and len(whole) > 1:
+            continue  # it carries the map of another one
+        carrier = multipliers[0] if declared.by_wavelength and multipliers else name
+        at = getattr(effect, carrier)
+        if isinstance(at, (ByWavelength, bool)) or isinstance(value, np.ndarray):
+            continue
+        yield Change("per_pixel", effect.name, name, (), per="pixel", carrier=(effect.name, carrier), relative=True)
+
+
+def templates(change: Change) -> list[dict[Key, float]]:
+    """The values at which a candidate is tried first: each strength by itself, shapes on a coarse grid."""
+    grids = []
+    for dial in change.shapes:
+        if dial.log:
+            count = min(_SHAPES, max(2, round(math.log10(dial.high / dial.low) * 1.5)))
+            ends = np.linspace(math.log(dial.low), math.log(dial.high), 2 * count + 1)[1::2]
+            grids.append([dial.value(x) for x in ends])
+        else:
+            grids.append([dial.low + (dial.high - dial.low) * x for x in (0.25, 0.75)])
+    shapes: list[tuple[float, ...]] = list(itertools.product(*grids))
+    if len(shapes) > _MOST:  # one after the other, the others in their middle
+        middle = [g[len(g) // 2] for g in grids]
+        shapes = [(*middle[:i], x, *middle[i + 1 :]) for i, g in enumerate(grids) for x in g]
+        shapes = list(dict.fromkeys(shapes))[:_MOST]
+    out = []
+    for shape in shapes:
+        about = {d.key: x for d, x in zip(change.shapes, shape, strict=True)}
+        for dial in change.strengths:
+            out.append({**dict(change.fixed), **about, dial.key: first_strength(dial)})
+    return out or [dict(change.fixed)]
+
+
+def first_strength(dial: Dial) -> float:
+    """A strength that should show and not saturate."""
+    off = dial.off or 0.0
+    if dial.low < 0 or off == dial.high:
+        return off + (0.1 if off < dial.high else -0.1) * (dial.high - dial.low)
+    if dial.low <= off <= dial.high and off > 0:
+        return min(off * 1.1, dial.high)
+    return math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * (dial.high - dial.low)

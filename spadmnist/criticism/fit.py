@@ -1,0 +1,670 @@
+"""Fit: settle parameters of a sensor against a measurement.
+
+Everything is judged as `compare` judges it. What another value of a parameter would do to a statistic is found by
+simulating a few recordings with the same random numbers as the model's own: their difference is nearly free of
+scatter, and what is left of it is added to that of the cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from scipy import stats
+
+from .. import twin
+from ..errors import SpadError
+from ..measurement import Measurement
+from ..recording import Capture, Recording
+from ..sensor import Sensor
+from ..statistics import Summary
+from . import compare as comparing
+from .candidates import Dial, Key, Values, with_values
+from .nulls import Null, _standardized, learn
+
+Cell = tuple[str, str]  # capture, statistic
+RATES = ("", "rates")  # the block of all captures' totals
+_LEAST_SPREAD = 0.03  # other models' totals must not lie outside
+FEW = 4  # recordings that tell the difference between two models
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A capture as it was measured: its detections, of each pixel, and its summaries."""
+
+    capture: Capture
+    total: float
+    counts: np.ndarray | None
+    summaries: Mapping[str, Summary]
+
+
+@dataclass
+class Made:
+    """Recordings that a model made of one capture. values: (recordings, cells) by statistic."""
+
+    numbers: np.ndarray
+    totals: np.ndarray
+    values: dict[str, np.ndarray]
+    laws: dict[str, tuple[str, np.ndarray | None]]
+
+
+@dataclass
+class State:
+    """A model beside the measurement: its nulls, the data's residuals, and those of its own recordings.
+
+    level, expected, law, scatter, stated: as in `compare.CaptureNull`, by capture.
+    """
+
+    values: dict[Key, Any]
+    sensors: Sensors
+    made: dict[str, Made]
+    nulls: dict[Cell, Null]
+    rates: dict[str, comparing.CaptureNull]
+    factors: dict[str, np.ndarray]
+    residuals: dict[Cell, np.ndarray]
+    own: dict[Cell, np.ndarray]
+    exact: list[Cell]
+
+
+@dataclass
+class Moved:
+    """What another model does: by how much each cell's expectation shifts, and the residuals that it leaves."""
+
+    shifts: dict[Cell, np.ndarray]
+    noise: dict[Cell, float]
+    logs: dict[str, float]  # of the light that gives as many detections
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """A sensor, or one for each capture, or for each recording of it (maps that are not exactly known)."""
+
+    of: Callable[[str, int], Sensor]
+    one: Sensor
+    alike: bool = True
+    typical: Callable[[str], Sensor] | None = None
+
+    def usual(self, capture: str) -> Sensor:
+        """The one whose closed forms hold in the mean over what differs from recording to recording."""
+        return self.typical(capture) if self.typical else self.of(capture, 0)
+
+    @staticmethod
+    def same(sensor: Sensor) -> Sensors:
+        return Sensors(lambda capture, number: sensor, sensor)
+
+
+def _task(
+    models: Sequence[comparing._Model],
+    capture: Capture,
+    photons: np.ndarray,
+    numbers: np.ndarray,
+    seed: int,
+    dead: float,
+) -> Made | str:
+    """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each."""
+    totals: list[int] = []
+    found: dict[str, list[Summary]] = {}
+    known = comparing.statistics_for(capture.modality)
+
+    def take(recording: Recording) -> None:
+        recording = replace(recording, dead_time=dead, _kept={})
+        totals.append(int(recording.totals.sum()))
+        for statistic in known:
+            summary = comparing.reduced(statistic, recording)
+            if summary is not None:
+                found.setdefault(statistic.name, []).append(summary)
+
+    try:
+        for k, model in enumerate(models):
+            some = slice(None) if len(models) == 1 else slice(k, k + 1)
+            sensor = model.sensor
+            if capture.light.dark:
+                sensor = comparing._InTheDark.of(sensor)
+            for recording in comparing.simulated(sensor, capture, photons[some], numbers[some], seed):
+                take(recording)
+    except (SpadError, ValueError) as error:
+        return str(error)
+    whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
+    return Made(
+        numbers,
+        np.array(totals, float),
+        {n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
+        {
+            n: (s[0].law, None if s[0].scale is None else np.mean([np.asarray(one.scale) for one in s], axis=0))
+            for n, s in whole.items()
+        },
+    )
+
+
+class Bench:
+    """The measurement, reduced once, and the workers that simulate models of it."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        measurement: Measurement,
+        seed: int,
+        parallel: Parallel,
+        replicates: int,
+        say: Callable[[str], None] = lambda what: None,
+    ):
+        measurement.check_layout(sensor.layout)
+        self.start = sensor.settled()
+        self.seed, self.parallel, self.replicates, self.say = seed, parallel, replicates, say
+        self.dead = self.start.nominal_dead_time
+        self.seen: dict[str, Seen] = {}
+        self.simulations = 0
+        for capture in measurement.captures:
+            if capture.mean is not None:
+                self.seen[capture.id] = Seen(capture, capture.mean * sensor.layout.pixels, None, {})
+                continue
+            recording = measurement.recording(capture.id, self.start)
+            summaries = {}
+            for statistic in comparing.statistics_for(recording.modality):
+                summary = comparing.reduced(statistic, recording)
+                if summary is not None:
+                    summaries[statistic.name] = summary
+            counts = np.asarray(recording.totals, float)
+            self.seen[capture.id] = Seen(recording.capture, float(counts.sum()), counts, summaries)
+
+    # --- simulating ----------------------------------------------------------------------------------------------
+
+    def simulate(
+        self, wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]], pieces: int = 1
+    ) -> list[Made | str]:
+        """Recordings for each of (sensors, capture, photons, numbers), in their order."""
+        tasks = []
+        for sensors, id, photons, numbers in wanted:
+            parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
+            for part in parts:
+                if sensors.alike:
+                    models = [comparing._Model.of(sensors.of(id, 0))]
+                else:
+                    models = [comparing._Model.of(sensors.of(id, int(numbers[i]))) for i in part]
+                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead))
+        self.simulations += sum(len(n) for _, _, _, n in wanted)
+        results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
+        out: list[Made | str] = []
+        for _, _, _, numbers in wanted:
+            made = [next(results) for _ in range(max(1, min(pieces, len(numbers))))]
+            wrong = [p for p in made if isinstance(p, str)]
+            out.append(wrong[0] if wrong else _joined([p for p in made if isinstance(p, Made)]))
+        return out
+
+    def closed_form(self, sensor: Sensor, id: str) -> Callable[[float], float]:
+        """Level -> detections of the array in a capture; in the dark the level is a factor on the rates."""
+        capture = self.seen[id].capture
+        return comparing._closed_form(comparing._InTheDark.of(sensor) if capture.light.dark else sensor, capture)
+
+    def matched(self, state: State, sensor: Sensor, id: str) -> float:
+        """By how much the light must differ for a sensor to give as many detections as the state's; 1 where none does.
+
+        Statistics are compared at the same total, and must not be extrapolated to another.
+        """
+        usual, form = state.rates[id], self.closed_form(sensor, id)
+        wanted = math.log(usual.expected(usual.level))
+        x = 0.0
+        for _ in range(6):
+            here = math.log(form(usual.level * math.exp(x)))
+            if abs(wanted - here) < 1e-7:
+                break
+            slope = (math.log(form(usual.level * math.exp(x + 0.01))) - here) / 0.01
+            if slope < 0.02:
+                return 1.0
+            x += max(-0.5, min(0.5, (wanted - here) / slope))
+        return math.exp(x) if abs(x) < 1.5 else 1.0
+
+    def needed(self, state: State, sensor: Sensor, id: str) -> float:
+        """Log of how much the light (dark: the rates) must differ for a sensor to give as many detections."""
+        ratio = self.matched(state, sensor, id)
+        if ratio != 1.0:
+            return math.log(ratio)
+        usual = state.rates[id]
+        here = usual.expected(usual.level)
+        slope = math.log(usual.expected(usual.level * 1.01) / here) / math.log(1.01)
+        return -math.log(self.closed_form(sensor, id)(usual.level) / here) / max(slope, 0.05)
+
+    def told(self, state: State, sensors: Sensors) -> Moved:
+        """What another model changes of the totals, as the closed forms have it; nothing else."""
+        return Moved({}, {}, {id: self.needed(state, sensors.usual(id), id) for id in state.rates})
+
+    def _centre(self, sensor: Sensor, seen: Seen) -> tuple[float, float | None, Callable[[float], float], float]:
+        capture = seen.capture
+        if capture.light.dark:
+            sensor, stated = comparing._InTheDark.of(sensor), 1.0
+        else:
+            stated = twin.photons_at(capture, sensor.layout)  # type: ignore[assignment]
+        expected = comparing._closed_form(sensor, capture)
+        centre = comparing._level_for(expected, seen.total, stated)
+        uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
+        half = max(_LEAST_SPREAD, comparing._SPREAD * uncertainty)
+        if stated is not None and (
+            seen.total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(seen.total, 1.0))
+        ):
+            centre = stated
+        return centre, stated, expected, half
+
+    def state(self, values: Values, sensors: Sensors | None = None, replicates: int | None = None) -> State:
+        """Learn what the model makes of every capture, and judge the data by it."""
+        sensors = sensors or Sensors.same(with_values(self.start, values))
+        n = replicates or self.replicates
+        order = np.random.Generator(np.random.SFC64(n)).permutation(n)
+        numbers = np.arange(n, dtype=np.uint64)
+        about, wanted = {}, []
+        for id, seen in self.seen.items():
+            centre, stated, expected, half = self._centre(sensors.usual(id), seen)
+            factors = np.exp(half * np.linspace(-1, 1, n)[order])
+            about[id] = centre, stated, expected, factors
+            wanted.append((sensors, id, centre * factors, numbers))
+        results = self.simulate(wanted, pieces=4)
+        state = State(dict(values), sensors, {}, {}, {}, {}, {}, {}, [])
+        for (id, (centre, stated, expected, factors)), made in zip(about.items(), results, strict=True):
+            if isinstance(made, str):
+                raise SpadError(f"{id}: {made}")
+            state.made[id] = made
+            law, scatter = comparing._law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
+            state.rates[id] = comparing.CaptureNull(centre, stated, made.totals, expected, law, scatter, {})
+            state.factors[id] = factors
+            for name, summary in self.seen[id].summaries.items():
+                if name not in made.values:
+                    continue
+                kind, scale = made.laws[name]
+                null = learn([Summary(v, kind, str, comparing._no_size, scale) for v in made.values[name]], made.totals)
+                cell = id, name
+                state.nulls[cell] = null
+                judged = null.judge(summary.values, self.seen[id].total)
+                if null.law == "exact":
+                    if judged.p_value < 0.5:
+                        state.exact.append(cell)
+                    continue
+                state.residuals[cell] = judged.residuals
+                state.own[cell] = _own(null, made, made.values[name])
+        state.residuals[RATES] = self.rates(state, {id: math.log(max(s.total, 0.5)) for id, s in self.seen.items()})
+        draws = np.random.Generator(np.random.Philox(key=self.seed + 1)).standard_normal(n)
+        state.own[RATES] = np.stack([self._own_rates(state, k, float(draws[k])) for k in range(n)])
+        return state
+
+    # --- the totals ----------------------------------------------------------------------------------------------
+
+    def _stated(self, state: State) -> list[str]:
+        return [
+            id
+            for id in self.seen
+            if state.rates[id].stated is not None
+            and state.rates[id].total_at(float(state.rates[id].stated or 1.0)) >= 5
+        ]
+
+    def rate_space(self, state: State) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+        """(captures, elasticities, inverse root of the covariance of the log levels, the light's part in it)."""
+        ids = self._stated(state)
+        errors, elasticity, common = [], [], []
+        for id in ids:
+            null, light = state.rates[id], self.seen[id].capture.light
+            _, e, slope = null.level_of(max(self.seen[id].total, 1.0))
+            if light.dark:
+                mean = null.total_at(1.0)
+                e = max(e, 1 / math.sqrt(mean) / max(slope, 1e-3))
+            errors.append(math.hypot(e, light.own_uncertainty))
+            elasticity.append(max(slope, 1e-3))
+            common.append(0.0 if light.dark else light.relative_uncertainty)
+        c = np.array(common)
+        covariance = np.diag(np.maximum(np.array(errors), 1e-6) ** 2) + np.outer(c, c)
+        root = np.linalg.inv(np.linalg.cholesky(covariance)) if ids else np.zeros((0, 0))
+        return ids, np.array(elasticity), root, c
+
+    def rates(self, state: State, logs: Mapping[str, float]) -> np.ndarray:
+        """Residuals of the totals: independent, 1 wide; the light's common factor is among them."""
+        ids, _, root, _ = self.rate_space(state)
+        return root @ self.levels(state, ids, logs) if ids else np.zeros(0)
+
+    def levels(self, state: State, ids: Sequence[str], logs: Mapping[str, float]) -> np.ndarray:
+        """Logs of the levels (dark: of the rates) that give these totals, relative to what is stated."""
+        return np.array(
+            [
+                math.log(state.rates[id].level_of(math.exp(logs[id]))[0] / float(state.rates[id].stated or 1.0))
+                for id in ids
+            ]
+        )
+
+    def _own_rates(self, state: State, k: int, draw: float) -> np.ndarray:
+        ids, slopes, root, common = self.rate_space(state)
+        x = []
+        for id, slope in zip(ids, slopes, strict=True):
+            null = state.rates[id]
+            usual = null.law[0] + null.law[1] * math.log(null.expected(float(null.level * state.factors[id][k])))
+            x.append((math.log(max(null.totals[k], 0.5)) - usual) / slope)
+        return root @ (np.array(x) + draw * common) if ids else np.zeros(0)
+
+    # --- other models beside a state ------------------------------------------------------------------------------
+
+    def moved(
+        self, state: State, models: Sequence[Sensors], few: int = FEW, only: Sequence[str] = ()
+    ) -> list[Moved | str]:
+        """What each of these models would change. few: recordings of each capture; only: of some captures."""
+        numbers = np.arange(few, dtype=np.uint64)
+        ids = [id for id in self.seen if not only or id in only]
+        wanted = []
+        for sensors in models:
+            for id in ids:
+                level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
+                wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
+        results = self.simulate(wanted, pieces=1)
+        out: list[Moved | str] = []
+        for i in range(len(models)):
+            part = results[i * len(ids) : (i + 1) * len(ids)]
+            wrong = [p for p in part if isinstance(p, str)]
+            out.append(wrong[0] if wrong else self._moved(state, models[i], dict(zip(ids, part, strict=True))))  # type: ignore[arg-type]
+        return out
+
+    def _moved(self, state: State, sensors: Sensors, made: dict[str, Made]) -> Moved | str:
+        shifts: dict[Cell, np.ndarray] = {}
+        noise: dict[Cell, float] = {}
+        logs = {}
+        for id, other in made.items():
+            base, some = state.made[id], other.numbers.astype(int)
+            apart = np.log(np.maximum(other.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
+            # the closed form has no scatter: where the recordings do not contradict it, it serves
+            usual = state.rates[id]
+            logs[id] = self.needed(state, sensors.usual(id), id)
+            if abs(math.log(self.matched(state, sensors.usual(id), id))) < 1e-12:
+                apart += logs[id]  # no other level gave as many
+            beyond = float(np.mean(apart))
+            alike = min(float(np.std(apart)) if len(apart) > 2 else math.inf, 1.5 * usual.scatter)
+            if sensors.typical is None and abs(beyond) > 3.5 * alike / math.sqrt(len(apart)):
+                logs[id] -= beyond / max(usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2], 0.05)
+            for name, values in other.values.items():
+                cell = id, name
+                if cell not in state.residuals:
+                    continue
+                if values.shape[1] != len(state.residuals[cell]):
+                    return f"{id}: its {name} has other cells than the measurement's"
+                null = state.nulls[cell]
+                new = values - np.stack([null.expected(t)[0] for t in other.totals])
+                old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
+                spread = _spread_of(null, base)
+                shift, left = _difference(new, old, spread)
+                shift = _beyond_noise(shift, spread, left + 3.0 / null.recordings, null.law)
+                if shift.any():
+                    shifts[cell], noise[cell] = shift, left
+        return Moved(shifts, noise, logs)
+
+    def residuals(self, state: State, moved: Moved, times: float = 1.0, noisy: bool = False) -> dict[Cell, np.ndarray]:
+        """The data's residuals if the shifts were `times` as large. noisy: their scatter adds to that of the cells."""
+        out: dict[Cell, np.ndarray] = {}
+        for cell in state.residuals:
+            if cell == RATES:
+                ids, _, root, _ = self.rate_space(state)
+                x = np.array([moved.logs.get(i, 0.0) for i in ids])
+                out[cell] = state.residuals[cell] + (times * (root @ x) if ids else 0.0)
+                continue
+            null, seen = state.nulls[cell], self.seen[cell[0]]
+            values = seen.summaries[cell[1]].values
+            if cell not in moved.shifts:
+                out[cell] = state.residuals[cell]
+                continue
+            out[cell] = _judged(
+                null, values, seen.total, times * moved.shifts[cell], times**2 * moved.noise[cell] * noisy
+            )
+        return out
+
+    def template(self, state: State, moved: Moved) -> dict[Cell, np.ndarray]:
+        """The residuals that a model at this state would see in data of the other."""
+        out: dict[Cell, np.ndarray] = {}
+        for cell in state.residuals:
+            if cell == RATES:
+                ids, _, root, _ = self.rate_space(state)
+                out[cell] = -(root @ np.array([moved.logs.get(i, 0.0) for i in ids])) if ids else np.zeros(0)
+                continue
+            null = state.nulls[cell]
+            expected, _ = null.expected(self.seen[cell[0]].total)
+            shift = moved.shifts.get(cell)
+            if shift is None:
+                out[cell] = np.zeros(len(expected))
+                continue
+            scale = null._spread(expected)
+            if null.law == "exponential":
+                out[cell] = shift / np.maximum(expected, 1e-9)
+            else:
+                out[cell] = shift / np.maximum(scale, 0.5 if null.law == "poisson" else 1e-30)
+        return out
+
+
+def _joined(parts: Sequence[Made]) -> Made:
+    names = set.intersection(*(set(p.values) for p in parts))
+    return Made(
+        np.concatenate([p.numbers for p in parts]),
+        np.concatenate([p.totals for p in parts]),
+        {n: np.concatenate([p.values[n] for p in parts]) for n in parts[0].values if n in names},
+        parts[0].laws,
+    )
+
+
+def _own(null: Null, made: Made, values: np.ndarray) -> np.ndarray:
+    """(recordings, cells) residuals of the model's own recordings."""
+    out = []
+    for v, total in zip(values, made.totals, strict=True):
+        expected, leverage = null.expected(float(total))
+        z = _standardized(null.law, v, expected, null.spread, -min(leverage, 0.9), null.recordings, null.scaled)
+        out.append(z / null.factor)
+    return np.stack(out)
+
+
+def _spread_of(null: Null, made: Made) -> np.ndarray:
+    expected = null.expected(float(made.totals.mean()))[0]
+    return np.maximum(null._spread(expected), 0.3 if null.law == "poisson" else 1e-30)
+
+
+def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float]:
+    """(mean of new less what chance made of it, as `old` tells; variance of that relative to a recording's)."""
+    n = len(new)
+    a, b = (new - new.mean(axis=0)) / spread, (old - old.mean(axis=0)) / spread
+    square = float((b * b).sum())
+    beta = float(np.clip((a * b).sum() / square, 0.0, 1.0)) if square > 0 and n > 1 else 0.0
+    shift = new.mean(axis=0) - beta * old.mean(axis=0)
+    left = float(((a - beta * b) ** 2).sum()) / max(1, (n - 1) * a.shape[1]) if n > 1 else 2.0
+    return shift, left / n
+
+
+def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, law: str) -> np.ndarray:
+    """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none."""
+    relative = (shift / spread) ** 2 / max(noise, 1e-12)
+    n = len(shift)
+    if law != "exponential" and float(relative.mean()) > 1.2 * float(stats.chi2.isf(1e-4, n)) / n:
+        return shift
+    return np.where(relative > (100.0 if law == "exponential" else 30.0), shift, 0.0)
+
+
+def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noise: float) -> np.ndarray:
+    expected, leverage = null.expected(total)
+    expected = expected + shift
+    if null.law in ("poisson", "exponential"):
+        expected = np.maximum(expected, 0.5 / null.recordings)
+    z = _standardized(null.law, values, expected, null.spread, leverage + noise, null.recordings, null.scaled)
+    return np.asarray(z / null.factor)
+
+
+def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:
+    """All cells in one line."""
+    return np.concatenate([blocks[k] for k in keys]) if keys else np.zeros(0)
+
+
+# --- misfit and verdict of a state ------------------------------------------------------------------------------
+
+
+def misfits(state: State, residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+    """Mean squared residual of each block, 1 being the model's own."""
+    return {
+        cell: float(np.mean(z**2)) / max(float(np.mean(state.own[cell] ** 2)), 0.05)
+        for cell, z in residuals.items()
+        if cell != RATES and len(z)
+    }
+
+
+def misfit(state: State, residuals: Mapping[Cell, np.ndarray]) -> float:
+    """Mean over the blocks."""
+    all_ = list(misfits(state, residuals).values())
+    return float(np.mean(all_)) if all_ else 1.0
+
+
+def usual_misfit(state: State) -> float:
+    """Below it are 95 % of the model's own recordings."""
+    own = [np.mean(z**2, axis=1) for cell, z in state.own.items() if cell != RATES]
+    return float(np.quantile(np.mean([o / max(o.mean(), 1e-30) for o in own], axis=0), 0.95)) if own else 1.2
+
+
+@dataclass(frozen=True)
+class Block:
+    """A check: a block of cells, or the totals. p: two-sided, of its sum or its worst cell."""
+
+    cell: Cell
+    p: float
+    worst: int
+    z: float
+
+
+def blocks(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> list[Block]:
+    """The checks of a state, judged with these residuals of the data, the clearest first."""
+    out = []
+    for cell, z in residuals.items():
+        if cell == RATES:
+            out += [Block(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)]
+            continue
+        null = state.nulls[cell]
+        square = float(np.mean(z**2))
+        mean, variance = max(float(null.own.mean()), 0.05), float(null.own.var(ddof=1))
+        shape = mean**2 / max(variance, 1e-12 * mean**2 + 1e-300)
+        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
+        worst = int(np.argmax(np.abs(z)))
+        p_cell = min(1.0, z.size * 2 * float(stats.norm.sf(abs(z[worst]) / null.tail)))
+        out.append(Block(cell, min(1.0, 2 * min(p_sum, p_cell)), worst, float(z[worst])))
+    out += [Block(cell, 1e-12, 0, 40.0) for cell in state.exact]
+    return sorted(out, key=lambda b: (b.p, -abs(b.z)))
+
+
+def failing(checks: Sequence[Block], level: float = comparing.FALSE_ALARM) -> list[Block]:
+    """Those that a right model would show once in a hundred times (Holm)."""
+    out = []
+    for rank, block in enumerate(checks):
+        if block.p > level / (len(checks) - rank):
+            break
+        out.append(block)
+    return out
+
+
+# --- settling parameters ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Settled:
+    """Values of some dials: point, covariance of their coordinates, the residuals left, how they follow the dials."""
+
+    dials: tuple[Dial, ...]
+    point: np.ndarray
+    covariance: np.ndarray
+    residuals: dict[Cell, np.ndarray]
+    slopes: dict[Cell, np.ndarray]  # (cells, dials)
+    square: float
+    values: dict[Key, Any]
+    phases: dict[tuple[str, Key], float] = field(default_factory=dict)
+
+    def interval(self, i: int) -> tuple[float, float, float]:
+        """(value, low, high) of 95 %."""
+        dial, half = self.dials[i], 1.96 * math.sqrt(max(float(self.covariance[i, i]), 0.0))
+        u = float(self.point[i])
+        return dial.value(u), dial.value(u - half), dial.value(u + half)
+
+
+def point_of(dials: Sequence[Dial], values: Mapping[Key, Any]) -> np.ndarray:
+    """The coordinates of some values, one for each dial."""
+    return np.array([d.coordinate(float(values[d.key])) for d in dials])
+
+
+def settle(
+    bench: Bench,
+    state: State,
+    dials: Sequence[Dial],
+    values: Mapping[Key, Any],
+    sensors_of: Callable[[Mapping[Key, Any]], Sensors],
+    rounds: int = 3,
+    few: int = FEW,
+) -> Settled | str:
+    """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated."""
+    dials = tuple(dials)
+    keys = list(state.residuals)
+    fixed = dict(values)
+
+    def at(u: np.ndarray) -> dict[Key, Any]:
+        return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(dials, u, strict=True)}}
+
+    def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | str]:
+        found = bench.moved(state, [sensors_of(at(u)) for u in points], few)
+        return [m if isinstance(m, str) else stacked(bench.residuals(state, m), keys) for m in found]
+
+    u = point_of(dials, values)
+    own = np.concatenate([state.own[k] for k in keys], axis=1)  # (recordings, cells)
+    steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    damping = 0.0
+    for turn in range(rounds):
+        moves = [u]
+        for i, dial in enumerate(dials):
+            h = steps[i]
+            if dial.value(u[i] + h) >= dial.high:
+                h = -h
+            moves.append(u + np.eye(len(dials))[i] * h)
+        found = evaluate(moves)
+        if isinstance(found[0], str):
+            return found[0]
+        z = found[0]
+        slopes = np.zeros((z.size, len(dials)))
+        for i in range(len(dials)):
+            other = found[i + 1]
+            if not isinstance(other, str):
+                slopes[:, i] = (other - z) / (moves[i + 1][i] - u[i])
+        square = float(z @ z)
+        if best is None or square < best[0]:
+            best, damping = (square, u, z, slopes), damping / 3
+        else:
+            damping = max(3 * damping, 0.3)
+        square, u0, z, slopes = best
+        normal = slopes.T @ slopes
+        step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (slopes.T @ z)
+        limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
+        step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
+        u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u0 + step, strict=True)])
+        gain = float(square - ((z + slopes @ (u - u0)) ** 2).sum())
+        covariance = _covariance(slopes, own)
+        error = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+        # never so short that what is taken for noise, or not, makes a slope
+        steps = np.clip(3 * error, [0.05 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.4)
+        if turn and (gain < 1.0 or np.all(np.abs(u - u0) < 0.3 * error)):
+            break
+    assert best is not None
+    last = evaluate([u])[0]
+    if not isinstance(last, str) and float(last @ last) < best[0] + 1.0:
+        best = float(last @ last), u, last, best[3]
+    square, u, z, slopes = best
+    covariance = _covariance(slopes, own)
+    return Settled(dials, u, covariance, _split(z, state, keys), _split(slopes, state, keys), square, at(u))
+
+
+def _covariance(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Of the least-squares estimate, the cells scattering as they do in the model's own recordings."""
+    solve = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ slopes.T
+    estimates = own @ solve.T
+    n = len(own)
+    # what so many recordings miss by chance: a little wider
+    return np.atleast_2d(np.cov(estimates.T)) * (n + 2) / max(n - 2, 1)
+
+
+def _split(stack: np.ndarray, state: State, keys: Sequence[Cell]) -> dict[Cell, np.ndarray]:
+    out, start = {}, 0
+    for key in keys:
+        size = len(state.residuals[key])
+        out[key] = stack[start : start + size]
+        start += size
+    return out

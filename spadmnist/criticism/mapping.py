@@ -1,0 +1,296 @@
+"""Maps: what each pixel's own value of a parameter is, from how many detections it has in every capture.
+
+The closed forms of the effects say how a pixel's rate follows a parameter, in every capture. Maps of several parameters
+are settled together, pixel by pixel, by Newton's method on the logarithms of their values relative to the array's; a
+prior as wide as the pixels turn out to differ keeps noise out, and one with long tails lets odd pixels be odd.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..sensor import Sensor
+from .candidates import Change, Key, Values, with_values
+from .compare import _InTheDark
+from .fit import Bench, Sensors
+
+_TAILS = 3.0  # degrees of freedom of the prior
+_TURNS = 12
+_MOST = 6.0  # of a logarithm
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map in logarithms: values are base * exp(estimate). error: standard deviation; raw, raw_error: without prior.
+
+    group: (pixels,) which of the values each pixel has (rows and columns share one).
+    """
+
+    carrier: Key
+    base: float
+    group: np.ndarray
+    estimate: np.ndarray
+    error: np.ndarray
+    raw: np.ndarray
+    raw_error: np.ndarray
+    sigma: float
+    low: float = 0.0
+    high: float = math.inf
+
+    def values(self, draw: np.ndarray | None = None) -> np.ndarray:
+        """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
+        logs = self.estimate if draw is None else self.estimate + draw * self.error
+        return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST + 4)), self.low, self.high)
+
+
+def groups_of(sensor: Sensor, per: str) -> np.ndarray:
+    """(pixels,) which value of a map over pixels, rows or columns each pixel has."""
+    pixels = np.arange(sensor.layout.pixels)
+    if per == "row":
+        return pixels // sensor.layout.columns
+    if per == "column":
+        return pixels % sensor.layout.columns
+    return pixels
+
+
+class _Line:
+    """Expected detections of each pixel in one capture, for maps."""
+
+    def __init__(self, bench: Bench, id: str, level: float):
+        self.seen, self.id, self.level = bench.seen[id], id, level
+        self.conditions = self.seen.capture.conditions
+        self.frames = self.seen.capture.modality != "tr"
+
+    def expected(self, sensor: Sensor) -> np.ndarray:
+        if self.seen.capture.light.dark:
+            sensor = _InTheDark.of(sensor)
+        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), self.level), self.conditions)
+        if not self.frames or (self.conditions.counting == "counter" and self.seen.capture.modality == "counts"):
+            return np.maximum(recorded[0], 1e-9)
+        live = self.conditions.frame_time / self.conditions.frame_period
+        share = -np.expm1(-candidates[0] * live / self.conditions.frames)
+        return np.maximum(self.conditions.frames * share, 1e-9)
+
+    def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
+        if self.frames:
+            return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), 0.25)
+        return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)
+
+
+def settle_maps(
+    bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float], use: Sequence[str] = ()
+) -> dict[Key, Map]:
+    """Maps of some parameters, from the captures in `use` (all).
+
+    The array's own mean rate is the light's matter in lit captures, so they tell the pixels' differences only.
+    """
+    start = with_values(bench.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
+    lines = [
+        _Line(bench, id, levels[id]) for id, s in bench.seen.items() if s.counts is not None and (not use or id in use)
+    ]
+    bases, groups, bounds = [], [], []
+    for change in wanted:
+        assert change.carrier is not None
+        effect = start.effect(change.carrier[0])
+        declared = None if effect is None else effect.parameters[change.carrier[1]]
+        if effect is None or declared is None:
+            from ..effects import Effect
+
+            declared = Effect.registry.find(change.carrier[0]).parameters[change.carrier[1]]
+            base = float(declared.off if declared.off is not None else 1.0)
+        else:
+            base = float(np.mean(np.asarray(getattr(effect, change.carrier[1]), float)))
+        low, high = declared.bounds
+        bases.append(base if base > 0 else float((declared.search or (1e-3, 1))[0]))
+        bounds.append((0.0 if low is None else low, math.inf if high is None else high))
+        groups.append(groups_of(start, change.per))
+    sizes = [int(g.max()) + 1 for g in groups]
+    delta = [np.zeros(n) for n in sizes]
+    sigma = [0.3 for _ in wanted]
+    precision = [np.full(n, 1e-6) for n in sizes]
+    post: list[np.ndarray] = [np.ones(n) for n in sizes]
+    raw: list[tuple[np.ndarray, np.ndarray]] = [(d, d) for d in delta]
+
+    def model(deltas: Sequence[np.ndarray]) -> Sensor:
+        given = dict(values)
+        for change, base, d, (low, high) in zip(wanted, bases, deltas, bounds, strict=True):
+            map_ = np.clip(base * np.exp(np.clip(d, -_MOST, _MOST + 4)), low, high)
+            given[change.carrier] = map_  # type: ignore[index]
+        return with_values(bench.start, given)
+
+    step = 0.02
+    for turn in range(_TURNS):
+        now = model(delta)
+        other = [model([d + (step if j == i else 0) for j, d in enumerate(delta)]) for i in range(len(wanted))]
+        k = len(wanted)
+        pixels = start.layout.pixels
+        normal = np.zeros((pixels, k, k))
+        score = np.zeros((pixels, k))
+        for line in lines:
+            counts = line.seen.counts
+            assert counts is not None
+            expected = line.expected(now)
+            scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
+            slopes = np.stack([(line.expected(o) - expected) / step for o in other], axis=1) * scale
+            expected = expected * scale
+            variance = line.variance(np.maximum(expected, 0.5), bench.dead)
+            normal += slopes[:, :, None] * slopes[:, None, :] / variance[:, None, None]
+            score += slopes * ((counts - expected) / variance)[:, None]
+        # one after the other where groups are not pixels; together where all are
+        if all(c.per == "pixel" for c in wanted):
+            prior = np.stack(precision, axis=1)
+            whole = normal + np.eye(k) * prior[:, None, :]
+            pull = score - prior * np.stack(delta, axis=1)
+            solved = np.linalg.solve(whole, pull[:, :, None])[:, :, 0]
+            inverse = np.linalg.inv(whole)
+            for i in range(k):
+                delta[i] = np.clip(delta[i] + np.clip(solved[:, i], -0.7, 0.7), -_MOST, _MOST)
+                post[i] = inverse[:, i, i]
+                own = np.maximum(normal[:, i, i], 1e-12)
+                raw[i] = delta[i] + np.clip(score[:, i] / own, -2, 2), 1 / own
+        else:
+            for i, group in enumerate(groups):
+                information = np.bincount(group, normal[:, i, i], sizes[i])
+                gradient = np.bincount(group, score[:, i], sizes[i])
+                move = (gradient - precision[i] * delta[i]) / (information + precision[i])
+                delta[i] = np.clip(delta[i] + np.clip(move, -0.7, 0.7), -_MOST, _MOST)
+                post[i] = 1 / (information + precision[i])
+                own = np.maximum(information, 1e-12)
+                raw[i] = delta[i] + gradient / own, 1 / own
+        for i in range(k):
+            if turn < 2:
+                continue
+            if bench_light_only(start, wanted[i]):
+                delta[i] = delta[i] - math.log(float(np.mean(np.exp(delta[i]))))
+            # as wide as the pixels differ beyond their noise; robustly, for a few may be quite other
+            weight = (_TAILS + 1) / (_TAILS + delta[i] ** 2 / sigma[i] ** 2)
+            square = float(np.mean(weight * (delta[i] - _middle(delta[i])) ** 2 + post[i]))
+            sigma[i] = min(max(math.sqrt(square), 1e-4), 3.0)
+            precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + delta[i] ** 2)
+    out = {}
+    for i, change in enumerate(wanted):
+        assert change.carrier is not None
+        error = np.sqrt(np.maximum(post[i], 0))
+        r, v = raw[i]
+        out[change.carrier] = Map(
+            change.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i]
+        )
+    return out
+
+
+def _middle(x: np.ndarray) -> float:
+    return float(np.median(x))
+
+
+def bench_light_only(sensor: Sensor, change: Change) -> bool:
+    """Does the parameter act on the light alone? Then its mean is the light level's matter."""
+    from ..effects import Effect
+
+    kind = Effect.registry.find(change.effect)
+    return getattr(kind, "stage", "") in ("light", "detection")
+
+
+def levels_of(bench: Bench, state: Any) -> dict[str, float]:
+    """The level (dark: 1, the rates as they are) of each capture."""
+    return {id: 1.0 if s.capture.light.dark else state.rates[id].level for id, s in bench.seen.items()}
+
+
+def information(bench: Bench, values: Values, change: Change, levels: dict[str, float]) -> dict[str, float]:
+    """How much each capture tells of the map's mean: the sum of squared slopes over variances."""
+    start = with_values(bench.start, values)
+    effect = start.effect(change.carrier[0])  # type: ignore[index]
+    if effect is None:
+        return dict.fromkeys(bench.seen, 0.0)
+    assert change.carrier is not None
+    now: np.ndarray = np.asarray(getattr(effect, change.carrier[1]), np.float64)
+    if change.per == "pixel":
+        now = np.broadcast_to(now, (start.layout.pixels,))
+    other = with_values(bench.start, {**values, change.carrier: now * 1.02})
+    out = {}
+    for id, seen in bench.seen.items():
+        if seen.counts is None:
+            out[id] = 0.0
+            continue
+        line = _Line(bench, id, levels[id])
+        a, b = line.expected(start), line.expected(other)
+        slope = (b - a) / 0.02
+        out[id] = float(np.sum(slope**2 / line.variance(np.maximum(a, 0.5), bench.dead)))
+    return out
+
+
+def sensors_with(
+    bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float], unseen: bool = True
+) -> tuple[Sensors, dict[Key, Map], dict[Key, Any]]:
+    """(a model for each capture, its maps fitted without it; the maps fitted to all; the values with these maps).
+
+    Where one capture alone shows a parameter, it is used all the same. Every recording has one of the maps that may
+    be true.
+    """
+    whole = settle_maps(bench, values, wanted, levels)
+    final = {**values, **{key: m.values() for key, m in whole.items()}}
+    needed = [information(bench, final, change, levels) for change in wanted]
+    maps: dict[str, dict[Key, Map]] = {}
+    for id, seen in bench.seen.items():
+        alone = any(told[id] > 0.6 * max(sum(told.values()), 1e-12) for told in needed)
+        if seen.counts is None or alone or not unseen or len(bench.seen) < 2:
+            maps[id] = whole
+        else:
+            others = [i for i in bench.seen if i != id]
+            maps[id] = settle_maps(bench, values, wanted, levels, others)
+
+    def of(id: str, number: int) -> Sensor:
+        rng = np.random.Generator(np.random.Philox(key=[bench.seed + 7, number]))
+        drawn = {}
+        for key, m in maps[id].items():
+            drawn[key] = m.values(rng.standard_normal(len(m.estimate)))
+        return with_values(bench.start, {**values, **drawn})
+
+    def typical(id: str) -> Sensor:
+        return with_values(bench.start, {**values, **{key: m.values() for key, m in maps[id].items()}})
+
+    return Sensors(of, with_values(bench.start, final), alike=False, typical=typical), whole, final
+
+
+def summary(map_: Map) -> dict[str, float]:
+    """sigma, low_fraction, low_ratio, high_fraction of a map."""
+    ratio = np.exp(map_.estimate - _middle(map_.estimate))
+    inner = map_.estimate - _middle(map_.estimate)
+    # of the bulk: beyond its noise, without the odd pixels
+    width = 1.4826 * float(np.median(np.abs(map_.raw - np.median(map_.raw))))
+    noise = float(np.median(map_.raw_error))
+    bulk = math.sqrt(max(width**2 - noise**2, 0.0))
+    beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
+    low, high = inner < -beyond, inner > beyond
+    rest = ~(low | high)
+    spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
+    return {
+        "sigma": math.sqrt(max(float(spread), 0.0)),
+        "low_fraction": float(low.mean()),
+        "low_ratio": float(ratio[low].mean()) if low.any() else 1.0,
+        "high_fraction": float(high.mean()),
+    }
+
+
+def patterned(map_: Map, designs: dict[str, np.ndarray]) -> dict[str, float]:
+    """p-value of each pattern in a map of pixels, against the scatter of what the patterns leave (F tests).
+
+    designs: (pixels, k) columns, without the mean.
+    """
+    ranks = stats.rankdata(map_.raw) / (len(map_.raw) + 1)
+    y = stats.norm.ppf(ranks)  # odd pixels do not make a pattern
+    out = {}
+    ones = np.ones((len(y), 1))
+    for name, design in designs.items():
+        full = np.linalg.lstsq(np.hstack([ones, design]), y, rcond=None)[0]
+        left = y - np.hstack([ones, design]) @ full
+        k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
+        free = len(y) - k - 1
+        explained = float(((y - y.mean()) ** 2).sum() - (left**2).sum())
+        out[name] = float(stats.f.sf(explained / max(k, 1) / max(float((left**2).sum()) / free, 1e-30), k, free))
+    return out

@@ -1,0 +1,134 @@
+"""The next sensor file: the user's own, its comments kept, with what was found written into it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import config, disk, document, units
+from ..effects import Effect
+from ..errors import SpadError
+from .candidates import Key
+
+Notes = Mapping[Key, str]
+
+
+def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> Path:
+    """Write `out` beside its maps; source: the sensor file that was diagnosed. Returns `out`.
+
+    values: (effect, parameter) -> number, switch or map; notes: what stands behind a line, as a comment.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    text = source.read_text(encoding="utf-8-sig")
+    shape = config.read_sensor(source).layout.shape
+    written: dict[Key, str] = {}
+    for (effect, parameter), value in values.items():
+        if isinstance(value, np.ndarray):
+            name = f"{effect}.{parameter}.npy"
+            np.save(out.parent / name, value.reshape(shape) if value.size == shape[0] * shape[1] else value)
+            written[effect, parameter] = f"{{file: {name}}}"
+        elif isinstance(value, bool):
+            written[effect, parameter] = "true" if value else "false"
+        else:
+            unit = Effect.registry.find(effect).parameters[parameter].unit
+            written[effect, parameter] = units.show(float(value), unit, 6) if unit else f"{float(value):.6g}"
+    text = _moved_files(text, source.parent, out.parent)
+    try:
+        new = _edited(text, written, notes)
+        disk.commit_file(out, new.encode(), out.parent)
+        config.read_sensor(out)
+    except (SpadError, ValueError):
+        # a file written in another way: its contents, without its comments
+        disk.commit_file(out, _dumped(text, written).encode(), out.parent)
+        config.read_sensor(out)
+    return out
+
+
+def _moved_files(text: str, before: Path, after: Path) -> str:
+    """Files that the sensor names, as they are reached from its new place."""
+
+    def moved(match: re.Match[str]) -> str:
+        name = match.group(2).strip().strip("\"'")
+        if not name or Path(name).is_absolute():
+            return match.group(0)
+        return f"{match.group(1)}{os.path.relpath(before.resolve() / name, after.resolve())}"
+
+    return re.sub(r"(\b(?:file|positions):\s*)([^,}\s#]+)", moved, text)
+
+
+def _edited(text: str, written: Mapping[Key, str], notes: Notes) -> str:
+    read = document.parse(text, "sensor")
+    sensor = read.value.get("sensor", read.value)
+    head = ("sensor",) if "sensor" in read.value else ()
+    known = sensor.get("effects") or {}
+    lines = text.rstrip("\n").split("\n")
+    by_effect: dict[str, dict[str, str]] = {}
+    for (effect, parameter), value in written.items():
+        by_effect.setdefault(effect, {})[parameter] = value
+    added: list[tuple[int, str]] = []  # behind which line, what
+    at = read.lines[(*head, "effects")] - 1
+    entries = [read.lines[(*head, "effects", name)] - 1 for name in known]
+    depth = _indent(lines[entries[0]]) if entries else _indent(lines[at]) + 2
+    end = max([at, *(n - 1 for path, n in read.lines.items() if path[: len(head) + 1] == (*head, "effects"))])
+    for effect, parameters in by_effect.items():
+        comment = "; ".join(dict.fromkeys(notes[effect, p] for p in parameters if (effect, p) in notes))
+        tail = f"  # {comment}" if comment else ""
+        if effect not in known:
+            body = ", ".join(f"{name}: {value}" for name, value in parameters.items())
+            added.append((end, f"{' ' * depth}{effect}: {{{body}}}{tail}"))
+            continue
+        place = read.lines[(*head, "effects", effect)] - 1
+        own = known[effect] or {}
+        if "{" in lines[place]:
+            lines[place] = _in_flow(lines[place], parameters, tail)
+            continue
+        inner = [read.lines[(*head, "effects", effect, name)] - 1 for name in own]
+        last = max(
+            [place, *(n - 1 for path, n in read.lines.items() if path[: len(head) + 2] == (*head, "effects", effect))]
+        )
+        for name, value in parameters.items():
+            path = (*head, "effects", effect, name)
+            if name in own and not isinstance(own[name], (dict, list)):
+                line = read.lines[path] - 1
+                lines[line] = re.sub(r"(:\s*)[^#]*?(\s*(#.*)?)$", rf"\g<1>{value}", lines[line]) + tail
+            elif name in own:
+                raise ValueError("a value over several lines")
+            else:
+                inner_depth = _indent(lines[inner[0]]) if inner else depth + 2
+                added.append((last, f"{' ' * inner_depth}{name}: {value}{tail}"))
+    for behind, more in sorted(added, key=lambda a: -a[0]):
+        lines.insert(behind + 1, more)
+    return "\n".join(lines) + "\n"
+
+
+def _in_flow(line: str, parameters: Mapping[str, str], tail: str) -> str:
+    """`effect: {a: 1, b: 2}` on one line."""
+    close = line.rindex("}")
+    body, rest = line[:close], line[close:]
+    for name, value in parameters.items():
+        pattern = rf"(\b{re.escape(name)}:\s*)(\{{[^{{}}]*\}}|[^,{{}}]+)"
+        if re.search(pattern, body):
+            body = re.sub(pattern, lambda m, value=value: m.group(1) + value, body, count=1)  # type: ignore[misc]
+        else:
+            body += ("" if body.rstrip().endswith("{") else ", ") + f"{name}: {value}"
+    return body + rest + tail
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip(" "))
+
+
+def _dumped(text: str, written: Mapping[Key, str]) -> str:
+    read = document.parse(text, "sensor").value
+    sensor = read.get("sensor", read)
+    for (effect, parameter), value in written.items():
+        effects = sensor.setdefault("effects", {})
+        own = effects.get(effect)
+        effects[effect] = own = dict(own or {})
+        own[parameter] = document.parse(f"x: {value}", "value").value["x"]
+    return document.dump({"sensor": sensor})

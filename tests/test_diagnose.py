@@ -1,0 +1,131 @@
+"""Diagnose: the open cases of the challenge, a null, a user's own effect, and the file that is written.
+
+The cases were made by another simulator; they are skipped where they are not at hand.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spadmnist import config, measurement, plugins
+from spadmnist.criticism import candidates, diagnose, next_sensor
+from spadmnist.effects import Effect
+
+CASES = Path(__file__).resolve().parents[2] / "shared" / "challenge"
+
+SENSOR = """# what the datasheet says
+sensor:
+  name: small
+  rules: device
+  layout: {rows: 8, columns: 8, pixel_area: 25 um^2, fill_factor: 1.0}
+  effects:
+    detection: {pdp: 0.42}   # at 500 nm
+    dark_counts: {rate: 100 Hz}
+    dead_time: {duration: 50 ns}
+    tdc: {resolution: 100 ps}
+"""
+
+ECHO = '''
+import numpy as np
+from spadmnist.effects import Effect, parameter
+from spadmnist.events import Children
+
+
+class Echo(Effect, stage="correlated"):
+    """A detection echoes in its own pixel, always equally late."""
+
+    share = parameter(0.02, "", "detections that echo", bounds=(0, 1), off=0.0, search=(1e-4, 0.2))
+    delay = parameter(150e-9, "s", "how late, after the dead time", bounds=(0, None), search=(20e-9, 2e-6))
+
+    def spawn(self, events, rng):
+        parent = np.flatnonzero(rng.random(len(events)) < self.share)
+        return Children(parent, np.full(len(parent), self.delay))
+'''
+
+
+def case(name: str):
+    folder = CASES / name
+    if not folder.is_dir():
+        pytest.skip("the challenge's cases are not here")
+    truth = json.loads((CASES / f"{name}.truth.json").read_text())
+    return config.read_sensor(folder / "sensor.yaml"), measurement.open(folder), truth
+
+
+def found_in(name: str, **keywords):
+    sensor, data, truth = case(name)
+    return diagnose.diagnose(sensor, data, quick=True, **keywords), truth
+
+
+@pytest.mark.slow
+def test_a_right_model_is_adequate():
+    found, _ = found_in("open-qis-null")
+    assert found.verdict == "adequate" and not found.steps
+
+
+@pytest.mark.slow
+def test_a_short_gate_is_found_by_its_trace_in_the_dark():
+    found, truth = found_in("open-qis-gate")
+    assert found.verdict == "explained"
+    assert [s.change.effect for s in found.steps] == ["short_gate"]
+    value = found.steps[0].values["fraction"]
+    assert value.low <= truth["hidden"]["gate_fraction"] <= value.high
+
+
+@pytest.mark.slow
+def test_crosstalk_is_found():
+    found, truth = found_in("open-tr-crosstalk")
+    assert found.steps[0].change.effect == "crosstalk"
+    value = found.steps[0].values["probability"]
+    assert value.low <= truth["hidden"]["crosstalk"][0] <= value.high
+    assert found.after < 1.3 < found.before
+
+
+def test_candidates_come_from_the_registry(tmp_path):
+    file = tmp_path / "sensor.yaml"
+    file.write_text(SENSOR)
+    sensor = config.read_sensor(file)
+    names = {change.name for change in candidates.changes(sensor)}
+    assert {"add crosstalk", "add flicker", "set dead_time.duration", "per_pixel detection.pdp"} <= names
+    assert {"add row_pattern", "set dead_time.paralyzable", "per_pixel dark_counts.rate"} <= names
+    # a common factor on the light is the set-up's, and what is listed is not added
+    assert not names & {"set detection.pdp", "add dead_time"}
+    for name in Effect.registry:
+        if name not in {e.name for e in sensor.effects}:
+            declared = Effect.registry.find(name).parameters.values()
+            can = [p for p in declared if p.off is not None and p.search is not None and p.per != "code"]
+            assert bool(can) == (f"add {name}" in names), name
+
+
+def test_the_next_sensor_is_the_users_own_file(tmp_path):
+    file = tmp_path / "sensor.yaml"
+    file.write_text(SENSOR)
+    values = {
+        ("crosstalk", "probability"): 0.005,
+        ("dead_time", "duration"): 52e-9,
+        ("detection", "relative"): np.linspace(0.9, 1.1, 64),
+    }
+    out = next_sensor.write(file, tmp_path / "next" / "sensor.yaml", values, {("crosstalk", "probability"): "from lab"})
+    text = out.read_text()
+    assert "# what the datasheet says" in text and "# at 500 nm" in text and "# from lab" in text
+    read = config.read_sensor(out)
+    assert read.effect("crosstalk").probability == pytest.approx(0.005)
+    assert read.effect("dead_time").duration == pytest.approx(52e-9)
+    assert read.effect("detection").relative == pytest.approx(np.linspace(0.9, 1.1, 64))
+
+
+def test_a_users_own_effect_is_a_candidate(tmp_path):
+    plugin = tmp_path / "echo.py"
+    plugin.write_text(ECHO)
+    file = tmp_path / "sensor.yaml"
+    file.write_text(SENSOR)
+    plugins.load_file(plugin)
+    try:
+        names = {change.name for change in candidates.changes(config.read_sensor(file))}
+        assert "add echo" in names
+    finally:
+        plugins._loaded.pop(plugin.resolve(), None)
+        Effect.registry.classes.pop("echo", None)
