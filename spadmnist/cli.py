@@ -744,7 +744,7 @@ def fit(
 
     \b
     spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml
-    spadmnist fit sensor.yaml lab/2025-03-01 --free dead_time.duration --per-pixel detection.pdp -o next.yaml
+    spadmnist fit sensor.yaml lab --free dead_time.duration --per-pixel detection.pdp -o next.yaml
     """
     from . import config as configs
     from . import disk
