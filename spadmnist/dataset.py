@@ -39,8 +39,8 @@ MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
 STATE = ".spadmnist"
 
-_EVENTS_PER_SHARD = 6_000_000
-_BYTES_PER_SHARD = 56 * 2**20  # before compression
+_EVENTS_PER_SHARD = 9_000_000
+_BYTES_PER_SHARD = 84 * 2**20  # before compression
 _IMAGES_PER_SHARD = 4096
 _BYTES_PER_CHUNK = 4 * 2**20
 _IMAGES_PER_CHUNK = 32  # one image is read in 0.1 ms, and twice as many would compress only 0.5 % better
