@@ -299,3 +299,53 @@ def _texts(plugins: Any) -> list[str]:
         return [plugins]
     inner = plugins.values() if isinstance(plugins, dict) else plugins
     return [text for item in inner for text in _texts(item)]
+
+
+BOTH = (
+    text_of("lossy_bus")
+    + '''
+
+from spadmnist.statistics import Recording, Statistic, Summary
+
+
+class EvenTicks(Statistic):
+    """How many stamps are even numbers: a converter whose lowest bit is stuck shows here."""
+
+    modalities = ("tr",)
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        events = recording.events
+        if events is None or events.ticks is None:
+            return None
+        even = float((events.ticks % 2 == 0).sum())
+        return Summary(
+            values=__import__("numpy").array([even]),
+            law="poisson",
+            where=lambda cell: "all pixels",
+            size=lambda cell, measured, expected: (f"{measured:.0f} stamps", measured / max(expected, 1) - 1),
+        )
+'''
+)
+
+
+@pytest.mark.slow
+def test_a_new_effect_and_a_new_statistic_in_one_file(folder: Path) -> None:
+    """Both are listed; the effect works in configs and models, the statistic is among the checks of a comparison."""
+    file = folder / "mine.py"
+    file.write_text(BOTH)
+    (folder / "c.yaml").write_text(CONFIG + "    lossy_bus: {loss: 25 %}\n")
+    before = listing(ROOT)
+    assert "even_ticks" in command("statistics", "--plugin", file, cwd=folder)
+    assert "even_ticks" not in command("statistics", cwd=folder)
+    assert "lowest bit is stuck" in command("statistics", "even_ticks", "--plugin", file, cwd=folder)
+    assert "lossy_bus" in command("effects", "--plugin", file, cwd=folder)
+    command("generate", "c.yaml", "-o", "out", "--jobs", 1, "--limit", 8, "--plugin", file, cwd=folder)
+    assert BOTH in _texts(json.loads((folder / "out" / "manifest.json").read_text())["plugins"])
+    simulate = ("simulate", "c.yaml", "out", "-o", "twin", "--plugin", file)
+    command(*simulate, cwd=folder)
+    answer = folder / "answer.json"
+    command("compare", "c.yaml", "twin", "--jobs", 2, "--json", answer, "--plugin", file, cwd=folder)
+    checks = json.loads(answer.read_text())["checks"]
+    mine = [c for c in checks if c["statistic"] == "even_ticks"]
+    assert len(mine) == 8 and all(c["passes"] for c in mine)
+    assert listing(ROOT) == before
