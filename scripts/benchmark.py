@@ -204,7 +204,7 @@ def reading(images_dir: Path | None, folder: Path) -> list[Row]:
 REDUCE = """\
 import sys
 from spadmnist import config, measurement
-from spadmnist.criticism.compare import statistics_for
+from spadmnist.criticism.recordings import statistics_for
 data = measurement.open(sys.argv[2])
 recording = data.recording("flat", config.read_sensor(sys.argv[1]))
 for statistic in statistics_for("qis"):

@@ -9,37 +9,28 @@ uncertainty, is a check of its own.
 
 from __future__ import annotations
 
-import functools
 import json
 import math
-import pickle
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel
 from scipy import stats
 
-from .. import plugins, twin
-from ..effects import Conditions
 from ..measurement import Measurement
-from ..recording import Capture, Recording
+from ..recording import Capture
 from ..sensor import Sensor
-from ..statistics import Statistic, Summary
-from ..streams import Streams
-from . import memory
-from .nulls import Judgement, Null, learn, poisson_scores
+from ..statistics import Summary
+from .nulls import Judgement, Null, poisson_scores
+from .recordings import REPLICATES, CaptureNull, model_of, reduced, statistics_for
 
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
-REPLICATES = 96
-_SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
-_LEAST_SPREAD = 0.01
 _SHARES = {"light": 0.25, "rate": 0.25}  # of the false alarms that are allowed
 _REST = 0.5
 _LEAST_P = 1e-300  # a p-value is never 0
-_EVENTS_AT_ONCE = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -139,230 +130,6 @@ def _plain(value: float) -> float:
     return float(f"{min(max(value, -1e300), 1e300):.6g}")
 
 
-# --- the model's recordings -------------------------------------------------------------------------------------
-
-
-def statistics_for(modality: str) -> list[Statistic]:
-    """Every registered statistic that makes sense for a modality."""
-    kinds = [Statistic.registry.find(name) for name in Statistic.registry]
-    return [kind() for kind in kinds if modality in kind.modalities]
-
-
-def simulated(
-    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
-) -> Iterator[Recording]:
-    """The capture as the model makes it, once for each of `numbers`, with so many photons/s (n,) on each pixel.
-
-    Yielded one by one; only a few of them are in memory together.
-    """
-    expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
-    step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
-    for start in range(0, len(numbers), step):
-        some = slice(start, start + step)
-        streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
-        yield from twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
-
-
-class _InTheDark(Sensor):
-    """A sensor without light whose dark rates are all scaled by what would be the photons/s.
-
-    So a dark capture, too, can be simulated with as many detections as were measured: whether their number is right is
-    one question, whether their pattern is, another.
-    """
-
-    @staticmethod
-    def of(sensor: Sensor) -> Sensor:
-        s = sensor
-        return _InTheDark(s.layout, s.effects, s.rules, s.chip_seed, s.name, True)
-
-    def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
-        """The dark rates times the factors that stand for photons."""
-        rate, light = super().rates(np.zeros_like(photons), conditions)
-        return rate * photons, light * photons
-
-
-@dataclass(frozen=True)
-class CaptureNull:
-    """What the model makes of a capture: the null of each statistic, and how the total follows the light.
-
-    level: photons/s on a pixel, in the dark a factor on the rates, about which the recordings were made; stated:
-    what the measurement says; totals: (recordings,) the detections of each.
-    law: log of the total as (offset, slope) of the log of what the closed form `expected` says; scatter: about that.
-    """
-
-    level: float
-    stated: float | None
-    totals: np.ndarray
-    expected: Callable[[float], float]
-    law: tuple[float, float]
-    scatter: float
-    nulls: Mapping[str, Null]
-
-    def total_at(self, level: float) -> float:
-        """Detections of the whole array expected at a level."""
-        return math.exp(self.law[0] + self.law[1] * math.log(self.expected(level)))
-
-    def level_of(self, total: float) -> tuple[float, float, float]:
-        """(level that gives this total, standard error of its log, elasticity of the total there)."""
-        low, high = self.level * 1e-6, self.level * 1e6
-        for _ in range(200):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
-        found = math.sqrt(low * high)
-        step = 1.01
-        elasticity = math.log(self.total_at(found * step) / self.total_at(found / step)) / (2 * math.log(step))
-        error = self.scatter * math.sqrt(1 + 2 / len(self.totals)) / max(elasticity, 1e-3)
-        return found, error, elasticity
-
-
-def _law_of(totals: np.ndarray, told: np.ndarray) -> tuple[tuple[float, float], float]:
-    """((offset, slope), scatter) of log totals against the closed form's; the slope is near 1, by 2 % or so."""
-    x, y = np.log(told), np.log(np.maximum(totals, 0.5))
-    apart = x - x.mean()
-    beside = y - y.mean() - apart
-    noise = float(np.var(beside, ddof=1)) / 0.02**2
-    slope = 1 + float(apart @ beside) / (float(apart @ apart) + max(noise, 1e-12))
-    offset = float(y.mean() - slope * x.mean())
-    return (offset, slope), float(np.std(y - offset - slope * x, ddof=2))
-
-
-@dataclass(frozen=True)
-class _Model:
-    """A sensor on its way to a worker, which must have run the user's plug-in files before it can unpack it."""
-
-    files: tuple[str, ...]
-    packed: bytes
-
-    @staticmethod
-    def of(sensor: Sensor) -> _Model:
-        return _Model(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
-
-    @property
-    def sensor(self) -> Sensor:
-        for file in self.files:
-            plugins.load_file(file)
-        return _unpacked(self.packed)
-
-
-@functools.lru_cache(maxsize=2)
-def _unpacked(packed: bytes) -> Sensor:
-    """What this program has packed itself, a moment ago."""
-    sensor = pickle.loads(packed)
-    assert isinstance(sensor, Sensor)
-    return sensor
-
-
-def _reduced(
-    model: _Model, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
-) -> tuple[list[int], dict[str, list[Summary]]]:
-    """(totals, summaries by statistic) of some of the model's recordings: the task of a worker."""
-    sensor = model.sensor
-    totals: list[int] = []
-    found: dict[str, list[Summary]] = {}
-    known = statistics_for(capture.modality)
-    for recording in simulated(sensor, capture, photons, numbers, seed):
-        totals.append(int(recording.totals.sum()))
-        for statistic in known:
-            summary = reduced(statistic, recording)
-            if summary is not None:
-                # words and functions stay behind: numbers travel between processes
-                bare = Summary(summary.values, summary.law, str, _no_size, summary.scale)
-                found.setdefault(statistic.name, []).append(bare)
-    return totals, found
-
-
-def _no_size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-    return "", 0.0
-
-
-def reduced(statistic: Statistic, recording: Recording) -> Summary | None:
-    """A statistic's summary; an error of a user's own statistic is told with its file and line."""
-    try:
-        return statistic.reduce(recording)
-    except Exception as error:
-        if type(statistic).__module__.startswith(f"{__package__.partition('.')[0]}."):
-            raise
-        raise plugins.blame(statistic, error) from error
-
-
-def model_of(
-    sensor: Sensor,
-    capture: Capture,
-    total: float,
-    seed: int,
-    replicates: int,
-    parallel: Parallel,
-    told: Callable[[int], None],
-) -> CaptureNull:
-    """Simulate a capture many times and learn its nulls. total: detections measured, to find a level that is free."""
-    if capture.light.dark:
-        sensor = _InTheDark.of(sensor)
-        stated: float | None = 1.0
-    else:
-        stated = twin.photons_at(capture, sensor.layout)
-    expected = _closed_form(sensor, capture)
-    centre = _level_for(expected, total, stated)
-    uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
-    half = max(_LEAST_SPREAD, _SPREAD * uncertainty)
-    if stated is not None and (total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(total, 1.0))):
-        centre = stated  # the same recordings then serve every measurement of this model
-    entry = memory.name_of(sensor, capture, centre, half, seed, replicates) if centre == stated else ""
-    known = memory.recall(entry) if entry else None
-    if known is not None:
-        told(replicates)
-        (offset, slope, scatter), array, nulls = known[0]["law"], known[0]["totals"], known[1]
-        return CaptureNull(centre, stated, array, expected, (float(offset), float(slope)), float(scatter), nulls)
-    numbers = np.arange(replicates, dtype=np.uint64)
-    # evenly spread, in an order that has nothing to do with the number
-    order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
-    factors = np.exp(half * np.linspace(-1, 1, replicates)[order])
-    tasks = np.array_split(numbers, max(1, min(replicates // 4, 24))) if sensor.block == 1 else [numbers]
-    packed = _Model.of(sensor)
-    results = parallel(
-        delayed(_reduced)(packed, capture, centre * factors[part.astype(int)], part, seed) for part in tasks
-    )
-    totals: list[int] = []
-    found: dict[str, list[Summary]] = {}
-    for part_totals, part_found in results:
-        totals += part_totals
-        for name, summaries in part_found.items():
-            found.setdefault(name, []).extend(summaries)
-        told(len(part_totals))
-    array = np.array(totals, float)
-    whole = {name: summaries for name, summaries in found.items() if len(summaries) == replicates}
-    nulls = {name: learn(summaries, array) for name, summaries in whole.items()}
-    law, scatter = _law_of(array, np.array([expected(float(centre * f)) for f in factors]))
-    if entry:
-        memory.keep(entry, {"law": np.array([*law, scatter]), "totals": array}, nulls)
-    return CaptureNull(centre, stated, array, expected, law, scatter, nulls)
-
-
-def _closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
-    """Level -> detections of the whole array, as the effects' closed forms have it."""
-    conditions = capture.conditions
-
-    @functools.lru_cache(maxsize=4096)
-    def detections(level: float) -> float:
-        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), level), conditions)
-        if capture.modality == "tr" or (capture.modality == "counts" and conditions.counting == "counter"):
-            return max(float(recorded.sum()), 1e-9)
-        live = conditions.frame_time / conditions.frame_period
-        share = -np.expm1(-candidates * live / conditions.frames)
-        return max(float((conditions.frames * share).sum()), 1e-9)
-
-    return detections
-
-
-def _level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
-    """The level at which so many detections are expected; the stated one where none does."""
-    low, high = 1e-6, 1e12
-    for _ in range(100):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if expected(middle) < total else (low, middle)
-    found = math.sqrt(low * high)
-    return found if 1e-5 < found < 1e11 else stated or 1.0
-
-
 # --- the comparison ---------------------------------------------------------------------------------------------
 
 
@@ -427,7 +194,7 @@ def compare(
                 )
                 if null.law != "exact":
                     judged.append((judgement, null))
-    nuisances, common = _light(levels, captures)
+    nuisances, common = light_of(levels, captures)
     checks += common
     checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
     misfit = float(np.mean([j.misfit for j, _ in judged])) if judged else 1.0
@@ -488,7 +255,7 @@ def _level_checks(
     return [Check("rate", capture.id, z * z, p, "all pixels, no light", size, relative)]
 
 
-def _light(
+def light_of(
     levels: Sequence[tuple[Capture, float, float, float]], captures: Sequence[Capture]
 ) -> tuple[list[Nuisance], list[Check]]:
     """The common light factor, each capture's own, and whether they are as the measurement states."""

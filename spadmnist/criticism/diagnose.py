@@ -21,7 +21,7 @@ from ..errors import InputError, SpadError
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import compare as comparing
-from . import fit, mapping
+from . import fit, mapping, recordings
 from .candidates import Change, Key, changes, templates, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
 
@@ -510,7 +510,7 @@ def _nuisances(bench: Bench, state: State) -> list[dict[str, Any]]:
             continue
         level, error, elasticity = null.level_of(seen.total)
         levels.append((seen.capture, math.log(level / null.stated), error, elasticity))
-    found, _ = comparing._light(levels, [s.capture for s in bench.seen.values()])
+    found, _ = comparing.light_of(levels, [s.capture for s in bench.seen.values()])
     return [
         {"capture": n.capture, "name": n.name, **{k: _plain(getattr(n, k)) for k in ("value", "low", "high", "pull")}}
         for n in found
@@ -535,7 +535,7 @@ def diagnose(
     """
     say = progress or (lambda what: None)
     with Parallel(n_jobs=jobs) as parallel:
-        bench = Bench(sensor, measurement, seed, parallel, 32 if quick else comparing.REPLICATES, say)
+        bench = Bench(sensor, measurement, seed, parallel, 32 if quick else recordings.REPLICATES, say)
         return _diagnosed(bench, measurement, max_steps, quick, say)
 
 
@@ -925,7 +925,7 @@ def fitted(
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
     with Parallel(n_jobs=jobs) as parallel:
-        bench = Bench(sensor, measurement, seed, parallel, comparing.REPLICATES, say)
+        bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         search = _Search(bench, say)
         say("the model as it is")
         state = bench.state({})

@@ -23,6 +23,7 @@ from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Summary
 from . import compare as comparing
+from . import recordings
 from .candidates import Dial, Key, Values, with_values
 from .nulls import Null, _standardized, learn
 
@@ -63,7 +64,7 @@ class State:
     sensors: Sensors
     made: dict[str, Made]
     nulls: dict[Cell, Null]
-    rates: dict[str, comparing.CaptureNull]
+    rates: dict[str, recordings.CaptureNull]
     factors: dict[str, np.ndarray]
     residuals: dict[Cell, np.ndarray]
     own: dict[Cell, np.ndarray]
@@ -98,7 +99,7 @@ class Sensors:
 
 
 def _task(
-    models: Sequence[comparing._Model],
+    models: Sequence[recordings.Packed],
     capture: Capture,
     photons: np.ndarray,
     numbers: np.ndarray,
@@ -108,13 +109,13 @@ def _task(
     """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each."""
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = comparing.statistics_for(capture.modality)
+    known = recordings.statistics_for(capture.modality)
 
     def take(recording: Recording) -> None:
         recording = replace(recording, dead_time=dead, _kept={})
         totals.append(int(recording.totals.sum()))
         for statistic in known:
-            summary = comparing.reduced(statistic, recording)
+            summary = recordings.reduced(statistic, recording)
             if summary is not None:
                 found.setdefault(statistic.name, []).append(summary)
 
@@ -123,8 +124,8 @@ def _task(
             some = slice(None) if len(models) == 1 else slice(k, k + 1)
             sensor = model.sensor
             if capture.light.dark:
-                sensor = comparing._InTheDark.of(sensor)
-            for recording in comparing.simulated(sensor, capture, photons[some], numbers[some], seed):
+                sensor = recordings.InTheDark.of(sensor)
+            for recording in recordings.simulated(sensor, capture, photons[some], numbers[some], seed):
                 take(recording)
     except (SpadError, ValueError) as error:
         return str(error)
@@ -164,8 +165,8 @@ class Bench:
                 continue
             recording = measurement.recording(capture.id, self.start)
             summaries = {}
-            for statistic in comparing.statistics_for(recording.modality):
-                summary = comparing.reduced(statistic, recording)
+            for statistic in recordings.statistics_for(recording.modality):
+                summary = recordings.reduced(statistic, recording)
                 if summary is not None:
                     summaries[statistic.name] = summary
             counts = np.asarray(recording.totals, float)
@@ -182,9 +183,9 @@ class Bench:
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             for part in parts:
                 if sensors.alike:
-                    models = [comparing._Model.of(sensors.of(id, 0))]
+                    models = [recordings.Packed.of(sensors.of(id, 0))]
                 else:
-                    models = [comparing._Model.of(sensors.of(id, int(numbers[i]))) for i in part]
+                    models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
                 tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead))
         self.simulations += sum(len(n) for _, _, _, n in wanted)
         results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
@@ -198,7 +199,7 @@ class Bench:
     def closed_form(self, sensor: Sensor, id: str) -> Callable[[float], float]:
         """Level -> detections of the array in a capture; in the dark the level is a factor on the rates."""
         capture = self.seen[id].capture
-        return comparing._closed_form(comparing._InTheDark.of(sensor) if capture.light.dark else sensor, capture)
+        return recordings.closed_form(recordings.InTheDark.of(sensor) if capture.light.dark else sensor, capture)
 
     def matched(self, state: State, sensor: Sensor, id: str) -> float:
         """By how much the light must differ for a sensor to give as many detections as the state's; 1 where none does.
@@ -235,13 +236,13 @@ class Bench:
     def _centre(self, sensor: Sensor, seen: Seen) -> tuple[float, float | None, Callable[[float], float], float]:
         capture = seen.capture
         if capture.light.dark:
-            sensor, stated = comparing._InTheDark.of(sensor), 1.0
+            sensor, stated = recordings.InTheDark.of(sensor), 1.0
         else:
             stated = twin.photons_at(capture, sensor.layout)  # type: ignore[assignment]
-        expected = comparing._closed_form(sensor, capture)
-        centre = comparing._level_for(expected, seen.total, stated)
+        expected = recordings.closed_form(sensor, capture)
+        centre = recordings.level_for(expected, seen.total, stated)
         uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
-        half = max(_LEAST_SPREAD, comparing._SPREAD * uncertainty)
+        half = max(recordings.LEAST_SPREAD, recordings.SPREAD * uncertainty)
         if stated is not None and (
             seen.total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(seen.total, 1.0))
         ):
@@ -266,14 +267,14 @@ class Bench:
             if isinstance(made, str):
                 raise SpadError(f"{id}: {made}")
             state.made[id] = made
-            law, scatter = comparing._law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
-            state.rates[id] = comparing.CaptureNull(centre, stated, made.totals, expected, law, scatter, {})
+            law, scatter = recordings.law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
+            state.rates[id] = recordings.CaptureNull(centre, stated, made.totals, expected, law, scatter, {})
             state.factors[id] = factors
             for name, summary in self.seen[id].summaries.items():
                 if name not in made.values:
                     continue
                 kind, scale = made.laws[name]
-                null = learn([Summary(v, kind, str, comparing._no_size, scale) for v in made.values[name]], made.totals)
+                null = learn([Summary(v, kind, str, recordings.no_size, scale) for v in made.values[name]], made.totals)
                 cell = id, name
                 state.nulls[cell] = null
                 judged = null.judge(summary.values, self.seen[id].total)

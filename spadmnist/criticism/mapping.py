@@ -17,8 +17,8 @@ from scipy import stats
 
 from ..sensor import Sensor
 from .candidates import Change, Key, Values, with_values
-from .compare import _InTheDark
 from .fit import Bench, Sensors
+from .recordings import InTheDark
 
 _TAILS = 3.0  # degrees of freedom of the prior
 _TURNS = 12
@@ -69,7 +69,7 @@ class _Line:
 
     def expected(self, sensor: Sensor) -> np.ndarray:
         if self.seen.capture.light.dark:
-            sensor = _InTheDark.of(sensor)
+            sensor = InTheDark.of(sensor)
         candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), self.level), self.conditions)
         if not self.frames or (self.conditions.counting == "counter" and self.seen.capture.modality == "counts"):
             return np.maximum(recorded[0], 1e-9)
