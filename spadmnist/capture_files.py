@@ -19,10 +19,11 @@ import contextlib
 import math
 import mmap
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ _LARGEST_FRAME = 1 << 28  # bytes
 _PIECE = 1 << 20  # events that are read at a time
 _FRAMES_AT_ONCE = 1 << 25  # bytes as they are stored
 _KEPT = 1 << 26  # bytes: frames that are no more than this are read once and kept
-_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
+FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
 # what h5py raises on damaged files
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, OverflowError, TypeError, EOFError)
 
@@ -58,7 +59,7 @@ class _Found:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
     """The HDF5 file; whatever is wrong with it becomes a sentence."""
     import h5py
 
@@ -105,8 +106,8 @@ def _data_set(file: Any, name: str, path: Path) -> Any:
         raise InputError(f"{path}: {name} holds {found.dtype}; unsigned integers are read: store it as uint32 or alike")
     made = found.id.get_create_plist()
     for code in (made.get_filter(i)[0] for i in range(made.get_nfilters())):
-        if code not in _FILTERS:
-            allowed = ", ".join(_FILTERS.values())
+        if code not in FILTERS:
+            allowed = ", ".join(FILTERS.values())
             raise InputError(f"{path}: {name} is stored with the filter number {code}; allowed are {allowed}")
     if found.chunks is not None and math.prod(found.chunks) * found.dtype.itemsize > _LARGEST_CHUNK:
         raise InputError(
@@ -115,7 +116,7 @@ def _data_set(file: Any, name: str, path: Path) -> Any:
     return found
 
 
-def _check_stored(found: Any, name: str, path: Path) -> None:
+def check_stored(found: Any, name: str, path: Path) -> None:
     """What was declared but never written would be read as zeros."""
     if not found.size:
         return
@@ -130,7 +131,7 @@ def _check_stored(found: Any, name: str, path: Path) -> None:
         )
 
 
-def _attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
+def attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
     """A number or text from the first of some nodes that has it; None where none has."""
     import h5py
 
@@ -177,12 +178,12 @@ def examine(path: Path, capture: Capture, shape: tuple[int, int]) -> Capture:
 
     shape: rows and columns of the array. Raises InputError with a sentence.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         return _found(file, capture, shape, path).capture
 
 
 def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _Found:
-    said = _attribute((file,), "modality", path)
+    said = attribute((file,), "modality", path)
     if said is not None and said != capture.modality:
         raise InputError(
             f"{path}: says that it is {str(said)[:40]!r}, but the capture {capture.id} is {capture.modality!r}; "
@@ -216,7 +217,7 @@ def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _
         raise InputError(f"{path}: frames holds booleans; store unsigned integers")
     if math.prod(wanted[1:]) * frames.dtype.itemsize > _LARGEST_FRAME:
         raise InputError(f"{path}: one frame has more than {_LARGEST_FRAME >> 20} MiB; that is more than can be read")
-    _check_stored(frames, "frames", path)
+    check_stored(frames, "frames", path)
     return found
 
 
@@ -238,13 +239,13 @@ def _found_events(file: Any, capture: Capture, path: Path) -> _Found:
             f"{path}: declares {len(time):,} detections; a capture may have {_MOST_EVENTS:,}, which take 8 GiB: "
             "cut it into several"
         )
-    _check_stored(time, "time", path)
-    _check_stored(pixel, "pixel", path)
+    check_stored(time, "time", path)
+    check_stored(pixel, "pixel", path)
     return _Found(capture, _tick((file, time), capture.conditions.exposure, path))
 
 
 def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
-    value = _attribute(nodes, "tick", path)
+    value = attribute(nodes, "tick", path)
     if value is None:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
     if isinstance(value, str) or not 0 < value < math.inf:
@@ -259,7 +260,7 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
 
 
 def _is_packed(file: Any, frames: Any, columns: int, path: Path) -> bool:
-    width = _attribute((frames, file), "width", path)
+    width = attribute((frames, file), "width", path)
     if width is None:
         if frames.shape[2] == columns:
             return False
@@ -277,8 +278,8 @@ def _is_packed(file: Any, frames: Any, columns: int, path: Path) -> bool:
 def _found_counts(file: Any, frames: Any, capture: Capture, path: Path) -> _Found:
     """Count frames: a capture states the clock of the binary frames that they sum, or that of the count frames."""
     c = capture.conditions
-    bits = _attribute((file, frames), "bits", path)
-    counting = _attribute((file, frames), "counting", path) or "frames"
+    bits = attribute((file, frames), "bits", path)
+    counting = attribute((file, frames), "counting", path) or "frames"
     if bits is None:
         raise InputError(f"{path}: lacks the attribute bits, of a count; write for example bits = 8")
     if isinstance(bits, (str, float)) or not 1 <= bits <= _MOST_BITS:
@@ -313,7 +314,7 @@ def read(path: Path, capture: Capture, layout: Layout, dead_time: float) -> tupl
 
     Raises InputError with a sentence.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         found = _found(file, capture, layout.shape, path)
         if capture.modality == "tr":
             events, notes = _events(file, found, layout.pixels, path)
@@ -414,7 +415,7 @@ class StoredFrames:
             return np.zeros((0, *self.shape[1:]), self._type)
         first, kept = self._kept or (0, np.zeros((0, *self.shape[1:]), self._type))
         if not first <= start < stop <= first + len(kept):
-            with _opened(self._path) as file:
+            with opened(self._path) as file:
                 frames = _data_set(file, "frames", self._path)
                 first, last = self._around(start, stop, frames)
                 kept = self._read(frames, first, last)
@@ -481,42 +482,120 @@ class StoredFrames:
 _FINEST = 1e-12  # s: the tick of stamps that a sensor without a converter gives
 
 
-def file_image(recording: Recording) -> bytes:
-    """A whole HDF5 file of a recording, made in memory: the same bytes for the same recording.
+def write(recording: Recording, file: IO[bytes], attributes: Mapping[str, Any] | None = None) -> None:
+    """Write a recording as an HDF5 file into a new, empty file, piece by piece: the same bytes for the same recording.
 
-    Detections stand grouped by pixel. Stamps that are no whole ticks are rounded down to ticks of 1 ps.
+    Detections stand grouped by pixel. Stamps that are no whole ticks are rounded down to ticks of 1 ps. attributes:
+    more of them for the file. Raises OSError where the file cannot be written, which then holds anything.
+    """
+
+    def fill(made: Any, alive: Callable[[], None]) -> None:
+        _put(made, {"modality": recording.modality})
+        if recording.events is not None:
+            _put_events(made, recording, recording.events, alive)
+        else:
+            _put_frames(made, recording, alive)
+        _put(made, dict(attributes or {}))
+
+    write_hdf5(file, fill)
+
+
+def size(recording: Recording) -> int:
+    """Bytes of a recording's data before they are packed; a file of it is hardly ever larger."""
+    if recording.frames is not None:
+        return math.prod(recording.frames.shape) * np.asarray(recording.frames[:0]).itemsize
+    return 12 * (0 if recording.events is None else len(recording.events))
+
+
+def write_hdf5(file: IO[bytes], fill: Callable[[Any, Callable[[], None]], None]) -> None:
+    """Write an HDF5 file into a new, empty file. fill: called with the open `h5py.File`, and with what it calls now and
+    then: it raises where going on makes no sense.
+
+    HDF5 crashes where writing fails, or where a signal makes Python raise while it writes. So it writes to what never
+    fails, and in a thread of its own, for signals reach the main thread alone; what went wrong is raised here.
     """
     import h5py
 
-    with h5py.File(
-        "capture.h5", "w", driver="core", backing_store=False, block_size=1 << 22, libver=("earliest", "v110")
-    ) as file:
-        _put(file, {"modality": recording.modality})
-        if recording.events is not None:
-            _put_events(file, recording, recording.events)
-        else:
-            _put_frames(file, recording)
-        file.flush()
-        return bytes(file.id.get_file_image())
+    sink = _Sink(file)
+
+    def alive() -> None:
+        if sink.failure is not None:
+            raise sink.failure
+
+    def work() -> None:
+        with h5py.File(sink, "w", libver=("earliest", "v110")) as made:
+            fill(made, alive)
+
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            thread.submit(work).result()
+        except BaseException as error:
+            sink.failure = sink.failure or error
+    alive()
 
 
-def _put_events(file: Any, recording: Recording, events: Events) -> None:
-    tick, ticks = events.tick, events.ticks
-    if ticks is None or tick is None:
+class _Sink:
+    """A file as HDF5 sees it. The first failure is kept and ends the writing, of which HDF5 is not told."""
+
+    def __init__(self, file: IO[bytes]):
+        self.failure: BaseException | None = None
+        self._file, self._at, self._end = file, 0, 0
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = offset + (self._end if whence == 2 else 0)
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def write(self, data: Any) -> int:
+        self._try(self._file.write, data)
+        self._at += len(data)
+        self._end = max(self._end, self._at)
+        return len(data)
+
+    def read(self, size: int) -> bytes:
+        return (self._try(self._file.read, size) or b"").ljust(size, b"\0")
+
+    def truncate(self, size: int) -> int:
+        self._try(self._file.truncate, size)
+        self._end = size
+        return size
+
+    def flush(self) -> None:
+        self._try(self._file.flush)
+
+    def _try(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        if self.failure is None:
+            try:
+                self._file.seek(self._at)
+                return call(*arguments)
+            except BaseException as error:
+                self.failure = error
+        return None
+
+
+def _put_events(file: Any, recording: Recording, events: Events, alive: Callable[[], None]) -> None:
+    pixels, count, tick = recording.pixels, len(events), events.tick
+    kind = np.dtype(np.uint8) if events.ticks is None else events.ticks.dtype
+    if events.ticks is None or tick is None:
         tick = _FINEST
-        ticks = (events.times / tick).astype(unsigned_for(recording.conditions.exposure / tick, "time stamps"))
-    pixels = recording.pixels
-    where = np.repeat(np.arange(pixels, dtype=np.uint16 if pixels <= 1 << 16 else np.uint32), events.counts)
+        kind = np.dtype(unsigned_for(recording.conditions.exposure / tick, "time stamps"))
     _put(file, {"tick": tick, "tick_units": "s"})
     about = "time of each detection since the start of the exposure"
-    for name, data, unit, text in (
-        ("time", ticks, units.show(tick, "s", 12), about),
-        ("pixel", where, "1", "pixel of each detection, counted row by row"),
-    ):
-        _create(file, name, data.shape, data.dtype, min(len(data), 1 << 16), unit, text)[...] = data
+    time = _create(file, "time", (count,), kind, min(count, 1 << 16), units.show(tick, "s", 12), about)
+    numbers = np.uint16 if pixels <= 1 << 16 else np.uint32
+    about = "pixel of each detection, counted row by row"
+    pixel = _create(file, "pixel", (count,), numbers, min(count, 1 << 16), "1", about)
+    for start in range(0, count, _PIECE):
+        alive()
+        some = slice(start, min(start + _PIECE, count))
+        stamps = events.times[some] / tick if events.ticks is None else events.ticks[some]
+        time[some] = stamps.astype(kind)
+        pixel[some] = np.repeat(np.arange(pixels), np.diff(events.offsets.clip(some.start, some.stop)))
 
 
-def _put_frames(file: Any, recording: Recording) -> None:
+def _put_frames(file: Any, recording: Recording, alive: Callable[[], None]) -> None:
     assert recording.frames is not None
     c, modality = recording.conditions, recording.modality
     largest = max(recording.none, 1) if modality == "str" else c.largest_count
@@ -533,12 +612,15 @@ def _put_frames(file: Any, recording: Recording) -> None:
         _put(file, {"bits": c.bits, "counting": c.counting})
         about = "detections of a count frame"
     shape = recording.frames.shape
-    rows = max(1, min(shape[0], (1 << 20) // max(1, math.prod(shape[1:]) * kind.itemsize)))
+    each = max(1, math.prod(shape[1:]) * kind.itemsize)
+    rows = max(1, min(shape[0], (1 << 20) // each))
     frames = _create(file, "frames", shape, kind, rows, unit, about)
     if modality == "qis":
         frames.attrs["width"] = recording.layout.columns
-    for start, part in recording.chunks():
-        frames[start : start + len(part)] = part
+    step = rows * max(1, _FRAMES_AT_ONCE // 2 // (rows * each))  # whole chunks, so that none is packed twice
+    for start in range(0, shape[0], step):
+        alive()
+        frames[start : start + step] = recording.frames[start : min(start + step, shape[0])]
 
 
 def _create(file: Any, name: str, shape: tuple[int, ...], kind: Any, rows: int, unit: str, about: str) -> Any:

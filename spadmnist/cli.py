@@ -312,7 +312,8 @@ def simulate(
     _load(plugin_files)
     model = config.read_sensor(sensor)
     opened = library.open(measurement)
-    twin.simulate(model, opened, output, seed)
+    with _terminal() as progress:
+        twin.simulate(model, opened, output, seed, progress)
     if as_json:
         click.echo(json.dumps({"measurement": str(output), "captures": [c.id for c in opened.captures]}))
     else:
@@ -429,7 +430,7 @@ def _count(damage: Any) -> str:
 @click.option("--dataset", metavar="PATH", help="In HDF5: the frames.  [default: frames]")
 @click.option("--tdc", type=click.Path(path_type=Path), metavar="FILE.csv", help="LinoSPAD2: ends of the codes, in ps.")
 @click.option("--offsets", type=click.Path(path_type=Path), metavar="FILE.npy", help="LinoSPAD2: of the pixels, in ps.")
-@click.option("--firmware", type=click.Choice(["2212b", "2212s"]), default=None, help="LinoSPAD2.")
+@click.option("--firmware", type=click.Choice(["2212b", "2212s", "2208"]), default=None, help="LinoSPAD2.")
 @click.option("--timestamps", type=click.IntRange(1, 2**24), default=None, metavar="N", help="LinoSPAD2: of a cycle.")
 @click.option("--cycle", metavar="TIME", help="LinoSPAD2: its length.")
 @_json
@@ -506,7 +507,8 @@ def export(
 
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
-    paths = exporters.export(library.open(measurement, readout), output, format_, ids)
+    with _terminal() as progress:
+        paths = exporters.export(library.open(measurement, readout), output, format_, ids, progress)
     if as_json:
         click.echo(json.dumps({"files": [str(path) for path in paths]}))
         return
@@ -698,19 +700,19 @@ def diagnose(
     from . import config as configs
     from . import disk
     from . import measurement as measurements
+    from .criticism import answer, next_sensor
     from .criticism import diagnose as criticism
-    from .criticism import next_sensor
 
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
         with _writing(output):
-            found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, criticism.notes(found)))
+            found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, answer.notes(found)))
     if json_file is not None:
         with _writing(json_file):
-            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
-    click.echo(criticism.table(found))
+            disk.commit_file(json_file, (answer.canonical(found) + "\n").encode(), json_file.parent)
+    click.echo(answer.table(found))
 
 
 @cli.command(short_help="Settle parameters of a model.")
@@ -749,18 +751,18 @@ def fit(
     from . import config as configs
     from . import disk
     from . import measurement as measurements
+    from .criticism import answer, next_sensor
     from .criticism import diagnose as criticism
-    from .criticism import next_sensor
 
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
     with _writing(output):
-        found.file = str(next_sensor.write(sensor, output, found.values, criticism.notes(found)))
+        found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found)))
     if json_file is not None:
         with _writing(json_file):
-            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
-    click.echo(criticism.table(found))
+            disk.commit_file(json_file, (answer.canonical(found) + "\n").encode(), json_file.parent)
+    click.echo(answer.table(found))
 
 
 @cli.command("methods", short_help="List flux reconstructions, or describe one.")

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import io
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from . import __version__, capture_files, disk
 from .errors import SpadError
+from .factory import Progress
 from .importers.captures import safe_name
 from .measurement import Measurement
 from .recording import Recording
@@ -62,7 +62,9 @@ class Target:
         raise NotImplementedError
 
 
-def export(measurement: Measurement, out: Path, format: str, ids: tuple[str, ...] = ()) -> list[Path]:
+def export(
+    measurement: Measurement, out: Path, format: str, ids: tuple[str, ...] = (), progress: Progress | None = None
+) -> list[Path]:
     """Write captures (`ids`; all that have data, without them) to a file, or to files in a folder; their paths.
 
     `out` is a file where it ends as such files do, otherwise a folder. What is there already is not written over.
@@ -87,20 +89,29 @@ def export(measurement: Measurement, out: Path, format: str, ids: tuple[str, ...
             raise SpadError(f"{capture.id} is {capture.modality}, which {format} cannot hold; take one of {others}")
         if path.exists():
             raise SpadError(f"{path}: is there already, and is not written over; remove it, or name another with -o")
+    progress = progress or Progress()
+    progress.start("exporting", len(chosen), 0.0)
     for capture, path in zip(chosen, paths, strict=True):
-        with _whole(path) as file:
-            target.put(measurement.recording(capture.id), file)
+        one = measurement.recording(capture.id)
+
+        def told(share: float, id: str = capture.id) -> None:
+            progress.advance(share, id)
+
+        with _whole(path, capture_files.size(one)) as file:
+            target.put(one.watched(told), file)
+        if one.frames is None:
+            told(1.0)
     return paths
 
 
 @contextlib.contextmanager
-def _whole(path: Path) -> Iterator[IO[bytes]]:
+def _whole(path: Path, size: int) -> Iterator[IO[bytes]]:
     """A new file that is there as a whole or not at all."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
-    with disk.writing(path, 0):
+    with disk.writing(path, size):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with open(part, "xb") as file:
+            with open(part, "x+b") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -126,13 +137,8 @@ class PlainHdf5(Target):
 
     @classmethod
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
-        """Made in memory, packed: HDF5 itself never touches the disk (it crashes on a full one)."""
-        import h5py
-
-        image = io.BytesIO(capture_files.file_image(recording))
-        with h5py.File(image, "r+") as made:
-            made.attrs.update(facts(recording))
-        file.write(image.getbuffer())
+        """Piece by piece, packed."""
+        capture_files.write(recording, file, facts(recording))
 
 
 class Npz(Target):
@@ -197,8 +203,6 @@ class PhotonHdf5(Target):
     @classmethod
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
         """What the format asks for, each field with the description that it prescribes; our own part in /user."""
-        import h5py
-
         ticks, pixel, tick = _events(recording)
         order = np.argsort(ticks, kind="stable")
         lit = recording.capture.light
@@ -221,8 +225,10 @@ class PhotonHdf5(Target):
         }
         if lit.wavelength is not None:
             values["setup/excitation_wavelengths"] = np.array([lit.wavelength])
-        with h5py.File("photons.hdf5", "w", driver="core", backing_store=False) as made:
+
+        def fill(made: Any, alive: Callable[[], None]) -> None:
             for name, value in values.items():
+                alive()
                 filters = {}
                 if np.ndim(value) and np.size(value):
                     filters = {"chunks": (min(len(value), 1 << 16),), "compression": 1, "shuffle": True}
@@ -235,8 +241,8 @@ class PhotonHdf5(Target):
             )
             for name, value in (("format_name", "Photon-HDF5"), ("format_version", "0.5")):
                 made.attrs[name] = np.bytes_(value)
-            made.flush()
-            file.write(made.id.get_file_image())
+
+        capture_files.write_hdf5(file, fill)
 
 
 _ONE = tuple(f"setup/num_{what}" for what in ("spots", "spectral_ch", "polarization_ch", "split_ch"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import filecmp
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -524,20 +525,25 @@ def write(
     first recording is asked for.
 
     Every file appears by one rename, `measurement.yaml` last. A file that is there and has the same bytes stays; a
-    folder that holds anything else is refused. Raises SpadError where it cannot be written.
+    folder that holds anything else is refused. Raises SpadError where it cannot be written, and for a capture that
+    could not be opened again.
     """
     root = Path(path)
+    for capture in captures:
+        _check_counts(capture)
     if root.exists() and not root.is_dir():
         raise SpadError(f"{root} is a file; choose another place with -o")
     with disk.writing(root, 0):
         root.mkdir(parents=True, exist_ok=True)
     with _alone(root):
         _check_place(root, captures, layout)
+        disk.sweep(disk.temporary(root))
         done: list[Capture] = []
         for one in recordings:
             done.append(one if isinstance(one, Capture) else one.capture)
+            _check_counts(done[-1])
             if isinstance(one, Recording):
-                _commit(root, _files(done)[-1], capture_files.file_image(one))
+                _commit_recording(root, _files(done)[-1], one)
         if layout.positions is not None:
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
         _check_place(root, done, layout)
@@ -583,7 +589,10 @@ def _alone(root: Path) -> Iterator[None]:
 
 def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> None:
     """Refuse a folder that holds anything but parts of this measurement. captures: all of them; none: not known yet."""
-    there = {entry.name for entry in os.scandir(root)} - {FILE, disk.temporary(root).parent.name}
+    own = disk.temporary(root).parent
+    there = set(os.listdir(root)) - {FILE, own.name}
+    if own.is_dir():  # a dataset that was begun keeps more there
+        there |= {f"{own.name}/{name}" for name in os.listdir(own)} - {f"{own.name}/{disk.temporary(root).name}"}
     if layout.positions is not None:
         there.discard(_POSITIONS)
     known = set(_files(captures))
@@ -592,16 +601,45 @@ def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> Non
         raise SpadError(f"{root} is not empty (there is {strange[0]}); choose another folder with -o, or remove it")
 
 
+def _check_counts(capture: Capture) -> None:
+    """Raise InputError where a part of the exposure would be in no count: a count sums 2^bits - 1 binary frames."""
+    c = capture.conditions
+    if capture.modality == "counts" and c.counting == "frames" and c.frames % c.largest_count:
+        raise InputError(
+            f"{capture.id}: {c.frames} binary frames do not fill count frames of {c.bits} bits, each the sum of "
+            f"{c.largest_count}; take {c.count_frames * c.largest_count or c.largest_count}"
+        )
+
+
 def _commit(root: Path, name: str, data: bytes) -> None:
     final = root / name
     if final.exists():
         if not final.is_file() or final.stat().st_size != len(data) or final.read_bytes() != data:
-            raise SpadError(
-                f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another "
-                f"folder with -o, or remove {root}"
-            )
+            raise _another(final)
         return
     disk.commit_file(final, data, disk.temporary(root))
+
+
+def _commit_recording(root: Path, name: str, one: Recording) -> None:
+    """Like `_commit`, written piece by piece."""
+    final = root / name
+    with disk.writing(final, capture_files.size(one)), disk.workspace(disk.temporary(root)) as work:
+        new = work / name
+        with new.open("x+b") as file:
+            capture_files.write(one, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if not final.exists():
+            disk.install(new, final, work / "aside")
+        elif not final.is_file() or not filecmp.cmp(new, final, shallow=False):
+            raise _another(final)
+
+
+def _another(final: Path) -> SpadError:
+    return SpadError(
+        f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another folder "
+        f"with -o, or remove {final.parent}"
+    )
 
 
 def _yaml(name: str, layout: Layout, captures: Sequence[Capture]) -> str:
@@ -685,6 +723,9 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
         **dict.fromkeys(("hot_pixels", "dead_pixels", "ones_share", "shortest_interval")),
         "notes": list(measurement.notes.get(capture.id, [])),
     }
+    frames = capture.modality in ("qis", "str")
+    if capture.mean is not None:
+        row |= {"rate_mean": capture.mean / row["live"], "ones_share": capture.mean / c.frames if frames else None}
     if recorded is None:
         return row
     totals = recorded.totals
@@ -699,7 +740,7 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
         "hot_pixels": int((totals > largest + 5 * np.sqrt(largest) + 10).sum()),
         "dead_pixels": int((totals == 0).sum()) if median >= 20 else None,
     }
-    if capture.modality in ("qis", "str"):
+    if frames:
         row["ones_share"] = float(totals.mean() / c.frames)
     if recorded.events is not None:
         shortest = [float(piece.min()) for piece in intervals(recorded.events) if len(piece)]

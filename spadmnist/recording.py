@@ -5,9 +5,9 @@ Simulated and measured data are the same type, so that no statistic can know whi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from . import kernels
 from .effects import Conditions
 from .events import Events, Layout
 from .readout import Recorded, no_detection
+
+T = TypeVar("T")
 
 MODALITIES = ("tr", "str", "qis", "counts")
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
@@ -130,9 +132,13 @@ class Recording:
     @property
     def totals(self) -> np.ndarray:
         """(pixels,) detections of each pixel (counts of all frames for `counts`)."""
-        if "totals" not in self._kept:
-            self._kept["totals"] = self._totals()
-        return self._kept["totals"]  # type: ignore[return-value]
+        return self.kept("totals", self._totals)
+
+    def kept(self, name: str, make: Callable[[], T]) -> T:
+        """What is computed of the data by name: made when it is first asked for, then kept with them."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        return self._kept[name]  # type: ignore[return-value]
 
     def _totals(self) -> np.ndarray:
         if self.events is not None:
@@ -149,6 +155,27 @@ class Recording:
     def named(self, capture: Capture) -> Recording:
         """The same data under another entry."""
         return replace(self, capture=capture)
+
+    def watched(self, read: Callable[[float], None]) -> Recording:
+        """The same data; `read` is told which share of the frames is read, each time."""
+        return self if self.frames is None else replace(self, frames=_Watched(self.frames, read))
+
+
+@dataclass(frozen=True)
+class _Watched:
+    """Frames that tell when they are read."""
+
+    frames: FrameSource
+    read: Callable[[float], None]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.frames.shape
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        out = self.frames[part]
+        self.read(len(out) / max(1, self.shape[0]))
+        return out
 
 
 def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, dead_time: float) -> Recording:

@@ -1,6 +1,6 @@
 """What a dataset holds, for people: the table of its light levels, and a sheet of its pictures.
 
-The only module that imports matplotlib, and only where a picture is drawn.
+With `pages` the only module that imports matplotlib, and only where a picture is drawn.
 """
 
 from __future__ import annotations

@@ -6,10 +6,11 @@ where frames do not depend on each other.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from .readout import Recorded
 from .recording import Capture, Recording
 from .sensor import Sensor
 from .streams import Streams
+
+if TYPE_CHECKING:
+    from .factory import Progress
 
 _AT_ONCE = 3e7  # expected events of a capture that is simulated in one go; a larger one in parts, where that is exact
 _MOST_AT_ONCE = 1e8  # where it is not
@@ -46,13 +50,15 @@ def model_recordings(
     streams: Streams,
     images: np.ndarray,
     direct: bool = False,
+    told: Callable[[float], None] = lambda share: None,
 ) -> list[Recording]:
     """What the sensor would record in a capture, once for each of `images`.
 
     photons: photons/s on each pixel's active area: one number, one for each image, or (images, pixels). streams: whose
     draws are taken; images: (n,) uint64, their numbers, one after the other. A capture that would take more memory than
     there should be is simulated in parts where that is exact, and refused where it is not (InputError). direct: draw
-    the bits of frames that stand alone without their events, which is faster.
+    the bits of frames that stand alone without their events, which is faster. told: which share of an image is made,
+    each time.
     """
     sensor = sensor.settled()
     pixels, wanted = sensor.layout.pixels, len(images)
@@ -64,8 +70,9 @@ def model_recordings(
         return []
     brightest = flux[[int(np.argmax(flux.mean(axis=1)))]]
     events = float(sensor.expected(brightest, capture.conditions)[0].sum())
-    if (events > _AT_ONCE or (direct and capture.modality == "qis")) and (whole := _in_parts(sensor, capture, events)):
-        return [whole(flux[i], streams.of(images[i : i + 1])) for i in range(wanted)]
+    large = events > _AT_ONCE or (direct and capture.modality == "qis")
+    if large and (whole := _in_parts(sensor, capture, events)):
+        return [whole(flux[i], streams.of(images[i : i + 1]), told) for i in range(wanted)]
     if events > _MOST_AT_ONCE:
         raise InputError(
             f"{capture.id}: would hold {events:.2g} events, more than the {_MOST_AT_ONCE:.0e} that can be simulated at "
@@ -76,6 +83,7 @@ def model_recordings(
     numbers = np.arange(int(images[0]) - before, int(images[0]) + wanted, dtype=np.uint64)
     around = flux[np.maximum(np.arange(len(numbers)) - before, 0)]
     made = sensor.expose(around, capture.conditions, streams.of(numbers), (capture.modality,))
+    told(wanted)
     return [_recording(sensor, made, before + i, capture) for i in range(wanted)]
 
 
@@ -83,7 +91,8 @@ def _recording(sensor: Sensor, made: Recorded, image: int, capture: Capture) -> 
     return recording.of_image(made, image, capture, sensor.layout, sensor.nominal_dead_time)
 
 
-_Part = Callable[[np.ndarray, Streams], Recording]
+_Told = Callable[[float], None]  # which share is made
+_Part = Callable[[np.ndarray, Streams, _Told], Recording]
 
 
 def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
@@ -95,10 +104,10 @@ def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
     if capture.modality == "tr" or not _frames_stand_alone(sensor, c, part):
         return None
     if capture.modality == "qis" and not sensor.at("gate"):
-        return lambda flux, streams: _by_bits(sensor, capture, flux, streams)
+        return lambda flux, streams, told: _by_bits(sensor, capture, flux, streams, told)
     if events > _MOST:
         return None
-    return lambda flux, streams: _by_stretches(sensor, capture, flux, streams, frames)
+    return lambda flux, streams, told: _by_stretches(sensor, capture, flux, streams, frames, told)
 
 
 def _frames_stand_alone(sensor: Sensor, conditions: Conditions, part: Conditions) -> bool:
@@ -120,7 +129,9 @@ def _frames_stand_alone(sensor: Sensor, conditions: Conditions, part: Conditions
     return all(np.array_equal(gate.open(within, part), gate.open(times, conditions)) for gate in gates)
 
 
-def _by_stretches(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, frames: int) -> Recording:
+def _by_stretches(
+    sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, frames: int, told: _Told
+) -> Recording:
     """Frames that stand alone, a stretch of them at a time."""
     found = []
     for n, start in enumerate(range(0, capture.conditions.frames, frames)):
@@ -129,11 +140,12 @@ def _by_stretches(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: S
         own = Streams(streams.seed, f"{streams.level}/stretch {n}", streams.split, streams.images)
         made = sensor.expose(flux[None], part, own, (capture.modality,))
         found.append(_recording(sensor, made, 0, replace(capture, conditions=part)))
+        told(count / capture.conditions.frames)
     whole = np.concatenate([np.asarray(one.frames[:]) for one in found if one.frames is not None])
     return Recording(capture, sensor.layout, None, whole, found[0].tick, sensor.nominal_dead_time)
 
 
-def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams) -> Recording:
+def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, told: _Told) -> Recording:
     """Frames that stand alone and are not stamped: a bit is 1 with probability 1 - exp(-rate * frame time).
 
     The frames with a detection are those in which a Poisson process has an event; where most have one, those without
@@ -154,10 +166,13 @@ def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Stream
         if c.frames % 8:
             bits[:, -1] &= np.uint8(0xFF << (8 - c.frames % 8) & 0xFF)
         out[:, row : row + step] = kernels.frames_first(bits, c.frames, len(bits) // columns, columns)
+        told(min(step, rows - row) / rows)
     return Recording(capture, sensor.layout, None, out, None, sensor.nominal_dead_time)
 
 
-def twin(sensor: Sensor, measurement: Measurement, seed: int = 0) -> Iterator[Recording | Capture]:
+def twin(
+    sensor: Sensor, measurement: Measurement, seed: int = 0, progress: Progress | None = None
+) -> Iterator[Recording | Capture]:
     """The measurement's captures as the sensor would have recorded them, one after the other; a mean for a mean.
 
     Every capture draws numbers of its own, named by its id: it is the same whichever others there are. Raises
@@ -174,18 +189,54 @@ def twin(sensor: Sensor, measurement: Measurement, seed: int = 0) -> Iterator[Re
                 "in light, for example irradiance: 120 nW/cm^2"
             )
         fluxes.append(flux)
-    return _twins(sensor, measurement, fluxes, seed)
+    return _twins(sensor, measurement, fluxes, seed, progress)
 
 
-def _twins(sensor: Sensor, measurement: Measurement, fluxes: list[float], seed: int) -> Iterator[Recording | Capture]:
+def _twins(
+    sensor: Sensor, measurement: Measurement, fluxes: list[float], seed: int, progress: Progress | None
+) -> Iterator[Recording | Capture]:
     images = np.zeros(1, np.uint64)
-    for capture, flux in zip(measurement.captures, fluxes, strict=True):
+    work = [_work(sensor, *one) for one in zip(measurement.captures, fluxes, strict=True)]
+    if progress is not None:
+        progress.start("simulating", sum(map(sum, work)), 0.0)
+    for capture, flux, (drawing, writing) in zip(measurement.captures, fluxes, work, strict=True):
+
+        def told(work: float, share: float, id: str = capture.id) -> None:
+            if progress is not None:
+                progress.advance(work * share, id)
+
         streams = Streams(seed, f"capture/{capture.id}", "simulate", images)
-        (made,) = model_recordings(sensor, capture, flux, streams, images)
-        yield made if capture.mean is None else replace(capture, mean=float(made.totals.mean()))
+        drawn, written = functools.partial(told, drawing), functools.partial(told, writing)
+        (made,) = model_recordings(sensor, capture, flux, streams, images, told=drawn)
+        if capture.mean is not None:
+            yield replace(capture, mean=float(made.totals.mean()))
+        elif made.frames is not None:
+            yield made.watched(written)
+        else:
+            yield made
+            written(1.0)
 
 
-def simulate(sensor: Sensor, measurement: Measurement, out: str | Path, seed: int = 0) -> Path:
+def _work(sensor: Sensor, capture: Capture, flux: float) -> tuple[float, float]:
+    """About how long it takes to draw a capture, and to write it: as long as so many events take to be drawn.
+
+    Measured: an event is packed as fast as it is drawn, and so are four bytes of frames, or four bits that are drawn by
+    themselves.
+    """
+    c, pixels = capture.conditions, sensor.layout.pixels
+    drawn = written = float(sensor.expected(np.full((1, pixels), flux), c)[0].sum())
+    if capture.modality != "tr":
+        size = {"qis": c.frames / 8, "str": 4.0 * c.frames}.get(capture.modality, c.count_frames)
+        written = pixels * size / 4
+    if capture.modality == "qis" and drawn > _AT_ONCE:
+        ones = -np.expm1(-drawn / (pixels * c.frames))
+        drawn = pixels * c.frames * min(ones, 1 - ones) / 4
+    return drawn, 0.0 if capture.mean is not None else written
+
+
+def simulate(
+    sensor: Sensor, measurement: Measurement, out: str | Path, seed: int = 0, progress: Progress | None = None
+) -> Path:
     """Write the model's twin of a measurement: the same captures, simulated."""
-    made = twin(sensor, measurement, seed)
+    made = twin(sensor, measurement, seed, progress)
     return write(out, measurement.name, sensor.layout, made, measurement.captures)

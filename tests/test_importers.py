@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -23,6 +24,7 @@ from spadmnist import cli, exporters, importers, measurement
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Events, Layout
+from spadmnist.factory import Progress
 from spadmnist.importers import Said
 from spadmnist.importers.captures import Imported, import_files
 from spadmnist.recording import Capture, Light, Recording
@@ -307,6 +309,53 @@ def test_linospad2_calibrated(tmp_path: Path) -> None:
         assert one.events.row(pixel)[0] == pytest.approx(round(time) * 1e-12, rel=1e-12)
     # the first word of pixel 0 falls 7 ps before its cycle, but for the end of its code; a converter was full
     assert any("outside" in n for n in made.notes) and any(n.count("1 of 128 times") for n in made.notes)
+
+
+# (a word, the pixel by line 5 in the firmwares 2212b, 2212s and 2208, codes): bits 31 | 30 | 29 28 | 27 to 0
+LINO_WORDS = [
+    (0b1_0_00_0000000000000000000000000000, (20, 5, 5), 0),
+    (0b1_0_01_0000000000000000000010001011, (21, 69, 5), 139),
+    (0b1_0_10_0000000000000000000010001100, (22, 133, 5), 140),
+    (0b1_0_11_1111111111111111111111111111, (23, 197, 5), 2**28 - 1),
+    (0b1_1_01_0000000000000000000100011001, (21, 69, 5), 281),  # bit 30 is not used
+    (0b0_0_11_0000000000000000000000000111, None, 0),  # not valid
+    (0b0_1_00_1111111111111111111111111111, None, 0),
+]
+
+
+@pytest.mark.parametrize(("firmware", "lines"), [("2212b", 65), ("2212s", 65), ("2208", 256)])
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_linospad2_word_by_word(tmp_path: Path, firmware: str, lines: int, calibrated: bool) -> None:
+    """As the public readers decode them, one word after the other."""
+    which = ("2212b", "2212s", "2208").index(firmware)
+    timestamps, cycles, cycle = len(LINO_WORDS), 3, 4.8e-3  # 268,800,000 codes
+    stored = [0] * (cycles * lines * timestamps)
+    for c in range(cycles):
+        at = (c * lines + 5) * timestamps
+        stored[at : at + timestamps] = [word for word, _, _ in LINO_WORDS]
+    stored[64 * timestamps] = 1 << 31 | 7  # no pixel in 2212
+    (tmp_path / "a.dat").write_bytes(struct.pack(f"<{len(stored)}I", *stored))
+    ends = np.linspace(0, 2500, 141)[1:] + np.sin(np.arange(256))[:, None]
+    ends[:, -1] = 2500
+    head = "," + ",".join(map(str, range(140)))
+    np.savetxt(tmp_path / "t.csv", np.c_[np.arange(256), ends.clip(0)], delimiter=",", header=head, comments="")
+
+    def seconds(pixel: int, codes: int) -> float:
+        if calibrated:
+            return ((codes - codes % 140) * 2500 / 140 + float(ends[pixel, codes % 140])) * 1e-12
+        return codes * 2.5e-9 / 140
+
+    expected = [(64, seconds(64, 7))] if firmware == "2208" else []
+    for c in range(cycles):
+        for _, pixels, codes in LINO_WORDS:
+            if pixels:
+                expected.append((pixels[which], c * cycle + seconds(pixels[which], codes)))
+    said = Said(firmware=firmware, timestamps=timestamps, cycle=cycle, tdc=tmp_path / "t.csv" if calibrated else None)
+    events = back(run(tmp_path / "a.dat", said)).events
+    assert events is not None and events.tick == pytest.approx(1e-12 if calibrated else 17.857142857e-12, rel=1e-10)
+    found = sorted(zip(map(int, events.pixel), map(float, events.times), strict=True))
+    assert [pixel for pixel, _ in found] == [pixel for pixel, _ in sorted(expected)]
+    assert np.abs(np.subtract(found, sorted(expected))[:, 1]).max() < 0.51e-12
 
 
 def test_linospad2_asks(tmp_path: Path) -> None:
@@ -838,10 +887,29 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
         exporters.export(opened, tmp_path / "a", "npz")
 
 
+@pytest.mark.parametrize(("format", "modality"), CHOICES)
+def test_progress_reaches_its_end(tmp_path: Path, format: str, modality: str) -> None:
+    """Of an import and of an export, which tell it piece by piece."""
+    totals: list[float] = []
+    steps: list[float] = []
+    progress = Progress(
+        lambda what, total, done: totals.append(total), lambda work, note: steps.append(work), lambda: None
+    )
+    one = recorded(modality)
+    measurement.write(tmp_path / "m", "m", one.layout, [one])
+    (path,) = exporters.export(measurement.open(tmp_path / "m"), tmp_path / "out", format, (), progress)
+    extra = 1 / one.n_frames if format in ("npy", "npz") and one.frames is not None else 0.0  # for the type of the data
+    assert totals == [1] and sum(steps) == pytest.approx(1 + extra)
+    if format == "hdf5":
+        totals.clear(), steps.clear()
+        run(path, Said(), [], progress=progress)
+        assert totals == [2 * path.stat().st_size] and sum(steps) == pytest.approx(totals[0]) and len(steps) >= 2
+
+
 # --- the verbs ----------------------------------------------------------------------------------------------------
 
 
-def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def spadmnist(*arguments: Any) -> tuple[int, str, str]:
         status = cli._run([str(one) for one in arguments])
         return status, *capsys.readouterr()
@@ -859,6 +927,10 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "export", lab, "-o", tmp_path / "b.hdf5", "--format", "photon-hdf5", "--capture", "a"
     )
     assert (status, told.strip()) == (0, str(tmp_path / "b.hdf5")), said
+    steps: list[float] = []
+    progress = Progress(advance=lambda work, note: steps.append(work))
+    monkeypatch.setattr(cli, "_terminal", lambda: contextlib.nullcontext(progress))
+    assert spadmnist("export", lab, "-o", tmp_path / "c", "--format", "npz")[0] == 0 and steps == [1]
     for wrong in (["--exposure", "1"], ["--exposure", "-1 ms"], ["--light", "blue"], []):
         status, told, said = spadmnist("import", file, "-o", tmp_path / "n", *wrong)
         assert status == 2 and not told and said.startswith("Error: ") and said.count("\n") == 1

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import random
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -19,6 +21,7 @@ import pytest
 from click.testing import CliRunner
 
 import spadmnist
+import spadmnist.cli as command_line
 from spadmnist import capture_files, config, document, factory, measurement, report, twin
 from spadmnist.cli import cli, main
 from spadmnist.effects import Conditions
@@ -702,6 +705,187 @@ def test_an_interrupted_run_is_finished_by_the_same_command(tmp_path: Path) -> N
         assert tree(tmp_path / f"{stop}") == tree(tmp_path / "whole")
 
 
+def test_counts_fill_whole_count_frames(tmp_path: Path) -> None:
+    """What is written can be opened: a count is the sum of 2^bits - 1 binary frames, so none may be left over."""
+    sensor = device()
+    for frames, bits_, counting, fine in [
+        (301, 1, "frames", True),
+        (301, 3, "counter", True),
+        (301, 3, "frames", True),
+        (300, 3, "frames", False),
+        (5, 3, "frames", False),
+    ]:
+        capture = one("counts", frames, bits=bits_, counting=counting)
+        mean = replace(capture, id="mean", mean=2.0)
+        root = tmp_path / f"{frames} {bits_} {counting}"
+        if fine:
+            (made,) = recordings(sensor, (capture,))
+            assert isinstance(made, Recording)
+            measurement.write(root, "lab", sensor.layout, [made, mean])
+            opened = measurement.open(root)
+            assert opened.captures == (capture, mean)
+            assert_same_data(made, opened.recording(capture.id, sensor))
+            continue
+        for some in (recordings(sensor, (capture,)), [mean]):
+            refused(lambda: measurement.write(root, "lab", sensor.layout, some), "do not fill", "the sum of 7")  # noqa: B023
+        before: list[Recording] = []
+        refused(
+            lambda: measurement.write(tmp_path / "x", "", sensor.layout, before, (capture,)),  # noqa: B023
+            f"take {max(7, frames // 7 * 7)}",
+        )
+        assert not (tmp_path / "x").exists() and tree(root) == {}
+
+
+class Noise:
+    """Frames that cannot be packed, made as they are read."""
+
+    def __init__(self, frames: int, at: Callable[[int], object] = lambda start: None):
+        self.shape, self.at = (frames, 256, 32), at
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        start, stop, _ = part.indices(self.shape[0])
+        self.at(start)
+        return np.random.Generator(np.random.Philox(start)).integers(0, 256, (stop - start, 256, 32), np.uint8)
+
+    def recording(self) -> Recording:
+        capture = Capture("noise", "qis", Light(), Conditions(self.shape[0] * 1e-5, self.shape[0], 1e-5, 1e-5, None))
+        return Recording(capture, Layout(256, 256, np.nan, np.nan), None, self)
+
+
+def alone(script: str) -> subprocess.CompletedProcess[str]:
+    """Run in a process of its own, which may crash."""
+    head = """
+import os, resource, signal, sys
+from pathlib import Path
+sys.path.insert(0, "tests")
+from test_measurement import Noise, measurement, SpadError
+def write(root, frames=4000, at=lambda start: None):
+    made = Noise(frames, at).recording()
+    measurement.write(Path(root), "lab", made.layout, [made])
+"""
+    folder = Path(__file__).parents[1]
+    return subprocess.run([sys.executable, "-c", head + script], capture_output=True, text=True, cwd=folder)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts in kB")
+def test_writing_takes_little_memory(tmp_path: Path) -> None:
+    """A file of 131 MB, of which a part is in memory at a time."""
+    done = alone(f"""
+write({str(tmp_path / "warm")!r}, 10)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+write({str(tmp_path / "out")!r}, 16000)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+""")
+    assert int(done.stdout) < 100e6 < 131e6 < (tmp_path / "out" / "noise.h5").stat().st_size, done.stderr
+
+
+def test_a_file_that_cannot_be_written_is_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    """HDF5 crashes where a write fails: it is not told of it."""
+    done = alone(f"""
+root = Path({str(tmp_path)!r})
+for n, limit in enumerate((10, 3000, 100_000, 5_000_000, 32_000_000)):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        write(root / str(n))
+    except SpadError as error:
+        print(error)
+""")
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    said = done.stdout.splitlines()
+    assert len(said) == 5 and all("cannot write up to 32.8 MB here: File too large; raise the limit" in s for s in said)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_full_disk(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", disk], capture_output=True).returncode:
+        pytest.skip("mounting a small tmpfs is not allowed here")
+    try:
+        done = alone(f"""
+try:
+    write({str(disk / "out")!r})
+except SpadError as error:
+    print(error)
+""")
+        assert done.returncode == 0 and "No space left on device; free some space" in done.stdout, done.stderr
+        assert not [path for path in disk.rglob("*") if path.is_file()]
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_who_is_killed_leaves_no_half_file_and_can_go_on(tmp_path: Path) -> None:
+    done = alone(f"""
+write({str(tmp_path / "out")!r}, at=lambda start: start > 2000 and os.kill(os.getpid(), signal.SIGKILL))
+""")
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".spadmnist"}
+    for name in ("out", "whole"):
+        made = Noise(4000).recording()
+        measurement.write(tmp_path / name, "lab", made.layout, [made])
+    assert tree(tmp_path / "out") == tree(tmp_path / "whole") and len(tree(tmp_path / "out")) == 2
+
+
+def test_an_interrupt_ends_the_writing(tmp_path: Path) -> None:
+    """It comes while HDF5 packs a piece, and calls back; most of the frames are then never read."""
+    done = alone(f"""
+import threading
+read = []
+def at(start):
+    read.append(start)
+    if len(read) == 3:
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    write({str(tmp_path / "out")!r}, 40_000, at)
+except KeyboardInterrupt:
+    print(max(read))
+""")
+    assert done.returncode == 0 and not done.stderr and int(done.stdout) < 20_000, done.stderr
+    assert tree(tmp_path / "out") == {}
+
+
+def test_an_interrupt_while_hdf5_writes_what_it_kept(tmp_path: Path) -> None:
+    """Were it raised in what HDF5 calls, the process would crash."""
+    done = alone(f"""
+import threading
+import time
+import numpy as np
+from spadmnist import capture_files
+noise = np.random.Generator(np.random.Philox(1)).integers(0, 256, 8_000_000, np.uint8)
+def fill(made, alive):
+    found = made.create_dataset("x", noise.shape, "u1", chunks=(65536,), compression="gzip")
+    found[...] = noise
+    threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    with open({str(tmp_path / "x.h5")!r}, "w+b") as file:
+        capture_files.write_hdf5(file, fill)
+    time.sleep(1)
+except KeyboardInterrupt:
+    print("interrupted")
+""")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
+def test_the_place_of_a_dataset_that_was_begun_is_refused(tmp_path: Path) -> None:
+    (tmp_path / ".spadmnist" / "tmp").mkdir(parents=True)
+    (tmp_path / ".spadmnist" / "tmp" / "shard").write_text("x")
+    (tmp_path / ".spadmnist" / "lock").touch()
+    before = tree(tmp_path)
+    with pytest.raises(SpadError, match=r"there is \.spadmnist/lock"):
+        measurement.write(tmp_path, "lab", device().layout, recordings(device()))
+    assert tree(tmp_path) == before
+
+
+def test_what_is_computed_of_a_recording_is_kept() -> None:
+    made = Noise(10).recording()
+    calls: list[int] = []
+    for _ in range(2):
+        assert made.kept("x", lambda: calls.append(1) or 7) == 7  # type: ignore[func-returns-value]
+    shares: list[float] = []
+    watched = made.watched(shares.append)
+    assert calls == [1] and np.array_equal(watched.totals, made.totals) and sum(shares) == pytest.approx(1.0)
+
+
 def test_a_measurement_with_positions_comes_back(tmp_path: Path) -> None:
     places = np.array([[0.0, 0.0], [2.3e-5, 0.0], [1.15e-5, 1.9916e-5]])
     effects = [Detection(pdp=0.4), DarkCounts(rate=1e5), Tdc(resolution=1e-9)]
@@ -988,7 +1172,54 @@ def test_a_sheet_of_means_alone_cannot_be_drawn(tmp_path: Path) -> None:
     assert "3.000" in report.capture_table(opened, report.looks(opened, False))
 
 
-def test_simulate_from_the_command_line(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+PAPER = """
+format: spadmnist-measurement/1
+layout: {rows: 8, columns: 8}
+captures:
+  - {id: dark, mean: 2.6, modality: qis, light: {kind: dark}, frames: 10000, frame_time: 1 us}
+  - {id: 500 low, mean: 470, modality: qis, light: {kind: flat, wavelength: 500 nm, irradiance: 120 nW/cm^2},
+     frames: 10000, frame_time: 1 us}
+  - {id: 700 low, mean: 62, modality: qis, light: {kind: flat, wavelength: 700 nm, irradiance: 20 nW/cm^2},
+     frames: 10000, frame_time: 1 us}
+  - {id: dark long, mean: 26, modality: qis, light: {kind: dark}, frames: 10000, frame_time: 10 us}
+  - {id: 500 high, mean: 9715, modality: qis, light: {kind: flat, wavelength: 500 nm, irradiance: 885 nW/cm^2},
+     frames: 10000, frame_time: 10 us}
+  - {id: 700 high, mean: 4011, modality: qis, light: {kind: flat, wavelength: 700 nm, irradiance: 195 nW/cm^2},
+     frames: 10000, frame_time: 10 us}
+"""
+SPAD512 = """
+sensor:
+  name: SPAD512
+  layout: {rows: 8, columns: 8, pixel_area: 36 um^2, fill_factor: 1.0}
+  effects: {detection: {pdp: {500 nm: 0.444, 700 nm: 0.207}}, dark_counts: {rate: 260 Hz}}
+"""
+
+
+def test_the_published_means_are_a_measurement(tmp_path: Path) -> None:
+    """Only means are known: they are said, and simulated."""
+    lab, out = tmp_path / "lab", tmp_path / "twin"
+    lab.mkdir()
+    (lab / "measurement.yaml").write_text(PAPER)
+    (tmp_path / "sensor.yaml").write_text(SPAD512)
+    result = CliRunner().invoke(cli, ["inspect", str(lab), "--json"], catch_exceptions=False)
+    rows = {row["capture"]: row for row in json.loads(result.stdout)["captures"]}
+    assert (rows["500 low"]["ones_share"], rows["500 low"]["rate_mean"]) == pytest.approx((0.047, 47_000))
+    assert rows["dark"]["rate_mean"] == pytest.approx(260) and rows["dark"]["detections"] is None
+    said = CliRunner().invoke(cli, ["inspect", str(lab)], catch_exceptions=False).stdout
+    assert "9,715" in said and "97.2%" in said.replace(" %", "%")
+    result = CliRunner().invoke(
+        cli, ["simulate", str(tmp_path / "sensor.yaml"), str(lab), "-o", str(out)], catch_exceptions=False
+    )
+    assert result.exit_code == 0 and [path.name for path in out.iterdir()] == ["measurement.yaml"]
+    means = {c.id: c.mean for c in measurement.open(out).captures}
+    assert means.pop("dark") == pytest.approx(2.6, rel=0.4)  # 8 x 8 pixels scatter by 8 %
+    expected = {"500 low": 472, "700 low": 55, "dark long": 26, "500 high": 9715, "700 high": 4020}
+    assert means == pytest.approx(expected, rel=0.12)
+
+
+def test_simulate_from_the_command_line(
+    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "sensor.yaml").write_text(SENSOR)
     arguments = ["simulate", str(tmp_path / "sensor.yaml"), str(lab), "-o", str(tmp_path / "twin"), "--seed", "5"]
     result = CliRunner().invoke(cli, [*arguments, "--json"])
@@ -997,7 +1228,16 @@ def test_simulate_from_the_command_line(lab: Path, tmp_path: Path, capsys: pytes
     assert [replace(c, mean=None) for c in made.captures] == [replace(c, mean=None) for c in opened.captures]
     a, b = (int(m.recording("qis flat").totals.sum()) for m in (opened, made))
     assert a != b and abs(a - b) < 5 * np.sqrt(a + b)
-    arguments[-1] = "6"
+    totals: list[float] = []
+    steps: list[float] = []
+    progress = factory.Progress(
+        lambda what, total, done: totals.append(total), lambda work, note: steps.append(work), lambda: None
+    )
+    monkeypatch.setattr(command_line, "_terminal", lambda: contextlib.nullcontext(progress))
+    arguments[4] = str(tmp_path / "again")
+    assert CliRunner().invoke(cli, arguments).exit_code == 0
+    assert len(totals) == 1 and sum(steps) == pytest.approx(totals[0]) and len(steps) > len(CAPTURES)
+    arguments[4], arguments[-1] = str(tmp_path / "twin"), "6"
     for wrong, words in (
         (arguments, "another sensor or seed"),
         (["simulate", "x.yaml", str(lab), "-o", "y"], "no such file"),

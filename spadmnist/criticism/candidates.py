@@ -167,6 +167,8 @@ def _settings(effect: Effect) -> Iterator[Change]:
             continue
         if declared.unit == "rad" or effect.stage in ("light", "detection"):
             continue  # a common factor on the light is no matter of the sensor
+        if declared.unit == "Hz" and any(p.unit == "rad" for p in effect.parameters.values()):
+            continue  # a line that stands elsewhere is another one
         low, high = declared.search  # type: ignore[misc]
         low, high = min(low, value) if value > 0 else low, max(high, value)
         dial = Dial(effect.name, name, declared.unit, float(low), float(high), float(value))

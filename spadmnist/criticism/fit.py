@@ -7,6 +7,7 @@ scatter, and what is left of it is added to that of the cells.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,12 +36,16 @@ FEW = 4  # recordings that tell the difference between two models
 
 @dataclass(frozen=True)
 class Seen:
-    """A capture as it was measured: its detections, of each pixel, and its summaries."""
+    """A capture as it was measured: its detections, of each pixel, and its summaries.
+
+    counts: None where the mean alone is known. last: s, of the last detection that has a stamp of its own.
+    """
 
     capture: Capture
     total: float
     counts: np.ndarray | None
     summaries: Mapping[str, Summary]
+    last: float | None = None
 
 
 @dataclass
@@ -69,6 +74,7 @@ class State:
     residuals: dict[Cell, np.ndarray]
     own: dict[Cell, np.ndarray]
     exact: list[Cell]
+    space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `Bench.rate_space`
 
 
 @dataclass
@@ -95,7 +101,23 @@ class Sensors:
 
     @staticmethod
     def same(sensor: Sensor) -> Sensors:
+        """One sensor for every recording of every capture."""
         return Sensors(lambda capture, number: sensor, sensor)
+
+    def changed(self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None) -> Sensors:
+        """These sensors with some values set; phases: those of each capture."""
+
+        def own(capture: str) -> dict[Key, Any]:
+            return {**values, **{key: x for (id, key), x in (phases or {}).items() if id == capture}}
+
+        def of(capture: str, number: int) -> Sensor:
+            return with_values(self.of(capture, number), own(capture))
+
+        def usual(capture: str) -> Sensor:
+            return with_values(self.usual(capture), own(capture))
+
+        typical = functools.lru_cache(maxsize=64)(usual)
+        return Sensors(of, with_values(self.one, values), self.alike, typical if self.typical else None)
 
 
 def _task(
@@ -152,7 +174,9 @@ class Bench:
         parallel: Parallel,
         replicates: int,
         say: Callable[[str], None] = lambda what: None,
+        exposures: Mapping[str, float] | None = None,
     ):
+        """exposures: s, of captures that were not as long as the measurement states."""
         measurement.check_layout(sensor.layout)
         self.start = sensor.settled()
         self.seed, self.parallel, self.replicates, self.say = seed, parallel, replicates, say
@@ -164,13 +188,19 @@ class Bench:
                 self.seen[capture.id] = Seen(capture, capture.mean * sensor.layout.pixels, None, {})
                 continue
             recording = measurement.recording(capture.id, self.start)
+            if exposures and capture.id in exposures:
+                conditions = replace(recording.conditions, exposure=exposures[capture.id])
+                recording = replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
             summaries = {}
             for statistic in recordings.statistics_for(recording.modality):
                 summary = recordings.reduced(statistic, recording)
                 if summary is not None:
                     summaries[statistic.name] = summary
             counts = np.asarray(recording.totals, float)
-            self.seen[capture.id] = Seen(recording.capture, float(counts.sum()), counts, summaries)
+            last = None
+            if recording.events is not None and len(recording.events.times):
+                last = float(recording.events.times.max())
+            self.seen[capture.id] = Seen(recording.capture, float(counts.sum()), counts, summaries, last)
 
     # --- simulating ----------------------------------------------------------------------------------------------
 
@@ -256,13 +286,16 @@ class Bench:
         order = np.random.Generator(np.random.SFC64(n)).permutation(n)
         numbers = np.arange(n, dtype=np.uint64)
         about, wanted = {}, []
+        state = State(dict(values), sensors, {}, {}, {}, {}, {}, {}, [])
         for id, seen in self.seen.items():
+            if seen.counts is None:
+                state.rates[id], state.factors[id] = recordings.of_mean(sensors.usual(id), seen.capture, seen.total, n)
+                continue
             centre, stated, expected, half = self._centre(sensors.usual(id), seen)
             factors = np.exp(half * np.linspace(-1, 1, n)[order])
             about[id] = centre, stated, expected, factors
             wanted.append((sensors, id, centre * factors, numbers))
         results = self.simulate(wanted, pieces=4)
-        state = State(dict(values), sensors, {}, {}, {}, {}, {}, {}, [])
         for (id, (centre, stated, expected, factors)), made in zip(about.items(), results, strict=True):
             if isinstance(made, str):
                 raise SpadError(f"{id}: {made}")
@@ -301,21 +334,29 @@ class Bench:
 
     def rate_space(self, state: State) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
         """(captures, elasticities, inverse root of the covariance of the log levels, the light's part in it)."""
+        if state.space is not None:
+            return state.space
         ids = self._stated(state)
         errors, elasticity, common = [], [], []
         for id in ids:
-            null, light = state.rates[id], self.seen[id].capture.light
-            _, e, slope = null.level_of(max(self.seen[id].total, 1.0))
-            if light.dark:
-                mean = null.total_at(1.0)
-                e = max(e, 1 / math.sqrt(mean) / max(slope, 1e-3))
-            errors.append(math.hypot(e, light.own_uncertainty))
+            light = self.seen[id].capture.light
+            _, _, slope = state.rates[id].level_of(max(self.seen[id].total, 1.0))
+            errors.append(self.level_error(state, id))
             elasticity.append(max(slope, 1e-3))
             common.append(0.0 if light.dark else light.relative_uncertainty)
         c = np.array(common)
-        covariance = np.diag(np.maximum(np.array(errors), 1e-6) ** 2) + np.outer(c, c)
+        covariance = np.diag(np.array(errors) ** 2) + np.outer(c, c)
         root = np.linalg.inv(np.linalg.cholesky(covariance)) if ids else np.zeros((0, 0))
-        return ids, np.array(elasticity), root, c
+        state.space = ids, np.array(elasticity), root, c
+        return state.space
+
+    def level_error(self, state: State, id: str) -> float:
+        """Standard deviation of the log of a capture's level (dark: of its rates), its own uncertainty with it."""
+        null, light = state.rates[id], self.seen[id].capture.light
+        _, error, slope = null.level_of(max(self.seen[id].total, 1.0))
+        if light.dark:
+            error = max(error, 1 / math.sqrt(null.total_at(1.0)) / max(slope, 1e-3))
+        return max(math.hypot(error, light.own_uncertainty), 1e-6)
 
     def rates(self, state: State, logs: Mapping[str, float]) -> np.ndarray:
         """Residuals of the totals: independent, 1 wide; the light's common factor is among them."""
@@ -347,7 +388,7 @@ class Bench:
     ) -> list[Moved | str]:
         """What each of these models would change. few: recordings of each capture; only: of some captures."""
         numbers = np.arange(few, dtype=np.uint64)
-        ids = [id for id in self.seen if not only or id in only]
+        ids = [id for id in state.made if not only or id in only]
         wanted = []
         for sensors in models:
             for id in ids:
@@ -358,13 +399,16 @@ class Bench:
         for i in range(len(models)):
             part = results[i * len(ids) : (i + 1) * len(ids)]
             wrong = [p for p in part if isinstance(p, str)]
-            out.append(wrong[0] if wrong else self._moved(state, models[i], dict(zip(ids, part, strict=True))))  # type: ignore[arg-type]
+            joined = dict(zip(ids, part, strict=True))
+            out.append(wrong[0] if wrong else self._moved(state, models[i], joined))  # type: ignore[arg-type]
         return out
 
     def _moved(self, state: State, sensors: Sensors, made: dict[str, Made]) -> Moved | str:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
+        for id in state.rates.keys() - state.made.keys():
+            logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
             base, some = state.made[id], other.numbers.astype(int)
             apart = np.log(np.maximum(other.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
@@ -426,7 +470,7 @@ class Bench:
             if shift is None:
                 out[cell] = np.zeros(len(expected))
                 continue
-            scale = null._spread(expected)
+            scale = null.spread_at(expected)
             if null.law == "exponential":
                 out[cell] = shift / np.maximum(expected, 1e-9)
             else:
@@ -456,7 +500,7 @@ def _own(null: Null, made: Made, values: np.ndarray) -> np.ndarray:
 
 def _spread_of(null: Null, made: Made) -> np.ndarray:
     expected = null.expected(float(made.totals.mean()))[0]
-    return np.maximum(null._spread(expected), 0.3 if null.law == "poisson" else 1e-30)
+    return np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
 
 
 def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float]:
@@ -613,19 +657,21 @@ def settle(
     for turn in range(rounds):
         moves = [u]
         for i, dial in enumerate(dials):
-            h = steps[i]
-            if dial.value(u[i] + h) >= dial.high:
-                h = -h
-            moves.append(u + np.eye(len(dials))[i] * h)
+            # to both sides: what chance does to the point itself must not be in the slope
+            for h in (steps[i], -steps[i]):
+                other = u.copy()
+                other[i] = dial.coordinate(dial.value(u[i] + h))
+                moves.append(other)
         found = evaluate(moves)
         if isinstance(found[0], str):
             return found[0]
         z = found[0]
         slopes = np.zeros((z.size, len(dials)))
         for i in range(len(dials)):
-            other = found[i + 1]
-            if not isinstance(other, str):
-                slopes[:, i] = (other - z) / (moves[i + 1][i] - u[i])
+            up, down = found[2 * i + 1], found[2 * i + 2]
+            apart = moves[2 * i + 1][i] - moves[2 * i + 2][i]
+            if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
+                slopes[:, i] = (up - down) / apart
         square = float(z @ z)
         if best is None or square < best[0]:
             best, damping = (square, u, z, slopes), damping / 3
@@ -638,7 +684,7 @@ def settle(
         step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
         u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u0 + step, strict=True)])
         gain = float(square - ((z + slopes @ (u - u0)) ** 2).sum())
-        covariance = _covariance(slopes, own)
+        covariance = covariance_of(slopes, own)
         error = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
         # never so short that what is taken for noise, or not, makes a slope
         steps = np.clip(3 * error, [0.05 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.4)
@@ -649,11 +695,11 @@ def settle(
     if not isinstance(last, str) and float(last @ last) < best[0] + 1.0:
         best = float(last @ last), u, last, best[3]
     square, u, z, slopes = best
-    covariance = _covariance(slopes, own)
+    covariance = covariance_of(slopes, own)
     return Settled(dials, u, covariance, _split(z, state, keys), _split(slopes, state, keys), square, at(u))
 
 
-def _covariance(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
+def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Of the least-squares estimate, the cells scattering as they do in the model's own recordings."""
     solve = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ slopes.T
     estimates = own @ solve.T

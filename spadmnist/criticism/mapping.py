@@ -23,6 +23,7 @@ from .recordings import InTheDark
 _TAILS = 3.0  # degrees of freedom of the prior
 _TURNS = 12
 _MOST = 6.0  # of a logarithm
+_NEEDED = 1e-4  # p-value of a map that is needed beside others
 
 
 @dataclass(frozen=True)
@@ -149,11 +150,14 @@ def settle_maps(
             pull = score - prior * np.stack(delta, axis=1)
             solved = np.linalg.solve(whole, pull[:, :, None])[:, :, 0]
             inverse = np.linalg.inv(whole)
+            bare = normal + 1e-9 * np.eye(k)
+            free = np.linalg.solve(bare, score[:, :, None])[:, :, 0]
+            variance_free = np.linalg.inv(bare)
             for i in range(k):
+                # without the prior, the other maps being free
+                raw[i] = delta[i] + np.clip(free[:, i], -2, 2), variance_free[:, i, i]
                 delta[i] = np.clip(delta[i] + np.clip(solved[:, i], -0.7, 0.7), -_MOST, _MOST)
                 post[i] = inverse[:, i, i]
-                own = np.maximum(normal[:, i, i], 1e-12)
-                raw[i] = delta[i] + np.clip(score[:, i] / own, -2, 2), 1 / own
         else:
             for i, group in enumerate(groups):
                 information = np.bincount(group, normal[:, i, i], sizes[i])
@@ -255,6 +259,31 @@ def sensors_with(
         return with_values(bench.start, {**values, **{key: m.values() for key, m in maps[id].items()}})
 
     return Sensors(of, with_values(bench.start, final), alike=False, typical=typical), whole, final
+
+
+def needed(
+    bench: Bench, values: Values, held: Sequence[Change], wanted: Sequence[Change], levels: dict[str, float]
+) -> list[Change]:
+    """Those of some maps whose pixels differ beyond their noise when all are settled together, the clearest first."""
+    kept = list(wanted)
+    while kept:
+        found = settle_maps(bench, values, [*held, *kept], levels)
+        clear = {c: _spread_p(found[c.carrier]) for c in kept}  # type: ignore[index]
+        least = max(kept, key=lambda c: clear[c])
+        if clear[least] < _NEEDED:
+            return sorted(kept, key=lambda c: clear[c])
+        kept.remove(least)
+    return []
+
+
+def _spread_p(map_: Map) -> float:
+    """p-value of pixels that are all alike."""
+    told = map_.raw_error < 3.0  # elsewhere nothing is known
+    if told.sum() < 3:
+        return 1.0
+    r, weight = map_.raw[told], 1 / map_.raw_error[told] ** 2
+    z = (r - float(np.average(r, weights=weight))) ** 2 * weight
+    return float(stats.chi2.sf(float(z.sum()), int(told.sum()) - 1))
 
 
 def summary(map_: Map) -> dict[str, float]:

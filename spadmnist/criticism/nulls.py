@@ -73,7 +73,7 @@ class Null:
         expected, leverage = self.expected(total)
         z = _standardized(self.law, values, expected, self.spread, leverage, self.recordings, self.scaled)
         z = z / self.factor
-        spread = self._spread(expected)
+        spread = self.spread_at(expected)
         if self.law == "exact":
             wrong = values != expected
             worst = int(np.argmax(wrong))
@@ -91,7 +91,7 @@ class Null:
         p = min(1.0, 2 * min(p_sum, p_cell))
         return Judgement(p, square / mean, z, expected, spread, worst)
 
-    def _spread(self, expected: np.ndarray) -> np.ndarray:
+    def spread_at(self, expected: np.ndarray) -> np.ndarray:
         if self.law == "poisson":
             return np.asarray(np.sqrt(np.maximum(expected, 0.0)) * self.factor)
         if self.law == "exponential":

@@ -285,7 +285,10 @@ def frames_in_file(path: Path, at: int, dtype: Any, shape: tuple[int, ...]) -> S
     kind, each = np.dtype(dtype), math.prod(shape[1:])
 
     def get(start: int, stop: int) -> np.ndarray:
-        data = np.fromfile(path, kind, (stop - start) * each, offset=at + start * each * kind.itemsize)
+        try:
+            data = np.fromfile(path, kind, (stop - start) * each, offset=at + start * each * kind.itemsize)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None
         if len(data) != (stop - start) * each:
             raise InputError(f"{path}: became shorter while it was read; copy it again")
         return data.reshape(-1, *shape[1:])

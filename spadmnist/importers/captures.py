@@ -77,12 +77,16 @@ def import_files(
 
     def recordings() -> Iterator[Recording]:
         for path, kind, size, capture in zip(files, kinds, sizes, captures, strict=True):
+
+            def told(share: float, size: int = size, name: str = path.name) -> None:
+                progress.advance(size * share, name)
+
             again = found if len(files) == 1 else kind.read(path, said)
             if again.frames is None:
                 yield _events(path, again, said, capture, layout, pixel_of)
-                progress.advance(size, path.name)
+                told(1.0)
             else:
-                yield _frames(path, again, said, capture, layout, progress)
+                yield _frames(path, again, said, capture, layout).watched(told)
 
     default = files[0].stem if len(files) == 1 else out.resolve().name
     measurement.write(out, name or safe_name(default), layout, recordings(), captures)
@@ -252,7 +256,7 @@ def _events(
 _MIRRORED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
 
 
-def _frames(path: Path, found: Found, said: Said, capture: Capture, layout: Layout, progress: Progress) -> Recording:
+def _frames(path: Path, found: Found, said: Said, capture: Capture, layout: Layout) -> Recording:
     """Frames as a `Recording` has them, read and checked piece by piece."""
     stack, columns, modality, c = found.frames, layout.columns, capture.modality, capture.conditions
     assert stack is not None
@@ -288,7 +292,6 @@ def _frames(path: Path, found: Found, said: Said, capture: Capture, layout: Layo
         for first in range(start, stop, step):
             piece = stack[first : min(first + step, stop)]
             out[first - start : first - start + len(piece)] = checked(piece, first)
-        progress.advance(path.stat().st_size * (stop - start) / stack.shape[0], path.name)
         return out
 
     return Recording(capture, layout, None, Stack(shape, kind, get), tick)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture_files import _FILTERS, _attribute, _check_stored, _opened
+from ..capture_files import FILTERS, attribute, check_stored, opened
 from ..errors import InputError
 from . import LARGEST_PIECE, MOST_EVENTS, Format, Found, Said, Stack, facts
 
@@ -45,12 +45,12 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
         what = "(frames, rows, columns)" if axes == 3 else "one axis"
         raise InputError(f"{path}: {name} is {found.dtype} of the shape {found.shape}; store whole numbers with {what}")
     made = found.id.get_create_plist()
-    if not {made.get_filter(i)[0] for i in range(made.get_nfilters())} <= _FILTERS.keys():
+    if not {made.get_filter(i)[0] for i in range(made.get_nfilters())} <= FILTERS.keys():
         raise InputError(f"{path}: {name} is packed by a filter that HDF5 itself lacks; store it with gzip")
     taken = math.prod(found.chunks or (1,)) * found.dtype.itemsize
     if taken > LARGEST_PIECE or (axes == 1 and len(found) > MOST_EVENTS):
         raise InputError(f"{path}: {name} is stored in larger parts than can be read; store it in smaller ones")
-    _check_stored(found, name, path)
+    check_stored(found, name, path)
     return found
 
 
@@ -76,17 +76,17 @@ class PhotonHdf5(Format):
         """The groups of photon data tell it from other HDF5."""
         if not super().fits(path, head):
             return False
-        with _opened(path) as file:
+        with opened(path) as file:
             return "photon_data" in file or "photon_data0" in file
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
         """Time stamps in timestamps_unit, detectors as channels."""
-        with _opened(path) as file:
+        with opened(path) as file:
             spots = sorted(int(m[1]) for key in file if (m := re.fullmatch(r"photon_data(\d{1,6})", key)))
             groups = [f"photon_data{spot}" for spot in spots] or ["photon_data"]
             own = _node(file, "user/spadmnist", path, group=True)
-            known = {} if own is None else facts(path, lambda name: _attribute((own,), name, path))
+            known = {} if own is None else facts(path, lambda name: attribute((own,), name, path))
             if _node(file, "acquisition_duration", path) is not None:
                 known.setdefault("exposure", _number(file, "acquisition_duration", path))
             units = {_number(file, f"{group}/timestamps_specs/timestamps_unit", path) for group in groups}
@@ -110,12 +110,12 @@ class PlainHdf5(Format):
     def read(cls, path: Path, said: Said) -> Found:
         """Attributes of the file, or of the data set, say how it was recorded, by the names of `FACTS`."""
         name = said.dataset or "frames"
-        with _opened(path) as file:
+        with opened(path) as file:
             detections = said.dataset is None and "time" in file
             stored = None if detections else _data_set(file, name, path, axes=3)
             nodes = (file,) if detections else (stored, file)
-            known = facts(path, lambda key: _attribute(nodes, key, path))
-            if _attribute(nodes, "counting", path) == "counter":
+            known = facts(path, lambda key: attribute(nodes, key, path))
+            if attribute(nodes, "counting", path) == "counter":
                 known["counter"] = 1
             if stored is None:
                 time, pixel = (_data_set(file, key, path)[...] for key in ("time", "pixel"))
@@ -123,7 +123,7 @@ class PlainHdf5(Format):
             shape, dtype = stored.shape, stored.dtype
 
         def get(start: int, stop: int) -> np.ndarray:
-            with _opened(path) as file:
+            with opened(path) as file:
                 return np.asarray(_data_set(file, name, path, axes=3)[start:stop])
 
         packed = said.packed or "width" in known

@@ -17,18 +17,19 @@ _LARGEST_TABLE = 1 << 24  # bytes of a calibration
 
 
 class LinoSpad2(Format):
-    """LinoSPAD2, firmware 2212: 32-bit little-endian words, 256 pixels at 64 converters, cycle after cycle.
+    """LinoSPAD2: 32-bit little-endian words of 256 pixels, cycle after cycle.
 
     A word: bit 31, it is valid; bits 28-29, the pixel's address at its converter; bits 0-27, codes since the start of
-    the cycle, 140 to a clock of 2.5 ns. A cycle has --timestamps words of each of 65 converters, one after the other,
-    the last of which belongs to no pixel. Pixel at converter k with address a: 4 k + a (2212b), k + 64 a (2212s).
+    the cycle, 140 to a clock of 2.5 ns. A cycle of the firmware 2212 has --timestamps words of each of 65 converters,
+    one after the other, the last of which belongs to no pixel. Pixel at converter k with address a: 4 k + a (2212b, in
+    blocks), k + 64 a (2212s, with skips). 2208: so many words of each pixel, and no address.
     Calibrated: 2500 ps * (word // 140) + tdc[pixel, word % 140] + offset[pixel], rounded to --tick (1 ps); without
     --tdc the codes are kept as ticks of 2.5 ns / 140.
 
     The cycles are joined without the pauses between them, which the file does not hold.
 
-    Source: the daplis package (github.com/rngKomorebi/daplis), unpack.py, delta_t.py and its introduction; read there,
-    not tried on a recording of the sensor.
+    Source: the daplis package (github.com/rngKomorebi/daplis), unpack.py, calibrate.py and delta_t.py, and, for 2208,
+    github.com/sevaedmi/LinoSPAD2; read there, not tried on a recording of the sensor.
     """
 
     about = "LinoSPAD2 .dat"
@@ -37,17 +38,18 @@ class LinoSpad2(Format):
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
         """The firmware may also stand in the name of the calibration, as in TDC_NL11_#33_2212b.csv."""
-        named = [name for name in ("2212b", "2212s") if said.tdc is not None and name in said.tdc.stem]
+        named = [name for name in ("2212b", "2212s", "2208") if said.tdc is not None and name in said.tdc.stem]
         firmware = said.firmware or (named[0] if named else None)
         known = {"firmware": firmware, "timestamps": said.timestamps, "cycle": said.cycle}
         if missing := [name for name, value in known.items() if value is None]:
             raise ask(path, missing)
         assert said.timestamps is not None and said.cycle is not None
-        size, each = path.stat().st_size, 65 * said.timestamps
+        lines, kept = (256, 256) if firmware == "2208" else (65, 64)  # so many lists of words, of which these are kept
+        size, each = path.stat().st_size, lines * said.timestamps
         cycles = size // (4 * each)
         if size % (4 * each):
             raise InputError(
-                f"{path}: {size:,} bytes are no whole cycles of 65 x {said.timestamps} words; give another "
+                f"{path}: {size:,} bytes are no whole cycles of {lines} x {said.timestamps} words; give another "
                 "--timestamps (recordings with absolute time stamps are not read)"
             )
         if said.offsets is not None and said.tdc is None:
@@ -60,17 +62,17 @@ class LinoSpad2(Format):
             raise InputError(
                 f"--cycle: {units.show(said.cycle, 's')} is no whole number of ticks of {units.show(tick, 's')}"
             )
-        words = frames_in_file(path, 0, "<u4", (cycles, 65, said.timestamps))
+        words = frames_in_file(path, 0, "<u4", (cycles, lines, said.timestamps))
         channels, ticks, outside, full = [np.zeros(0, np.uint8)], [np.zeros(0, np.uint64)], 0, 0
         step = max(1, _AT_ONCE // each)
         for start in range(0, cycles, step):
-            some = words[start : start + step][:, :64]
+            some = words[start : start + step][:, :kept]
             valid = some >> 31 == 1
             full += int(valid.all(axis=2).sum())
-            cycle, converter, _ = np.nonzero(valid)
+            cycle, line, _ = np.nonzero(valid)
             word = some[valid].astype(np.int64)
             address, codes = word >> 28 & 3, word & 0xFFFFFFF
-            pixel = 4 * converter + address if firmware == "2212b" else converter + 64 * address
+            pixel = {"2212b": 4 * line + address, "2212s": line + 64 * address}.get(str(firmware), line)
             if ends is not None:
                 time = codes // _CODES * _CLOCK + ends[pixel, codes % _CODES] + offsets[pixel]
                 codes = np.rint(time * (PICOSECOND / tick)).astype(np.int64)
@@ -80,7 +82,8 @@ class LinoSpad2(Format):
             ticks.append((codes + (start + cycle) * length)[inside].astype(np.uint64))
         notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
         if full:
-            notes.append(f"{full:,} of {64 * cycles:,} times a converter was full, and blind for the rest of its cycle")
+            times = f"{full:,} of {kept * cycles:,} times"
+            notes.append(f"{times} a converter was full, and blind for the rest of its cycle")
         if outside:
             notes.append(f"{outside:,} time stamps lie outside their cycle and were left out")
         facts = {"tick": tick, "exposure": cycles * said.cycle, "rows": 1, "columns": 256}

@@ -1,13 +1,126 @@
-"""What statistics of frames share: bits as words, common ones, moments of the pixels, ones of the frames."""
+"""What statistics of frames share: bits as words, common ones, first stamps, moments of the pixels, ones of the frames.
+
+Frames are read once and kept in the form that the statistics take where that is small; otherwise they are read, and
+brought into it, a piece at a time and every time anew.
+"""
 
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ..kernels import inline, jit
 from ..recording import Recording
+
+_SMALL = 2**23  # pixels times frames up to which a form of the frames is kept with the recording
+
+
+class FirstStamps(NamedTuple):
+    """First stamps (STR) of some frames, frame by frame and in the order of the pixels.
+
+    offsets: (frames + 1,); stamps: (stamps,) ticks since the start of their frame; pixels: (stamps,) int32.
+    """
+
+    offsets: np.ndarray
+    stamps: np.ndarray
+    pixels: np.ndarray
+
+
+def contiguous(frames: np.ndarray) -> np.ndarray:
+    """(frames, pixels) of frames (frames, rows, columns), in the order of memory, too."""
+    flat = frames.reshape(len(frames), -1)
+    if flat.flags.c_contiguous:
+        return flat
+    out = np.empty(flat.shape, flat.dtype)
+    _copy(flat, out)
+    return out
+
+
+@jit
+def _copy(frames, out):
+    # some frames at a time: one of two arrays is gone through across its lines of the cache
+    for first in range(0, frames.shape[0], 16):
+        last = min(first + 16, frames.shape[0])
+        for p in range(frames.shape[1]):
+            for f in range(first, last):
+                out[f, p] = frames[f, p]
+
+
+def _kept(recording: Recording, name: str, make: Callable[[], Iterator[Any]]) -> Iterator[Any]:
+    """What `make` yields, which is kept if the capture is small."""
+    if recording.n_frames * recording.pixels > _SMALL:
+        yield from make()
+        return
+    if name not in recording._kept:
+        recording._kept[name] = list(make())
+    yield from recording._kept[name]  # type: ignore[misc]
+
+
+def first_stamps(recording: Recording) -> Iterator[tuple[int, FirstStamps]]:
+    """(number of the first frame, first stamps of some frames) of an STR recording, piece by piece."""
+
+    def make() -> Iterator[tuple[int, FirstStamps]]:
+        for first, part in recording.chunks():
+            flat = contiguous(part)
+            offsets = np.zeros(len(flat) + 1, np.int64)
+            _number(flat, recording.none, offsets)
+            stamps, pixels = np.empty(offsets[-1] + 1, flat.dtype), np.empty(offsets[-1] + 1, np.int32)
+            _gather(flat, recording.none, offsets, stamps, pixels)
+            yield first, FirstStamps(offsets, stamps[:-1], pixels[:-1])
+
+    return _kept(recording, "first stamps", make)
+
+
+@jit
+def _number(frames, none, offsets):
+    for f in range(frames.shape[0]):
+        number = np.int64(0)
+        for p in range(frames.shape[1]):
+            number += frames[f, p] < none
+        offsets[f + 1] = offsets[f] + number
+
+
+@jit
+def _gather(frames, none, offsets, stamps, pixels):
+    """The stamps below `none`; there is room for one more, which is written behind them and written over."""
+    for f in range(frames.shape[0]):
+        k = offsets[f]
+        if k == offsets[f + 1]:
+            continue
+        for p in range(frames.shape[1]):
+            stamps[k] = frames[f, p]
+            pixels[k] = p
+            k += frames[f, p] < none
+
+
+def bits(recording: Recording) -> Iterator[tuple[int, np.ndarray]]:
+    """As `recording.bits`: (number of the first frame, (frames, rows, bytes) uint8), but kept where it is small."""
+    if recording.modality == "qis":
+        return recording.bits()
+    return _kept(recording, "bits", lambda: _of_stamps(recording) if recording.modality == "str" else recording.bits())
+
+
+def _of_stamps(recording: Recording) -> Iterator[tuple[int, np.ndarray]]:
+    columns = recording.layout.columns
+    for first, found in first_stamps(recording):
+        out = np.zeros((len(found.offsets) - 1, recording.layout.rows, -(-columns // 8)), np.uint8)
+        place = np.arange(recording.pixels, dtype=np.int32)
+        row, column = np.divmod(place, columns)
+        _set(
+            found.offsets, found.pixels, row * out.shape[2] + column // 8, 128 >> column % 8, out.reshape(len(out), -1)
+        )
+        yield first, out
+
+
+@jit
+def _set(offsets, pixels, byte, bit, out):
+    for f in range(out.shape[0]):
+        for i in range(offsets[f], offsets[f + 1]):
+            out[f, byte[pixels[i]]] |= np.uint8(bit[pixels[i]])
 
 
 def as_words(packed: np.ndarray) -> np.ndarray:
@@ -82,14 +195,47 @@ def frame_sums(recording: Recording) -> np.ndarray:
     """(frames,) int64 detections of the whole array in each frame."""
     if "frame_sums" not in recording._kept:
         out = np.empty(recording.n_frames, np.int64)
+        totals = np.zeros(recording.pixels, np.int64)
         if recording.modality == "counts":
             for first, part in recording.chunks():
-                out[first : first + len(part)] = part.reshape(len(part), -1).sum(axis=1, dtype=np.int64)
+                flat = part.reshape(len(part), -1)
+                out[first : first + len(part)] = flat.sum(axis=1, dtype=np.int64)
+                totals += flat.sum(axis=0, dtype=np.int64)
         else:
-            for first, part in recording.bits():
+            for first, part in bits(recording):
                 _ones(as_words(part), out[first : first + len(part)])
+                add_pixels(part, recording.layout.columns, totals)
         recording._kept["frame_sums"] = out
+        recording._kept.setdefault("totals", totals)  # those of the recording: its frames are read once for both
     return recording._kept["frame_sums"]  # type: ignore[return-value]
+
+
+def add_pixels(packed: np.ndarray, columns: int, out: np.ndarray) -> None:
+    """Add to out (pixels,) int64 how often each pixel has a detection in packed frames (frames, rows, bytes)."""
+    words = as_words(packed)
+    sums = np.zeros((words.shape[1], 64), np.int64)
+    _pixel_sums(words, sums)
+    rows, width = packed.shape[1:]
+    by_byte = sums.reshape(-1, 8)[: rows * width, ::-1]  # the first pixel of a byte is its highest bit
+    out += by_byte.reshape(rows, 8 * width)[:, :columns].ravel()
+
+
+@jit
+def _pixel_sums(words, sums):
+    """Add to sums (words, 64) how often each bit is set, from the lowest to the highest."""
+    frames, size = words.shape
+    each = np.uint64(0x0101010101010101)
+    held = np.zeros((8, size), np.uint64)  # eight counters of a byte each in one word
+    for first in range(0, frames, 255):
+        held[:] = np.uint64(0)
+        for f in range(first, min(first + 255, frames)):
+            for bit in range(8):
+                for w in range(size):
+                    held[bit, w] += (words[f, w] >> np.uint64(bit)) & each
+        for w in range(size):
+            for byte in range(8):
+                for bit in range(8):
+                    sums[w, 8 * byte + bit] += np.int64((held[bit, w] >> np.uint64(8 * byte)) & np.uint64(255))
 
 
 @jit

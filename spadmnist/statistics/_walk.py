@@ -16,6 +16,7 @@ from ..events import Layout
 from ..kernels import jit
 from ..recording import Recording
 from ._counting import exposure_in, guide, logarithmic, place, sort_ticks, tick_of, whole_ticks
+from ._frames import first_stamps
 
 REACH = 3  # pitches
 SIZES = ((2, 2), (3, 3), (4, 4), (5, 8), (9, 16), (17, 0))  # detections in a cluster; 0: any number
@@ -23,8 +24,9 @@ _LAGS = (1e-9, 3e-9, 10e-9, 30e-9, 100e-9)  # s
 _LATER = 30e-9  # s: up to here one neighbour is asked to fire after the other
 _GAPS = (1e-9, 10e-9)  # s
 _PER_DECADE = 10
-_AT_ONCE = 65536  # events that are sorted together: they fit into the cache
-_FEW = 32  # stamps of a pixel in 100 ns that are looked at one by one
+_AT_ONCE = 16384  # events that are sorted together: they fit into the cache
+_DEEP = 4  # stamps of a pixel that are held; what is earlier is looked up
+_SHIFTS = 64  # steps between stamps up to which those of the whole array are compared in turn
 _NEVER = -(1 << 62)
 
 
@@ -162,21 +164,21 @@ def _through(recording: Recording) -> Walk:
     found = np.zeros((len(near_by.names) + 1, lags.size), np.int64)
     later = np.zeros(len(near_by.names) + 1, np.int64)
     if recording.events is None:
-        for _, part in recording.chunks():
-            frames = np.ascontiguousarray(part.reshape(len(part), -1))
-            _through_frames(frames, recording.none, edges, start, gaps(tick), kinds, spacings, clusters)
+        for _, part in first_stamps(recording):
+            between = gaps(tick), kinds, spacings, clusters
+            _through_frames(part.offsets, part.stamps, recording.none, edges, start, *between)
     else:
         stamps, _ = whole_ticks(recording)
         offsets, end = recording.events.offsets, exposure_in(recording, tick)
-        spot, stride, first, step, kind, second = _around(recording.layout, near_by)
+        spot, stride, first, step, kind, second = around(recording.layout, near_by)
         _through_exposure(
-            stamps, offsets, end, edges, start, gaps(tick), kinds, lags, latest(tick),
+            stamps, offsets, end, edges, start, gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])),
             spot, stride, first, step, kind, second, spacings, clusters, upto, found, later,
         )  # fmt: skip
     return Walk(spacings, clusters, np.diff(upto, prepend=0), found[:-1], found[-1], later[:-1])
 
 
-def _around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Who is around whom: (spot of each pixel, stride, first, step, kind, second).
 
     A spot is a place in an array with an empty margin, so that there is one around every pixel. On a grid all spots
@@ -212,7 +214,7 @@ def _through_exposure(
     """Walk through all rows' stamps in the order of time, a slab of time after the other.
 
     edges, start: of spacings, see `guide`; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
-    `_around`. Adds to spacings, clusters, upto (bins,) pairs of the array that are nearer than each of `lags`, found
+    `around`. Adds to spacings, clusters, upto (bins,) pairs of the array that are nearer than each of `lags`, found
     (classes, bins) pairs of near pixels, later (classes,).
     """
     rows = offsets.size - 1
@@ -228,9 +230,10 @@ def _through_exposure(
     while (np.int64(1) << bits) < spots:
         bits += 1
     top = (np.int64(1) << (62 - bits)) - 1
-    row_of = np.zeros(spots, np.int64)
-    recent = np.full(spots, _NEVER)  # the last stamp that was passed
-    passed = np.zeros(spots, np.int64)  # its place
+    row_of = np.full(spots, -1)
+    recent = np.full((_DEEP, spots), _NEVER)  # the last stamps that were passed
+    latest_at = np.full(_DEEP + 1, _NEVER)  # of all those that ever stood at each depth; the last is held no longer
+    passed = np.zeros(spots, np.int64)  # the place of the last one
     for row in range(rows):
         row_of[spot[row]] = row
         passed[spot[row]] = offsets[row] - 1
@@ -244,7 +247,6 @@ def _through_exposure(
     runs = np.ones(gaps.size, np.int64)
     last = np.int64(-1)
     longest = lags[lags.size - 1]
-    behind = np.zeros(lags.size, np.int64)
     for slab in range(slabs):
         stop = (slab + 1) * width if slab < slabs - 1 else top
         before = position.copy()
@@ -263,23 +265,18 @@ def _through_exposure(
         sort_ticks(raw, count, (slab * width) << bits, width << bits, ordered, 0, spare, heads)
         _near_pairs(
             ordered[:count], bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
-            row_of, recent, passed, found, later,
+            row_of, recent, latest_at, passed, found, later,
         )  # fmt: skip
         for i in range(count):
             times[held + i] = ordered[i] >> bits
         last = _follow(times, held, held + count, last, edges, start, gaps, kinds, runs, spacings, clusters)
-        for k in range(lags.size):
-            crowded = np.float64(total) * lags[k] > end
-            upto[k] += _pairs(times, held, held + count, lags[k], crowded, behind, k)
         whole = held + count
-        oldest = behind[lags.size - 1]
-        while oldest < whole and stop - times[oldest] >= longest:
-            oldest += 1
+        for k in range(lags.size):
+            upto[k] += _pairs(times, held, whole, lags[k], np.float64(total) * lags[k] / end)
+        oldest = _since(times, 0, whole, stop - longest)
         for i in range(oldest, whole):
             times[i - oldest] = times[i]
         held = whole - oldest
-        for k in range(lags.size):
-            behind[k] = max(behind[k] - oldest, 0)
     _finish(kinds, runs, clusters)
 
 
@@ -303,52 +300,68 @@ def _gather(stamps, offsets, position, stop, spot, bits, raw):
 @jit
 def _near_pairs(
     ordered, bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
-    row_of, recent, passed, found, later,
+    row_of, recent, latest_at, passed, found, later,
 ):  # fmt: skip
-    """Count the pairs that each stamp makes with earlier ones around it; moves `recent` and `passed` on."""
+    """Count the pairs that each stamp makes with earlier ones around it; moves `recent`, ..., `passed` on."""
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
-    begin, end = np.int64(0), np.int64(step.size)
+    # ranges of lags: up to each of these; those that are not used lie beyond what is looked at
+    ranges = np.unique(np.append(lags, np.array([1, latest])))
+    limits = np.full(8, longest)
+    limits[: ranges.size] = ranges
+    counters = np.zeros((step.size, limits.size + 1), np.int64)
     hits = np.empty(step.size + 1, np.int64)
+    begin, end, base = np.int64(0), np.int64(step.size), np.int64(0)
     for i in range(ordered.size):
         now = ordered[i] >> bits
         here = ordered[i] & mask
-        around = here
-        if stride > 0:
-            # mostly there is nothing, and this says so at once
-            close = 0
-            for dy in range(-REACH, REACH + 1):
-                line = recent[here + dy * stride - REACH : here + dy * stride + REACH + 1]
-                for dx in range(2 * REACH + 1):
-                    close += now - line[dx] < longest
-            end = np.int64(step.size if close > 0 else 0)
-        else:
-            around = 0
-            begin, end = first[here], first[here + 1]
-        some = 0
-        for e in range(begin, end):
-            hits[some] = e
-            some += now - recent[around + step[e]] < longest
-        for h in range(some):
-            e = hits[h]
-            there = around + step[e]
-            k = passed[there]
-            oldest = max(offsets[row_of[there]], k - _FEW)
-            while k >= oldest and now - np.int64(stamps[k]) < longest:
-                lag = now - np.int64(stamps[k])
-                b = 0
-                for j in range(lags.size - 1):
-                    b += lag >= lags[j]
-                found[kind[e], b] += 1
-                later[kind[e]] += second[e] & (lag > 0) & (lag < latest)
-                k -= 1
-            if k < oldest and k >= offsets[row_of[there]]:
-                _many_before(stamps, offsets[row_of[there]], k, now, lags, found[kind[e]])
-                if second[e]:
-                    before = _since(stamps, offsets[row_of[there]], k + 1, now - latest)
-                    later[kind[e]] += _since(stamps, before, k + 1, now - 1) - before
-        recent[here] = now
+        if now - latest_at[0] < longest:
+            if stride > 0:
+                base = here
+            else:
+                begin, end = first[here], first[here + 1]
+            depth = 0
+            while depth < _DEEP and now - latest_at[depth] < longest:
+                # first all entries are gone through, then those that are found: no processor could guess which ones
+                some = np.uint64(0)
+                for e in range(begin, end):
+                    lag = now - recent[depth, np.uint64(base + step[e])]
+                    hits[some] = e
+                    some += np.uint64(lag < longest)
+                for h in range(some):
+                    lag = now - recent[depth, np.uint64(base + step[hits[h]])]
+                    k = np.uint64(0)
+                    for limit in range(limits.size):
+                        k += np.uint64(lag >= limits[limit])
+                    counters[np.uint64(hits[h]), k] += 1
+                depth += 1
+            if now - latest_at[_DEEP] < longest:
+                for e in range(begin, end):
+                    row = row_of[base + step[e]]
+                    if row < 0:
+                        continue
+                    start, stop = offsets[row], passed[base + step[e]] - _DEEP + 1
+                    if stop > start and now - np.int64(stamps[stop - 1]) < longest:
+                        _many_before(stamps, start, stop - 1, now, lags, found[kind[e]])
+                        if second[e]:
+                            until = _since(stamps, start, stop, now - 1)
+                            later[kind[e]] += until - _since(stamps, start, until, now - latest)
+        for depth in range(_DEEP, 0, -1):
+            earlier = recent[depth - 1, here]
+            latest_at[depth] = max(latest_at[depth], earlier)
+            if depth < _DEEP:
+                recent[depth, here] = earlier
+        recent[0, here] = now
+        latest_at[0] = now
         passed[here] += 1
+    for e in range(step.size):
+        b = 0
+        for k in range(ranges.size):
+            while lags[b] < limits[k]:
+                b += 1
+            found[kind[e], b] += counters[e, k]
+            if second[e] and 1 < limits[k] <= latest:
+                later[kind[e]] += counters[e, k]
 
 
 @jit
@@ -374,27 +387,35 @@ def _many_before(stamps, begin, k, now, lags, out):
 
 
 @jit
-def _pairs(times, begin, end, lag, crowded, behind, k):
-    """Pairs of times, of which the later one is one of begin to end, less than `lag` apart.
-
-    behind[k]: the first time that is near enough to the last one, moved on; crowded: are there usually several?
-    """
-    oldest = behind[k]
+def _pairs(times, begin, end, lag, usual):
+    """Pairs of times less than `lag` apart, of which the later one is one of begin to end; usual: how many each has."""
     number = np.int64(0)
-    if crowded:
-        # each step goes on in one of the two places, whichever it is: no branch that a processor could guess wrong
-        i = begin
-        while i < end:
-            far = np.int64(times[i] - times[oldest] >= lag)
-            number += (1 - far) * (i - oldest)
-            oldest += far
-            i += 1 - far
-    else:
-        for i in range(begin, end):
-            while times[i] - times[oldest] >= lag:
-                oldest += 1
-            number += i - oldest
-    behind[k] = oldest
+    if usual < _SHIFTS / 4:
+        # those that are next to each other, then those next but one, and so on until there are none
+        for k in range(1, _SHIFTS):
+            first = max(begin, k)
+            some = _nearer(times[first:end], times[first - k : end - k], lag)
+            number += some
+            if some == 0:
+                return number
+        number = np.int64(0)
+    oldest = _since(times, 0, begin, times[begin] - lag) if begin < end else begin
+    # each step goes on in one of the two places, whichever it is: no branch that a processor could guess wrong
+    i = begin
+    while i < end:
+        far = np.int64(times[i] - times[oldest] >= lag)
+        number += (1 - far) * (i - oldest)
+        oldest += far
+        i += 1 - far
+    return number
+
+
+@jit
+def _nearer(later, earlier, lag):
+    """How many are less than `lag` later."""
+    number = np.int64(0)
+    for i in range(later.size):
+        number += later[i] - earlier[i] < lag
     return number
 
 
@@ -433,20 +454,36 @@ def _finish(kinds, runs, clusters):
 
 
 @jit
-def _through_frames(frames, none, edges, start, gaps, kinds, spacings, clusters):
-    """Spacings and clusters of first stamps (frames, pixels), frame by frame."""
-    pixels = frames.shape[1]
-    raw = np.empty(pixels, np.int64)
-    spare = np.empty(pixels, np.int64)
-    times = np.empty(pixels, np.int64)
+def _through_frames(offsets, stamps, none, edges, start, gaps, kinds, spacings, clusters):
+    """Spacings and clusters of first stamps, frame by frame; see `FirstStamps`. Some frames are sorted together."""
+    bits = 0
+    while (np.int64(1) << bits) < none:
+        bits += 1
+    mask = (np.int64(1) << bits) - 1
+    frames = offsets.size - 1
+    most = _AT_ONCE
+    for f in range(frames):
+        most = max(most, offsets[f + 1] - offsets[f])
+    raw = np.empty(most, np.int64)
+    spare = np.empty(most, np.int64)
+    times = np.empty(most, np.int64)
     heads = np.empty((2, 2049), np.int64)
     runs = np.ones(gaps.size, np.int64)
-    for f in range(frames.shape[0]):
-        count = 0
-        for p in range(pixels):
-            if frames[f, p] < none:
-                raw[count] = frames[f, p]
-                count += 1
-        sort_ticks(raw, count, 0, none, times, 0, spare, heads)
-        _follow(times, 0, count, -1, edges, start, gaps, kinds, runs, spacings, clusters)
-        _finish(kinds, runs, clusters)
+    first = 0
+    while first < frames:
+        last = first + 1
+        while last < frames and offsets[last + 1] - offsets[first] <= most:
+            last += 1
+        before = offsets[first]
+        for f in range(first, last):
+            for i in range(offsets[f], offsets[f + 1]):
+                raw[i - before] = (np.int64(f - first) << bits) | np.int64(stamps[i])
+        sort_ticks(raw, offsets[last] - before, 0, np.int64(last - first) << bits, times, 0, spare, heads)
+        for f in range(first, last):
+            begin, end = offsets[f] - before, offsets[f + 1] - before
+            if end - begin > 1:
+                for i in range(begin, end):
+                    times[i] &= mask
+                _follow(times, begin, end, -1, edges, start, gaps, kinds, runs, spacings, clusters)
+                _finish(kinds, runs, clusters)
+        first = last

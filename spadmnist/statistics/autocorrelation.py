@@ -9,15 +9,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..kernels import jit
+from ..kernels import inline, jit
 from . import Recording, Statistic, Summary
 from ._counting import Surplus, exposure_in, of_pairs, span, whole_ticks
-from ._frames import as_words, at_ends, count_ones, moments
+from ._frames import as_words, at_ends, bits, count_ones, moments
 
 _SHORTEST, _LONGEST = 10e-9, 10e-3  # s
 _LAGS = (1, 2, 3, 5, 10, 20, 50, 100)  # frames
 _PER_OCTAVE = 4
-_SPARSE = 1.5  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
+_SPARSE = 0.75  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
 
 
 class Autocorrelation(Statistic):
@@ -110,6 +110,7 @@ def _correlate(stamps, offsets, per_box, boxes, pairs, chance, variance):
     box = np.empty(most, np.int64)
     inside = np.empty(most, np.int64)
     filled = np.empty(0, np.int32)
+    held = np.empty((levels + 1, 16), np.int64)
     for row in range(offsets.size - 1):
         n = 0
         total = 0
@@ -134,7 +135,7 @@ def _correlate(stamps, offsets, per_box, boxes, pairs, chance, variance):
         while sparse < levels and n * np.float64(8 << sparse) < _SPARSE * boxes:
             sparse += 1
         if sparse > 0:
-            _few(box[:n], inside[:n], sparse, pairs)
+            _few(box[:n], inside[:n], sparse, held, pairs)
         if sparse < levels:
             size = boxes >> sparse
             if filled.size < size:
@@ -167,23 +168,32 @@ def _by_chance(box, inside, total, boxes, chance, variance):
 
 
 @jit
-def _few(box, inside, levels, out):
-    """The pairs of the first levels, one by one."""
+def _few(box, inside, levels, held, out):
+    """The pairs of the first levels, one by one. held: (levels + 1, 16), a buffer."""
+    held[: levels + 1] = 0
     window = np.int64(8) << (levels - 1)
     for i in range(1, box.size):
         here = box[i]
-        k = i - 1
+        # the pair with the last one always, wherever it belongs: no branch that a processor could guess wrong
+        _add_pair(here, box[i - 1], inside[i] * inside[i - 1], levels, held)
+        k = i - 2
         while k >= 0 and here - box[k] < window:
-            apart = here - box[k]
-            weight = inside[i] * inside[k]
-            # at the first level at which they can be less than 8 boxes apart, and at the next
-            level = max((np.float64(apart).view(np.int64) >> 52) - 1023 - 3, 0)
-            while level < levels and (apart >> level) >= 3:
-                d = (here >> level) - (box[k] >> level)
-                if d >= 4 and d < 8:
-                    out[level, d - 4] += weight
-                level += 1
+            _add_pair(here, box[k], inside[i] * inside[k], levels, held)
             k -= 1
+    for level in range(levels):
+        for d in range(4, 8):
+            out[level, d - 4] += held[level, d]
+
+
+@inline
+def _add_pair(here, there, weight, levels, held):
+    """Add a pair at the level at which it is 4 to 8 boxes apart and at the next; beyond all levels stands the last."""
+    level = max((np.float64(here - there).view(np.int64) >> 52) - 1023 - 2, 0)
+    at = min(level, levels)
+    held[at, ((here >> level) - (there >> level)) & 15] += weight
+    level += 1
+    at = min(level, levels)
+    held[at, ((here >> level) - (there >> level)) & 15] += weight
 
 
 @jit
@@ -213,7 +223,7 @@ def _products(recording: Recording, lags: np.ndarray) -> np.ndarray:
             before = both[-longest:]
         return out
     before = np.zeros((longest, 0), np.uint64)
-    for first, part in recording.bits():
+    for first, part in bits(recording):
         words = as_words(part)
         if before.shape[1] != words.shape[1]:
             before = np.zeros((longest, words.shape[1]), np.uint64)

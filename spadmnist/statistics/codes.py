@@ -10,14 +10,27 @@ from .. import units
 from ..kernels import jit
 from . import Recording, Statistic, Summary
 from ._counting import of_detections, per_cent
+from ._frames import first_stamps
 
 # All periods below divide it: a histogram of stamps modulo this number holds those of all of them.
-_PRIMES = (2, 3, 5, 7)
 _COMMON = 2**8 * 3 * 5**3 * 7
 _SHOWN = (256, 140, 100)
 _FOLDS = tuple(p for p in range(2, 1001) if _COMMON % p == 0)
+# (from, to): each period from the shortest that is folded before, so that little is added up. Every one of them divides
+# one of the first four that are small.
+_MIDDLE = ((_COMMON, 134400), (_COMMON, 84000), (84000, 21000), (134400, 16800), (134400, 13440), (134400, 5376))
 _COINCIDENCES = 500.0  # pairs of detections with the same code, from which on chi squared has its law
 _TURNS = 16  # periods that an exposure or a frame holds at least, for what is left over at its end to be little
+
+
+def _steps() -> tuple[tuple[int, int], ...]:
+    steps = list(_MIDDLE)
+    for period in reversed(_FOLDS):
+        steps.append((min(whole for _, whole in steps if whole % period == 0), period))
+    return tuple(steps)
+
+
+_STEPS = _steps()
 
 
 class Codes(Statistic):
@@ -74,17 +87,13 @@ class CodePeriods(Statistic):
             return None
         folded = _folds(recording)
         total = float(folded[periods[0]].sum())
-        values = np.zeros(len(periods))
-        uneven = np.zeros(len(periods))
-        for k, period in enumerate(periods):
-            if total * total < 2 * _COINCIDENCES * period:
-                continue
-            counts = folded[period].astype(np.float64)
-            freedom = period - 1
-            squares = float(counts @ counts) * period / total - total
-            part = 2 / (9 * freedom)
-            values[k] = (np.cbrt(squares / freedom) - (1 - part)) / np.sqrt(part)
-            uneven[k] = (squares - freedom) / total  # squared relative spread of the codes' widths
+        axis = np.array(periods, np.float64)
+        freedom, part = axis - 1, 2 / (9 * (axis - 1))
+        products = np.array([counts @ counts for counts in (folded[period].astype(np.float64) for period in periods)])
+        squares = products * axis / max(total, 1.0) - total
+        enough = total * total >= 2 * _COINCIDENCES * axis
+        values = np.where(enough, (np.cbrt(squares / freedom) - (1 - part)) / np.sqrt(part), 0.0)
+        uneven = np.where(enough, (squares - freedom) / max(total, 1.0), 0.0)  # squared relative spread of the widths
 
         def where(cell: int) -> str:
             period = periods[cell]
@@ -94,7 +103,6 @@ class CodePeriods(Statistic):
             wide = float(np.sqrt(max(uneven[cell], 0.0)))
             return f"widths of the codes vary by {per_cent(wide)} (rms)", wide
 
-        axis = np.array(periods, np.float64)
         return Summary(values, "normal", where, size, np.ones(len(periods)), axis, "period (ticks)", log=True)
 
 
@@ -111,31 +119,31 @@ def _folds(recording: Recording) -> dict[int, np.ndarray]:
     """Period -> (period,) how many stamps have each code, for all of `_FOLDS`."""
     known = recording._kept.get("code folds")
     if known is None:
-        density = np.zeros(_COMMON, np.int64)
+        number = recording.totals.sum()
+        density = np.zeros(_COMMON, np.int32 if number < 2**31 else np.int64)
         if recording.events is not None:
             assert recording.events.ticks is not None
-            _remainders(recording.events.ticks, np.iinfo(np.int64).max, density)
+            _remainders(recording.events.ticks, density)
         else:
-            for _, part in recording.chunks():
-                _remainders(np.ascontiguousarray(part).ravel(), recording.none, density)
+            for _, found in first_stamps(recording):
+                _remainders(found.stamps, density)
         folded = {_COMMON: density}
-        for period in _FOLDS:
-            _fold(folded, period)
+        for whole, part in _STEPS:
+            folded[part] = np.zeros(part, density.dtype if part > 1000 else np.int64)
+            _fold(folded[whole], folded[part])
         known = recording._kept["code folds"] = {period: folded[period] for period in _FOLDS}
     return known  # type: ignore[return-value]
 
 
-def _fold(folded: dict[int, np.ndarray], period: int) -> np.ndarray:
-    """From a period that is a few times as long, which is folded from a longer one."""
-    if period not in folded:
-        times = next(p for p in reversed(_PRIMES) if _COMMON % (period * p) == 0)
-        folded[period] = _fold(folded, period * times).reshape(times, period).sum(axis=0)
-    return folded[period]
+@jit
+def _fold(whole, part):
+    """Add up what lies a multiple of a period apart. whole: (times period,); part: (period,), added to."""
+    for first in range(0, whole.size, part.size):
+        for k in range(part.size):
+            part[k] += whole[first + k]
 
 
 @jit
-def _remainders(stamps, none, out):
+def _remainders(stamps, out):
     for i in range(stamps.size):
-        stamp = np.int64(stamps[i])
-        if stamp < none:
-            out[np.uint64(stamp) % np.uint64(_COMMON)] += 1
+        out[np.uint64(stamps[i]) % np.uint64(_COMMON)] += 1

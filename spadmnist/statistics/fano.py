@@ -10,7 +10,7 @@ import numpy as np
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
-from ._frames import as_words, frame_sums, ones_of
+from ._frames import as_words, bits, count_ones, frame_sums
 from ._scores import Pairs, minority, number_at, pair_scores, pairs_law, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 
@@ -19,7 +19,7 @@ _WINDOWS = 20  # of the longest kind
 _SHORTEST = 1e-6  # s
 _MOST = 2**22  # windows of the array sum that are held at a time
 _GROUP = 6  # up to 2^6 frames, counts are bits of different weight in different words
-_WORDS = 8  # words (of 64 pixels) that are counted at a time: a line of the cache
+_AT_ONCE = 2**14  # words (of 64 pixels) that are counted at a time: they fit into the cache
 
 
 @jit
@@ -27,28 +27,80 @@ def event_pairs(stamps, offsets, factor, levels):
     """Pairs of events of the same row within windows of 1, 2, 4, ... of the shortest windows.
 
     factor: shortest windows per unit of the stamps; the longest window is 2^(levels - 1) of them, of which there are
-    20. Returns (pairs (levels,), inside (rows,) events within all windows), int64.
+    20. Returns (pairs (levels,), inside (rows,) events within all windows), int64. While there are more than four
+    windows to an event pairs are looked up one by one, from there on windows are filled.
     """
     end = np.int64(20) << np.int64(levels - 1)
     pairs = np.zeros(levels, np.int64)
     inside = np.zeros(offsets.size - 1, np.int64)
-    before = np.zeros(levels, np.int64)  # events of the row in the present window
+    most = 0
     for row in range(offsets.size - 1):
-        last = np.int64(-1)
+        most = max(most, offsets[row + 1] - offsets[row])
+    windows = np.empty(most, np.int64)
+    sums = np.empty(0, np.int32)
+    for row in range(offsets.size - 1):
+        n = 0
         for i in range(offsets[row], offsets[row + 1]):
             window = np.int64(stamps[i] * factor)
-            if window >= end:
-                continue
-            inside[row] += 1
-            apart = window ^ last if last >= 0 else end
-            for level in range(levels):
-                if (apart >> level) == 0:
-                    pairs[level] += before[level]
-                    before[level] += 1
-                else:
-                    before[level] = 1
-            last = window
+            if window < end:
+                windows[n] = window
+                n += 1
+        inside[row] = n
+        if n < 2:
+            continue
+        sparse = 0
+        while sparse < levels - 1 and end >> sparse > 4 * n:
+            sparse += 1
+        if sparse > 0 and not _few(windows[:n], sparse, pairs):
+            sparse = 0
+        size = end >> sparse
+        if sums.size < size:
+            sums = np.empty(size, np.int32)
+        sums[:size] = 0
+        for i in range(n):
+            sums[windows[i] >> sparse] += np.int32(1)
+        pairs[sparse:] += pairs_in_windows(sums[:size], levels - sparse)
     return pairs, inside
+
+
+@jit
+def _few(windows, levels, pairs):
+    """Add the pairs of the first levels, one by one; false, and nothing is added, where they turn out to be many."""
+    lowest = np.zeros(levels, np.int64)  # the pairs that share a window from this level on
+    left = 16 * windows.size
+    for i in range(1, windows.size):
+        k = i - 1
+        while k >= 0:
+            apart = windows[i] ^ windows[k]
+            if apart >> (levels - 1):
+                break
+            # so many bits are different
+            lowest[0 if apart == 0 else (np.float64(apart).view(np.int64) >> 52) - 1022] += 1
+            k -= 1
+        left -= i - 1 - k
+        if left < 0:
+            return False
+    so_far = np.int64(0)
+    for level in range(levels):
+        so_far += lowest[level]
+        pairs[level] += so_far
+    return True
+
+
+@jit
+def pairs_in_windows(sums, levels):
+    """(levels,) int64 pairs of detections within windows of 1, 2, 4, ... of the shortest. sums: (windows,), used up."""
+    pairs = np.zeros(levels, np.int64)
+    windows = sums.size
+    for level in range(levels):
+        total = np.int64(0)
+        for k in range(windows):
+            total += np.int64(sums[k]) * (np.int64(sums[k]) - 1)
+        pairs[level] = total // 2
+        windows //= 2
+        for k in range(windows):
+            sums[k] = sums[2 * k] + sums[2 * k + 1]
+    return pairs
 
 
 @jit
@@ -64,73 +116,85 @@ def event_sums(stamps, factor, windows):
 
 @jit
 def group_squares(frames, levels, squares, counts):
-    """Squares of the pixels' counts in windows of 2, 4, ... 2^levels frames, summed over pixels; one group of frames.
+    """Squares of the pixels' counts in windows of 2, 4, ... 2^levels frames, summed over pixels and groups of frames.
 
-    frames: (2^levels, words) uint64, a bit for each pixel. squares: (levels + 1,) int64, added to. counts: (64 words,)
-    int32, the counts of the whole group. The counts of 64 pixels stand in several words, one for each binary digit;
-    windows are added as in a binary counter, so that every frame is looked at once.
+    frames: (groups * 2^levels, words) uint64, a bit for each pixel. squares: (levels + 1,) int64, added to. counts:
+    (groups, 64 words) int32, the counts of each group. The counts of 64 pixels stand in several words, one for each
+    binary digit. Frames are put in order so that the two halves of every window stand in the two halves of the array:
+    then words are added many at a time.
     """
-    group, words = frames.shape
-    line = 8
-    held = np.zeros((levels + 1, levels + 2, line), np.uint64)  # first halves of windows: level, digit, word
-    now = np.zeros((levels + 2, line), np.uint64)
-    for first in range(0, words, line):
-        width = min(line, words - first)
-        for f in range(group):
-            for w in range(width):
-                now[0, w] = frames[f, first + w]
-            level = 0
-            while (f >> level) & 1:
-                for w in range(width):
-                    carry = np.uint64(0)
-                    for digit in range(level + 1):
-                        a = held[level, digit, w]
-                        b = now[digit, w]
-                        different = a ^ b
-                        now[digit, w] = different ^ carry
-                        carry = (a & b) | (carry & different)
-                    now[level + 1, w] = carry
-                level += 1
-                total = np.int64(0)
-                for i in range(level + 1):
-                    for j in range(i, level + 1):
-                        both = np.uint64(0)
-                        for w in range(width):
-                            both += ones_of(now[i, w] & now[j, w])
-                        total += np.int64(both) << (i + j + (1 if j > i else 0))
-                squares[level] += total
-            for digit in range(level + 1):
-                for w in range(width):
-                    held[level, digit, w] = now[digit, w]
-        for w in range(width):
-            place = 64 * (first + w)
-            for bit in range(64):
-                count = np.int32(0)
-                for digit in range(levels + 1):
-                    count += np.int32((now[digit, w] >> np.uint64(bit)) & np.uint64(1)) << np.int32(digit)
-                counts[place + bit] = count
+    groups, words = frames.shape[0] >> levels, frames.shape[1]
+    each = groups * words
+    size = each << levels
+    digits = np.empty((levels + 1, size), np.uint64)
+    carry = np.empty(size // 2, np.uint64)
+    for f in range(1 << levels):
+        place = 0
+        for bit in range(levels):
+            place |= ((f >> bit) & 1) << (levels - 1 - bit)
+        for group in range(groups):
+            at = place * each + group * words
+            digits[0, at : at + words] = frames[(group << levels) + f]
+    for level in range(1, levels + 1):
+        size //= 2
+        carry[:size] = np.uint64(0)
+        for digit in range(level):
+            _add_digit(digits[digit, :size], digits[digit, size : 2 * size], carry[:size])
+        digits[level, :size] = carry[:size]
+        total = np.int64(0)
+        for i in range(level + 1):
+            for j in range(i, level + 1):
+                both = count_ones(digits[i, :size], digits[j, :size])
+                total += both << (i + j + (1 if j > i else 0))
+        squares[level] += total
+    for group in range(groups):
+        for w in range(words):
+            of_word = counts[group, 64 * w : 64 * w + 64]
+            of_word[:] = 0
+            for digit in range(levels + 1):
+                word = digits[digit, group * words + w]
+                for bit in range(64):
+                    of_word[bit] += np.int32((word >> np.uint64(bit)) & np.uint64(1)) << np.int32(digit)
+
+
+@jit
+def _add_digit(a, b, carry):
+    """Add one binary digit of many numbers: a becomes that of the sum."""
+    for i in range(a.size):
+        different = a[i] ^ b[i]
+        both = a[i] & b[i]
+        a[i] = different ^ carry[i]
+        carry[i] = both | (carry[i] & different)
 
 
 @jit
 def add_window(counts, number, held, squares, totals):
     """One more window of the shortest kind, for all pixels: it is added as in a binary counter.
 
-    counts: (pixels,); number: of the window, from 0; held: (levels, pixels) int64, first halves of longer windows;
-    squares: (levels,) int64, sums over pixels of the squared counts at each length, added to; totals: (pixels,) int64,
-    added to.
+    counts: (pixels,) of any type; number: of the window, from 0; held: (levels, pixels) int64, first halves of longer
+    windows; squares: (levels,) int64, sums over pixels of the squared counts at each length, added to; totals:
+    (pixels,) int64, added to.
     """
     levels, pixels = held.shape
-    done = 1  # so many lengths end with this window
-    while done < levels and (number >> (done - 1)) & 1:
-        done += 1
+    now = np.empty(pixels, np.int64)
     for p in range(pixels):
-        count = np.int64(counts[p])
-        totals[p] += count
-        squares[0] += count * count
-        for level in range(1, done):
-            count += held[level - 1, p]
-            squares[level] += count * count
-        held[done - 1, p] = count
+        now[p] = np.int64(counts[p])
+        totals[p] += now[p]
+    squares[0] += _sum_of_squares(now)
+    level = 1
+    while level < levels and (number >> (level - 1)) & 1:  # so many lengths end with this window
+        now += held[level - 1]
+        squares[level] += _sum_of_squares(now)
+        level += 1
+    held[level - 1] = now
+
+
+@jit
+def _sum_of_squares(counts):
+    total = np.int64(0)
+    for p in range(counts.size):
+        total += counts[p] * counts[p]
+    return total
 
 
 def _levels(shortest: int) -> int:
@@ -163,18 +227,22 @@ def frame_pairs(recording: Recording) -> tuple[np.ndarray, np.ndarray, int]:
     words = -(-recording.layout.rows * -(-recording.layout.columns // 8) // 8)
     totals = np.zeros(64 * words, np.int64)  # of the pixels, in the order of their bits
     held = np.zeros((levels - step, 64 * words), np.int64)
-    counts = np.zeros(64 * words, np.int32)
+    groups = max(1, _AT_ONCE // (words << step))
+    counts = np.zeros((groups, 64 * words), np.int32)
     below, above = np.zeros(step + 1, np.int64), np.zeros(levels - step, np.int64)
     left, number = np.zeros((0, words), np.uint64), 0
-    for start, part in recording.bits():
+    for start, part in bits(recording):
         if start >= used:
             break
         flat = as_words(part[: used - start])
         flat = np.concatenate([left, flat]) if len(left) else flat
-        for first in range(0, len(flat) >> step << step, 1 << step):
-            group_squares(flat[first : first + (1 << step)], step, below, counts)
-            add_window(counts, number, held, above, totals)
-            number += 1
+        whole = len(flat) >> step << step
+        for first in range(0, whole, groups << step):
+            some = flat[first : min(first + (groups << step), whole)]
+            group_squares(some, step, below, counts)
+            for group in range(len(some) >> step):
+                add_window(counts[group], number, held, above, totals)
+                number += 1
         left = flat[len(flat) >> step << step :].copy()
     squares[: step + 1] = below
     squares[step:] = above
@@ -288,7 +356,7 @@ class ArrayFano(Statistic):
         if recording.events is not None:
             levels, shortest = _exact_lengths(conditions.exposure, _MOST)
             found, unit = stamps(recording)
-            sums = event_sums(found, unit / shortest, _WINDOWS << (levels - 1)).astype(np.int64)
+            sums = event_sums(found, unit / shortest, _WINDOWS << (levels - 1))
             slots = np.inf
             lengths = shortest * 2.0 ** np.arange(levels)
         else:
@@ -308,10 +376,12 @@ class ArrayFano(Statistic):
                 sums = int(slots) * recording.pixels - sums
         detections = float(sums.sum())
         share = shares(np.append(recording.totals, levels), levels)
+        windows = len(sums)
+        pairs = pairs_in_windows(sums, levels)
         scores, laws, noises = [], [], []
         for level in range(levels):
-            n = len(sums)
-            number = float((sums * (sums - 1)).sum() // 2)
+            n = windows >> level
+            number = float(pairs[level])
             if np.isfinite(slots):
                 one = scatter * 2.0**level
                 noise = n * one * (1.0 - 1.0 / n)
@@ -325,8 +395,7 @@ class ArrayFano(Statistic):
             scores.append(_array_score(number, detections, n, law, share[level]))
             laws.append(law)
             noises.append(noise)
-            sums = sums.reshape(-1, 2).sum(axis=1) if level + 1 < levels else sums
-        boxes = len(sums) << np.arange(levels)[::-1]
+        boxes = windows >> np.arange(levels)
         return _summary(scores, laws, lengths, np.array(noises), total / boxes, "the array")
 
 

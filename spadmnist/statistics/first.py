@@ -9,6 +9,7 @@ import numpy as np
 from ..kernels import jit
 from . import Recording, Statistic, Summary
 from ._counting import of_detections, span
+from ._frames import first_stamps
 
 _BINS = 40
 _FINE = 8  # parts of the first of them, about what is carried over from the frame before
@@ -35,14 +36,11 @@ class FirstArrivals(Statistic):
         tick = recording.tick or 1.0
         edges = _edges(recording.none)
         counts = np.zeros((len(_AFTER), edges.size - 1), np.int64)
-        before = np.zeros(0, np.int8)
+        kind, last = np.zeros(recording.pixels, np.int8), np.full(recording.pixels, -1)
         bin_of = np.repeat(np.arange(edges.size - 1), np.diff(edges)) if recording.none <= 1 << 22 else np.zeros(0, int)
         late = round(_LATE * recording.none)
-        for _, part in recording.chunks():
-            flat = np.ascontiguousarray(part.reshape(len(part), -1))
-            if not before.size:
-                before = np.full(flat.shape[1], -1, np.int8)
-            _arrivals(flat, recording.none, late, edges, bin_of, before, counts)
+        for first, found in first_stamps(recording):
+            _arrivals(*found, first, late, edges, bin_of, kind, last, counts)
         cells = edges.size - 1
         seconds = edges * tick
 
@@ -63,19 +61,18 @@ def _edges(none: int) -> np.ndarray:
 
 
 @jit
-def _arrivals(frames, none, late, edges, bin_of, before, counts):
-    """Add to `counts` (kinds, cells) the first stamps (frames, pixels); before: kind of each pixel's last frame, or -1.
+def _arrivals(offsets, stamps, pixels, first, late, edges, bin_of, kind, last, counts):
+    """Add first stamps to `counts` (kinds, cells). The others: see `FirstStamps`.
 
-    bin_of: (none,) cell of each tick, or empty where there are too many of them.
+    first: number of the first frame; bin_of: (none,) cell of each tick, or empty where there are too many of them;
+    kind, last: (pixels,) of the last frame with a detection, 1 or 2 as it is early or late, and its number.
     """
-    for f in range(frames.shape[0]):
-        for p in range(frames.shape[1]):
-            stamp = np.int64(frames[f, p])
-            kind = before[p]
-            if stamp >= none:
-                before[p] = 0
-                continue
-            before[p] = 2 if stamp >= late else 1
-            if kind >= 0:
+    for f in range(offsets.size - 1):
+        frame = first + f
+        for i in range(offsets[f], offsets[f + 1]):
+            stamp, p = np.int64(stamps[i]), pixels[i]
+            if frame > 0:  # nothing is known of the frame before the first
                 k = bin_of[stamp] if bin_of.size else np.searchsorted(edges, stamp, side="right") - 1
-                counts[kind, k] += 1
+                counts[kind[p] if last[p] == frame - 1 else 0, k] += 1
+            kind[p] = 2 if stamp >= late else 1
+            last[p] = frame

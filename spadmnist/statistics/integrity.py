@@ -12,7 +12,7 @@ import numpy as np
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
-from ._frames import frame_sums
+from ._frames import as_words, bits, first_stamps, frame_sums, ones_of
 from ._series import has_data, slots_of_frame, stamps
 
 _SURE_CHANCE = 1e-9  # a repeated frame for which all chances of a capture together are less is no chance
@@ -57,6 +57,39 @@ def chance_of_bits(frame, likely, log_best, loss, least):
             if chance < least:
                 break
     return chance
+
+
+@jit
+def same_stamps(offsets, stamps, before, same):
+    """Put `same` (frames,) to false where a frame has not the stamps of the one before, given the pixels are the same.
+
+    offsets, stamps: see `FirstStamps`; before: the stamps of the frame before the first of them.
+    """
+    for f in range(same.size):
+        if same[f]:
+            earlier = stamps[offsets[f - 1] : offsets[f]] if f else before
+            for i in range(earlier.size):
+                if stamps[offsets[f] + i] != earlier[i]:
+                    same[f] = False
+                    break
+
+
+@jit
+def chances_of_repeats(frames, same, likely, log_best, loss, least, of_stamp):
+    """(frames,) logarithm of the chance of each frame that is the same as the one before, 0 for the others.
+
+    frames: (frames, bytes); same: (frames,) bool; of_stamp: what each detection adds. The rest: see `chance_of_bits`.
+    """
+    out = np.zeros(same.size)
+    for f in range(same.size):
+        if same[f] and f > 0 and same[f - 1]:
+            out[f] = out[f - 1]  # the same frame once more
+        elif same[f]:
+            ones = 0
+            for i in range(frames.shape[1]):
+                ones += ones_of(np.uint64(frames[f, i]))
+            out[f] = chance_of_bits(frames[f], likely, log_best, loss, least) + of_stamp * ones
+    return out
 
 
 @jit
@@ -130,19 +163,14 @@ class RepeatedFrames(Statistic):
 
 def _chances_of_repeats(recording: Recording) -> np.ndarray:
     """Logarithm of the chance of each frame that is the same as the one before, by the pixels' own detections."""
-    chance_of = _chance_of_counts(recording) if recording.modality == "counts" else _chance_of_frame(recording)
-    found: list[float] = []
-    before: np.ndarray | None = None
-    for _, part in recording.chunks():
-        flat = np.ascontiguousarray(part).reshape(len(part), -1)
-        same = same_as_before(flat, flat[0] if before is None else before, before is None)
-        found += [chance_of(part[f]) for f in np.flatnonzero(same)]
-        before = flat[-1].copy()
-    return np.array(found)
+    if "chances of repeats" not in recording._kept:
+        found = _repeats_of_counts(recording) if recording.modality == "counts" else _repeats_of_bits(recording)
+        recording._kept["chances of repeats"] = np.array(found)
+    return recording._kept["chances of repeats"]  # type: ignore[return-value]
 
 
-def _chance_of_frame(recording: Recording) -> Callable[[np.ndarray], float]:
-    """Of a frame of bits or of stamps."""
+def _repeats_of_bits(recording: Recording) -> list[float]:
+    """Of frames of bits or of stamps."""
     frames, columns = recording.n_frames, recording.layout.columns
     # of a share a little off 0 and 1, since it is measured
     share = ((recording.totals + 0.5) / (frames + 1.0)).reshape(recording.layout.shape)
@@ -151,20 +179,38 @@ def _chance_of_frame(recording: Recording) -> Callable[[np.ndarray], float]:
     loss = np.pad(np.abs(np.log(share / (1.0 - share))), ((0, 0), (0, missing))).ravel()
     best = float(np.log(np.maximum(share, 1.0 - share)).sum())
     least = float(np.log(_SURE_CHANCE / frames))
-
-    def of_bits(frame: np.ndarray) -> float:
-        return float(chance_of_bits(np.ascontiguousarray(frame).ravel(), likely.ravel(), best, loss, least))
-
-    if recording.modality == "qis":
-        return of_bits
+    stamped = recording.modality == "str"
     # a stamp is the same by chance in about one of so many cases
-    same_stamp = float(np.log(max(1.0, -np.log(1.0 - share.max())) / recording.none))
+    of_stamp = float(np.log(max(1.0, -np.log(1.0 - share.max())) / recording.none)) if stamped else 0.0
+    found: list[float] = []
+    before, stamps_before = np.zeros(0, np.uint64), np.zeros(0, np.uint8)
+    stamps_of = first_stamps(recording) if stamped else None
+    for first, part in bits(recording):
+        words = as_words(part)
+        same = same_as_before(words, words[0] if first == 0 else before, first == 0)
+        before = words[-1].copy()
+        if stamps_of is not None:
+            offsets, stamps, _ = next(stamps_of)[1]
+            same_stamps(offsets, stamps, stamps_before.astype(stamps.dtype), same)
+            stamps_before = stamps[offsets[-2] :].copy()
+        if same.any():
+            flat = np.ascontiguousarray(part).reshape(len(part), -1)
+            chances = chances_of_repeats(flat, same, likely.ravel(), best, loss, least, of_stamp)
+            found += chances[same].tolist()
+    return found
 
-    def of_stamps(frame: np.ndarray) -> float:
-        bits = frame < recording.none
-        return of_bits(np.packbits(bits, axis=1)) + same_stamp * int(bits.sum())
 
-    return of_stamps
+def _repeats_of_counts(recording: Recording) -> list[float]:
+    """Of frames of counts."""
+    chance_of = _chance_of_counts(recording)
+    found: list[float] = []
+    before: np.ndarray | None = None
+    for _, part in recording.chunks():
+        flat = np.ascontiguousarray(part).reshape(len(part), -1)
+        same = same_as_before(flat, flat[0] if before is None else before, before is None)
+        found += [chance_of(part[f]) for f in np.flatnonzero(same)]
+        before = flat[-1].copy()
+    return found
 
 
 def _chance_of_counts(recording: Recording) -> Callable[[np.ndarray], float]:
@@ -219,6 +265,15 @@ class RareFrames(Statistic):
         return Summary(values, "poisson", lambda cell: f"frames {names[cell]}", size)
 
 
+def _faults(recording: Recording) -> tuple[int, int, int]:
+    """`faults` of a recording."""
+    if "faults" not in recording._kept:
+        assert recording.events is not None
+        found, unit = stamps(recording)
+        recording._kept["faults"] = faults(found, recording.events.offsets, recording.conditions.exposure / unit)
+    return recording._kept["faults"]  # type: ignore[return-value]
+
+
 class Disorder(Statistic):
     """Time stamps that are smaller than the one before in the same pixel.
 
@@ -232,7 +287,7 @@ class Disorder(Statistic):
     def reduce(self, recording: Recording) -> Summary | None:
         if not has_data(recording) or recording.events is None:
             return None
-        smaller = faults(stamps(recording)[0], recording.events.offsets, np.inf)[0]
+        smaller = _faults(recording)[0]
         events = max(1, len(recording.events))
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
@@ -255,8 +310,7 @@ class EqualStamps(Statistic):
     def reduce(self, recording: Recording) -> Summary | None:
         if not has_data(recording) or recording.events is None:
             return None
-        found, unit = stamps(recording)
-        _, equal, late = faults(found, recording.events.offsets, recording.conditions.exposure / unit)
+        _, equal, late = _faults(recording)
         events = max(1, len(recording.events))
         names = ("equal stamps of a pixel", "stamps behind the end of the exposure")
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from .. import units
-from ..kernels import jit
+from ..kernels import inline, jit
 from . import Recording, Statistic, Summary
 from ._counting import (
     exposure_in,
@@ -225,8 +225,10 @@ def _rescale(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @jit
 def _rescaled(stamps, offsets, dead, least, lags, counts, sums, products):
     levels = counts.size
-    longest = lags[lags.size - 1]
-    recent = np.empty(longest)
+    most = 0
+    for row in range(offsets.size - 1):
+        most = max(most, offsets[row + 1] - offsets[row])
+    u = np.empty(most)
     for row in range(offsets.size - 1):
         start, stop = offsets[row], offsets[row + 1]
         n = stop - start - 1
@@ -236,14 +238,43 @@ def _rescaled(stamps, offsets, dead, least, lags, counts, sums, products):
         if live <= 0:
             continue
         rate = n / live
+        own = stamps[start:stop]
         for k in range(n):
-            gap = np.float64(np.int64(stamps[start + k + 1]) - np.int64(stamps[start + k])) - dead
-            u = 1.0 - math.exp(-rate * gap) if gap > 0 else 0.0
-            counts[min(np.int64(u * levels), levels - 1)] += 1
-            u -= 0.5
-            for m in range(lags.size):
-                if k >= lags[m]:
-                    sums[m] += u * recent[(k - lags[m]) % longest]
-            recent[k % longest] = u
+            gap = np.float64(np.int64(own[k + 1]) - np.int64(own[k])) - dead
+            u[k] = rate * max(gap, 0.0)
+        for k in range(n):
+            u[k] = 1.0 - _exp_of_minus(u[k])
+        for k in range(n):
+            counts[min(np.int64(u[k] * levels), levels - 1)] += 1
+            u[k] -= 0.5
         for m in range(lags.size):
+            if n > lags[m]:
+                sums[m] += _product(u[lags[m] : n], u[: n - lags[m]])
             products[m] += max(n - lags[m], 0)
+
+
+@jit
+def _product(a, b):
+    """The sum of products in eight parts, so that several are taken at a time."""
+    parts = np.zeros(8)
+    whole = a.size // 8 * 8
+    for k in range(0, whole, 8):
+        for j in range(8):
+            parts[j] += a[k + j] * b[k + j]
+    total = parts.sum()
+    for k in range(whole, a.size):
+        total += a[k] * b[k]
+    return total
+
+
+@inline
+def _exp_of_minus(x):
+    """exp(-x) to rounding for x >= 0, in plain arithmetic, so that several are taken at a time."""
+    x = min(x, 700.0)
+    octaves = math.floor(x * 1.4426950408889634 + 0.5)
+    # what is left, at most half an octave: a power series
+    y = (octaves * 0.693147180369123816490 - x) + octaves * 1.90821492927058770002e-10
+    value = 1.0 / 479001600.0
+    for k in (39916800.0, 3628800.0, 362880.0, 40320.0, 5040.0, 720.0, 120.0, 24.0, 6.0, 2.0, 1.0, 1.0):
+        value = value * y + 1.0 / k
+    return value * np.int64((1023 - np.int64(octaves)) << 52).view(np.float64)

@@ -13,9 +13,11 @@ import numpy as np
 from ..kernels import jit
 from . import Recording, Statistic, Summary
 from ._counting import Surplus, exposure_in, of_pairs, per_cent, span, tick_of
-from ._frames import at_ends, frame_sums, moments, ones_of, some_frames
-from ._walk import Near, lag_edges, latest, near, walk
+from ._frames import at_ends, bits, count_ones, first_stamps, frame_sums, moments, ones_of, some_frames
+from ._walk import REACH, Near, around, lag_edges, latest, near, walk
 
+_CROWDED = 24  # places for each stamp, up to which all places of a frame are gone through
+_BLOCK = 4096  # words that are looked at together: they stay in the cache
 _PARTS = 64  # of a frame, in which the times of first stamps are counted
 
 
@@ -186,11 +188,16 @@ def _near_common(recording: Recording, near_by: Near) -> tuple[np.ndarray, int]:
         same = 0
         rows, columns = recording.layout.shape
         if recording.modality != "counts" and near_by.steps is not None:
-            before = np.zeros(0, np.uint64)
-            for first, part in recording.bits():
-                words = _row_words(part, columns)
-                same += _common_words(words, before if first else words[:0].ravel(), rows, near_by.steps, out)
-                before = words[-1].copy()
+            stride = columns + REACH
+            steps = np.stack([near_by.steps[:, 0], near_by.steps[:, 1] + stride * near_by.steps[:, 2]], axis=1)
+            size = -(-(rows * stride + int(steps[:, 1].max())) // 64)
+            before = np.zeros(size, np.uint64)
+            for _, part in bits(recording):
+                words = np.zeros((len(part) + 2, size), np.uint64)  # the last one is for what lies beyond the end
+                words[0] = before
+                used = _with_margins(part, columns, stride, words)
+                same += _common_words(words.ravel(), used * size, size, steps, out)
+                before = words[used - 1].copy()
         else:
             last: np.ndarray | None = None
             for values in _values(recording):
@@ -212,7 +219,7 @@ def _values(recording: Recording) -> Iterator[np.ndarray]:
             yield np.ascontiguousarray(part.reshape(len(part), -1))
         return
     columns = recording.layout.columns
-    for _, part in recording.bits():
+    for _, part in bits(recording):
         for k in range(0, len(part), 4096):
             yield np.unpackbits(part[k : k + 4096], axis=2, count=columns).reshape(-1, recording.pixels)
 
@@ -236,56 +243,83 @@ def _common_values(values, last, has_last, first, second, out):
             out[2] += earlier
 
 
-def _row_words(packed: np.ndarray, columns: int) -> np.ndarray:
-    """(frames, words) of packed frames: a row's first column is the highest bit of its first word.
+@jit
+def _with_margins(packed, columns, stride, out):
+    """Put packed frames (frames, rows, bytes) behind the first of `out` (frames, words), the lowest bits first.
 
-    Behind each row stands an empty word, and one more behind each frame, so that rows can be shifted.
+    stride: bits from a row to the next, more than columns, so that a step beside a row leads to an empty place. Of
+    several empty frames in a row, one is enough. Returns the frames that there are then.
     """
     frames, rows, width = packed.shape
-    words = -(-columns // 64)
-    padded = np.zeros((frames, rows, words + 1, 8), np.uint8)
-    padded.reshape(frames, rows, -1)[:, :, :width] = packed
-    out = np.zeros((frames, rows * (words + 1) + 1), np.uint64)
-    out[:, :-1] = padded.view(">u8").reshape(frames, -1)
-    return out
+    spread = np.empty(256, np.uint64)  # a byte the other way round
+    for byte in range(256):
+        spread[byte] = np.uint64(0)
+        for bit in range(8):
+            spread[byte] |= np.uint64((byte >> (7 - bit)) & 1) << np.uint64(bit)
+    used = 1
+    for f in range(frames):
+        ones = np.uint64(0)
+        for row in range(rows):
+            for k in range(width):
+                byte = spread[packed[f, row, k]]
+                ones |= byte
+                place = row * stride + 8 * k
+                word, shift = place >> 6, np.uint64(place & 63)
+                out[used, word] |= byte << shift
+                if shift > 56:
+                    out[used, word + 1] |= byte >> (np.uint64(64) - shift)
+        if ones == 0:
+            taken = False
+            for word in range(out.shape[1]):
+                taken |= out[used - 1, word] != 0
+            if not taken:
+                continue
+        used += 1
+    out[used] = np.uint64(0)
+    return used
 
 
 @jit
-def _common_words(words, before, rows, steps, out):
-    """Add the pairs of ones of frames, as `_row_words` gives them; before: the frame in front of them, or nothing.
+def _common_words(words, end, size, steps, out):
+    """Add the pairs of ones of frames, as `_with_margins` gives them, one behind the other up to `end`.
 
-    steps: (directions, 3) class, columns and rows to go. Returns the ones that a frame has in common with the last.
+    size: words of a frame, the first of which was counted before; steps: (directions, 2) class, bits to go. Returns
+    the ones that a frame shares with the last.
     """
-    width = (words.shape[1] - 1) // rows
     same = np.int64(0)
-    for f in range(words.shape[0]):
-        now = words[f]
-        last = words[f - 1] if f > 0 else before
-        if last.size:
-            same += _meet(now, last, 0, 0, now.size - 1, 0)
+    for first in range(size, end, _BLOCK):
+        last = min(first + _BLOCK, end)
         for k in range(steps.shape[0]):
-            kind, dx, dy = steps[k, 0], steps[k, 1], steps[k, 2]
-            # the row whose columns are moved to the left, and the other one; which of them holds the first pixel?
-            moved, fixed = (dy, 0) if dx >= 0 else (0, dy)
-            count = (rows - dy) * width
-            out[kind, 0] += _meet(now, now, fixed * width, moved * width, count, abs(dx))
-            if last.size:
-                of_moved = _meet(last, now, fixed * width, moved * width, count, abs(dx))  # those that are later
-                of_fixed = _meet(now, last, fixed * width, moved * width, count, abs(dx))
-                out[kind, 1] += of_moved if dx >= 0 else of_fixed
-                out[kind, 2] += of_fixed if dx >= 0 else of_moved
+            kind = steps[k, 0]
+            here, later, earlier = _meet(words, first, last, size, steps[k, 1])
+            out[kind, 0] += here
+            out[kind, 1] += later
+            out[kind, 2] += earlier
+        same += count_ones(words[first:last], words[first - size : last - size])
     return same
 
 
 @jit
-def _meet(a, b, i, j, count, shift):
-    """Ones that words of `a` from i on have in common with those of `b` from j on, moved to the left by `shift`."""
-    still, here, there = a[i : i + count], b[j : j + count], b[j + 1 : j + 1 + count]
-    total = np.uint64(0)
-    left, right = np.uint64(shift), np.uint64(63 - shift)
-    for k in range(count):
-        total += ones_of(still[k] & ((here[k] << left) | ((there[k] >> np.uint64(1)) >> right)))
-    return np.int64(total)
+def _meet(words, first, last, size, step):
+    """How many ones have one so many bits further on in the same frame; those of a frame in the next; the reverse.
+
+    Of the words from `first` to `last`; size: words from one frame to the next.
+    """
+    skip, right = step >> 6, np.uint64(step & 63)
+    left = np.uint64(63) - right
+    here, later, earlier = np.uint64(0), np.uint64(0), np.uint64(0)
+    count = last - first
+    # parts of the array with the same index in each: so a processor takes several words at a time
+    nows, befores = words[first:last], words[first - size : last - size]
+    low, high = words[first + skip :][:count], words[first + skip + 1 :][:count]
+    low_before, high_before = words[first + skip - size :][:count], words[first + skip + 1 - size :][:count]
+    for i in range(count):
+        now_moved = (low[i] >> right) | ((high[i] << np.uint64(1)) << left)
+        before_moved = (low_before[i] >> right) | ((high_before[i] << np.uint64(1)) << left)
+        here += ones_of(nows[i] & now_moved)
+        later += ones_of(befores[i] & now_moved)
+        earlier += ones_of(nows[i] & before_moved)
+    return np.int64(here), np.int64(later), np.int64(earlier)
 
 
 def _near_first(recording: Recording, near_by: Near) -> list[_Row]:
@@ -294,11 +328,25 @@ def _near_first(recording: Recording, near_by: Near) -> list[_Row]:
     edges = lag_edges(tick)
     number = np.zeros((len(near_by.names), edges.size), np.int64)
     times = np.zeros(_PARTS, np.int64)
-    for _, part in recording.chunks():
-        values = np.ascontiguousarray(part.reshape(len(part), -1))
-        _when(values, recording.none, times)
-        for kind, first, second in near_by.pairs:
-            _close(values, recording.none, first, second, edges, number[kind])
+    spot, stride, begins, step, kind, _ = around(recording.layout, near_by)
+    # each pair from one of its ends
+    one_way = step > (0 if stride else np.repeat(spot, np.diff(begins)))
+    begins = np.concatenate([[0], np.cumsum(one_way)])[begins]
+    margin = (REACH + 1) * (stride + 1)
+    far = np.int32(-(1 << 29)) if recording.none < 1 << 29 else np.int64(-(1 << 61))
+    for _, found in first_stamps(recording):
+        _when(found.stamps, recording.none, times)
+        _close(
+            *found,
+            edges,
+            spot,
+            stride,
+            begins,
+            step[one_way],
+            kind[one_way],
+            np.full((2, spot.max() + margin), far),
+            number,
+        )
     n = recording.totals.astype(np.float64)
     # by chance: both in the same frame, and so near if each comes at any time of those at which detections do
     density = times / max(1, times.sum())
@@ -314,21 +362,64 @@ def _near_first(recording: Recording, near_by: Near) -> list[_Row]:
 @jit
 def _when(stamps, none, times):
     per_part = times.size / none
-    for f in range(stamps.shape[0]):
-        for p in range(stamps.shape[1]):
-            if stamps[f, p] < none:
-                times[min(np.int64(stamps[f, p] * per_part), times.size - 1)] += 1
+    for i in range(stamps.size):
+        times[min(np.int64(stamps[i] * per_part), times.size - 1)] += 1
 
 
 @jit
-def _close(stamps, none, first, second, edges, out):
+def _close(offsets, stamps, pixels, edges, spot, stride, begins, step, kind, held, out):
+    """Add pairs of first stamps to the bins of their lags. offsets, stamps, pixels: see `FirstStamps`.
+
+    spot, ..., kind: see `around`, each pair once. held: (2, spots) a buffer, which holds what is long before any frame;
+    where there is no stamp, the second one's is longer ago, so that it is not near that in the first one.
+    """
+    one, other = held[0], held[1]
+    far = one[0]
+    further = far + far
+    for k in range(other.size):
+        other[k] = further
     last = edges[edges.size - 1]
-    for f in range(stamps.shape[0]):
-        for p in range(first.size):
-            a, b = np.int64(stamps[f, first[p]]), np.int64(stamps[f, second[p]])
-            lag = abs(a - b)
-            if lag < last and a < none and b < none:
-                k = 0
-                while edges[k] <= lag:
-                    k += 1
-                out[k] += 1
+    begin, end = np.int64(0), np.int64(step.size)
+    for f in range(offsets.size - 1):
+        number = offsets[f + 1] - offsets[f]
+        for i in range(offsets[f], offsets[f + 1]):
+            one[spot[pixels[i]]] = stamps[i]
+            other[spot[pixels[i]]] = stamps[i]
+        if stride > 0 and number * _CROWDED > spot.size:
+            low, high = spot[0], spot[spot.size - 1] + 1
+            for e in range(step.size):
+                for b in range(edges.size - 1, -1, -1):
+                    pairs = _within(one[low:high], other[low + step[e] : high + step[e]], edges[b])
+                    if pairs == 0:
+                        break
+                    out[kind[e], b] += pairs
+                    if b + 1 < edges.size:
+                        out[kind[e], b + 1] -= pairs
+        elif number > 1:
+            for i in range(offsets[f], offsets[f + 1]):
+                here, now = spot[pixels[i]], np.int64(stamps[i])
+                base = here
+                if stride == 0:
+                    base = 0
+                    begin, end = begins[here], begins[here + 1]
+                for e in range(begin, end):
+                    lag = abs(other[base + step[e]] - now)
+                    if lag < last:
+                        b = 0
+                        while edges[b] <= lag:
+                            b += 1
+                        out[kind[e], b] += 1
+        for i in range(offsets[f], offsets[f + 1]):
+            one[spot[pixels[i]]] = far
+            other[spot[pixels[i]]] = further
+
+
+@jit
+def _within(one, other, edge):
+    """How many of two arrays of the same type are less than `edge` apart."""
+    number = np.int64(0)
+    low, high = one.dtype.type(-edge), one.dtype.type(edge)
+    for p in range(one.size):
+        apart = one.dtype.type(one[p] - other[p])
+        number += (low < apart) & (apart < high)
+    return number

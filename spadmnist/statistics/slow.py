@@ -9,11 +9,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..kernels import column_sums, jit
+from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import per_cent, span
-from ._frames import frame_sums
+from ._frames import add_pixels, bits, frame_sums
 from ._scores import minority, number_at, pair_scores, pairs_law, poisson_score, shares
 from ._series import has_data, slots_of_frame, stamps
 from .maps import place_of
@@ -56,11 +56,22 @@ def blocks_of(recording: Recording) -> int:
     return next((blocks for blocks in (_BLOCKS, _BLOCKS // 2) if recording.n_frames >= 4 * blocks), 0)
 
 
+def _of_events(recording: Recording, blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`block_counts` of a recording of times."""
+    known = recording._kept.get("block counts")
+    if known is None:
+        assert recording.events is not None
+        found, unit = stamps(recording)
+        factor = unit * blocks / recording.conditions.exposure
+        known = recording._kept["block counts"] = block_counts(found, recording.events.offsets, factor, blocks)
+    return known  # type: ignore[return-value]
+
+
 def _counts_by_block(recording: Recording, blocks: int) -> Iterator[np.ndarray]:
     """(pixels,) int64 detections in each block of equally many frames; the frames left over are left out."""
     size = recording.n_frames // blocks
     counts, held, done = np.zeros(recording.pixels, np.int64), 0, 0
-    for _, part in recording.chunks() if recording.modality == "counts" else recording.bits():
+    for _, part in recording.chunks() if recording.modality == "counts" else bits(recording):
         part = np.ascontiguousarray(part)
         while len(part) and done < blocks:
             taken, part = part[: size - held], part[size - held :]
@@ -68,7 +79,7 @@ def _counts_by_block(recording: Recording, blocks: int) -> Iterator[np.ndarray]:
             if recording.modality == "counts":
                 counts += taken.reshape(len(taken), -1).sum(axis=0, dtype=np.int64)
             else:
-                column_sums(taken, recording.layout.columns, counts)
+                add_pixels(taken, recording.layout.columns, counts)
             if held == size:
                 yield counts
                 counts, held, done = np.zeros_like(counts), 0, done + 1
@@ -100,9 +111,7 @@ class Trend(Statistic):
         length = _block_time(recording, blocks)
         slots = np.inf
         if recording.events is not None:
-            found, unit = stamps(recording)
-            factor = unit * blocks / recording.conditions.exposure
-            sums = block_counts(found, recording.events.offsets, factor, blocks)[2]
+            sums = _of_events(recording, blocks)[2]
         else:
             size = recording.n_frames // blocks
             sums = frame_sums(recording)[: blocks * size].reshape(blocks, size).sum(axis=1)
@@ -154,9 +163,7 @@ class SlowSeries(Statistic):
         layout, length = recording.layout, _block_time(recording, blocks)
         slots = np.inf
         if recording.events is not None:
-            found, unit = stamps(recording)
-            factor = unit * blocks / recording.conditions.exposure
-            pairs, inside, _ = block_counts(found, recording.events.offsets, factor, blocks)
+            pairs, inside, _ = _of_events(recording, blocks)
         else:
             slots = slots_of_frame(recording) * (recording.n_frames // blocks)
             pairs, inside = np.zeros(recording.pixels, np.int64), np.zeros(recording.pixels, np.int64)

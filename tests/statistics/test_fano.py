@@ -127,6 +127,23 @@ def test_pairs_in_packed_frames_are_those_of_sums(frames: int, rows: int, column
     assert used == len(windows[0][1])
 
 
+def test_pairs_of_a_burst() -> None:
+    """Most events of one row in a millionth of the exposure: its pairs are too many to look them up one by one."""
+    rng = np.random.default_rng(2)
+    rows = [np.sort(np.append(0.3 + rng.random(2000) * 2e-6, rng.random(100))), np.sort(rng.random(300))]
+    events = tr_of(rows, grid(1, 2), 1.0, 1e-9).events
+    assert events is not None
+    levels, ticks = 16, events.ticks.astype(np.float64)  # type: ignore[union-attr]
+    factor = 20 * 2**15 * 1e-9
+    pairs, inside = event_pairs(events.ticks, events.offsets, factor, levels)
+    row = np.repeat([0, 1], np.diff(events.offsets))
+    for level in range(levels):
+        window = (ticks * factor).astype(np.int64) >> level
+        counts = np.unique(np.stack([row, window]), axis=1, return_counts=True)[1]
+        assert pairs[level] == (counts * (counts - 1) // 2).sum()
+    assert inside.tolist() == [2100, 300]
+
+
 def test_events_behind_the_exposure_are_left_out() -> None:
     rows = [np.array([1e-6, 2e-4, 9.9e-4, 1.0001e-3, 5e-3])]
     assert event_pairs(tr_of(rows, grid(1, 1), 1e-3).events.ticks, np.array([0, 5]), 1e-10 / 5e-5, 1)[1][0] == 3  # type: ignore[union-attr]

@@ -1,0 +1,255 @@
+"""What `diagnose` and `fit` answer: steps, verdict, ladder of errors; as JSON, for a terminal, for the next sensor."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .. import units
+from ..effects import Effect
+from .candidates import Change, Dial, Key
+from .fit import Cell
+
+
+def plain(value: float) -> float:
+    """A finite number of six digits."""
+    return float(f"{min(max(value, -1e300), 1e300):.6g}")
+
+
+def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Lines of a table."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A settled value with its 95 % interval, SI."""
+
+    value: float
+    low: float | None
+    high: float | None
+    unit: str = ""
+
+    def as_data(self) -> dict[str, Any]:
+        out: dict[str, Any] = {"value": plain(self.value)}
+        if self.low is not None and self.high is not None:
+            out |= {"low": plain(self.low), "high": plain(self.high)}
+        return out | {"unit": self.unit}
+
+
+@dataclass
+class Step:
+    """An accepted change, as `formats` has it."""
+
+    change: Change
+    values: dict[str, Value]
+    misfit: float
+    significance: float
+    material: str
+    alternatives: list[dict[str, Any]] = field(default_factory=list)
+    dials: tuple[Dial, ...] = ()
+    phased: bool = False
+    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+    before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def as_data(self) -> dict[str, Any]:
+        kind = "per_pixel" if self.change.kind == "per_pixel" else self.change.kind
+        return {
+            "change": kind,
+            "effect": self.change.effect,
+            "parameter": self.change.parameter,
+            "values": {name: v.as_data() for name, v in self.values.items()},
+            "misfit": plain(self.misfit),
+            "significance": plain(self.significance),
+            "material": self.material,
+            "alternatives": self.alternatives,
+        }
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A check before and after, for a picture: (cells,) each; spread is that of the last model."""
+
+    statistic: str
+    capture: str
+    label: str
+    log: bool
+    axis: np.ndarray | None
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    spread: np.ndarray
+
+
+@dataclass
+class Diagnosis:
+    """What `diagnose` found; see `formats`."""
+
+    sensor: str
+    measurement: str
+    verdict: str
+    before: float
+    after: float
+    null_95: float
+    nuisances: list[dict[str, Any]]
+    steps: list[Step]
+    setup: list[dict[str, Any]]
+    unexplained: list[dict[str, Any]]
+    ladder: list[dict[str, Any]]
+    advice: list[dict[str, Any]]
+    excluded: list[dict[str, Any]]
+    invisible: list[dict[str, Any]] = field(default_factory=list)
+    traces: list[Trace] = field(default_factory=list, repr=False)
+    values: dict[Key, Any] = field(default_factory=dict, repr=False)
+    file: str | None = None
+    simulations: int = 0
+
+    def as_data(self) -> dict[str, Any]:
+        """As `formats`: spadmnist-diagnosis/1."""
+        return {
+            "format": "spadmnist-diagnosis/1",
+            "verdict": self.verdict,
+            "misfit": {"before": plain(self.before), "after": plain(self.after)},
+            "misfit_null_95": plain(self.null_95),
+            "nuisances": self.nuisances,
+            "steps": [step.as_data() for step in self.steps],
+            "setup": self.setup,
+            "unexplained": self.unexplained,
+            "ladder": self.ladder,
+            "advice": self.advice,
+            "excluded": self.excluded,
+            "not_identifiable": self.invisible,
+            "sensor": self.file,
+        }
+
+
+def title(change: Change) -> str:
+    """What people call it: the effect, or the parameter."""
+    if change.kind == "add":
+        return change.effect
+    return f"{change.effect}.{change.parameter}" + (" per pixel" if change.kind == "per_pixel" else "")
+
+
+def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
+    """One sentence on what the remainder does."""
+    names = {str(r["statistic"]) for r in found}
+    together = names & {"neighbours", "far_pairs", "multiplicity", "spacing", "array_fano"}
+    same = names & {"intervals", "edge_intervals", "autocorrelation", "rescaled", "rescaled_lag"}
+    if "far_pairs" in names:
+        who = "pixels far from each other share it"
+    elif "neighbours" in names or together:
+        who = "pixels that are close to each other share it"
+    elif same:
+        who = "it stays in its own pixel"
+    else:
+        who = "it is a matter of rates and maps"
+    in_dark = any(r["capture"] in dark for r in found)
+    return f"{who}; {'it is there in the dark, too' if in_dark else 'it shows in light alone'}"
+
+
+def canonical(found: Diagnosis) -> str:
+    """The answer as JSON."""
+    return json.dumps(found.as_data(), indent=1, allow_nan=False)
+
+
+def table(found: Diagnosis) -> str:
+    """The answer for a terminal: the verdict, the steps, the ladder."""
+    lines = [*textwrap.wrap(f"{found.verdict.upper().replace('_', ' ')}: {sentence(found)}", 100), ""]
+    for number, step in enumerate(found.steps, 1):
+        parts = [f"{name} {shown(v)}" for name, v in step.values.items()]
+        text = f"{number}. {title(step.change)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
+        lines += textwrap.wrap(text, 100, subsequent_indent="   ")
+    for entry in found.setup:
+        f = entry["factor"]
+        where = entry["capture"] or "all"
+        either = " (or)" if entry["confused"] else ""
+        lines.append(
+            f"set-up{either}: {entry['quantity']} of {where} x {f['value']:.4f} "
+            f"(95 %: {f['low']:.4f} to {f['high']:.4f})"
+        )
+    if found.steps or found.setup:
+        lines.append("")
+    names = ("mean_rate", "map", "linearity", "intervals", "neighbours")
+    rows: list[tuple[str, ...]] = [("model", "misfit", *(n.replace("_", " ") + " %" for n in names))]
+    for row in found.ladder:
+        rows.append((row["model"], f"{row['misfit']:.3f}", *(f"{100 * row['errors'].get(n, 0.0):.3f}" for n in names)))
+    rows.append(("noise floor (95 %)", f"{found.null_95:.3f}", *("" for _ in names)))
+    lines += columns(rows)
+    if found.unexplained:
+        lines += ["", "What remains:"]
+        lines += columns(
+            [
+                (r["statistic"], r["capture"] or "all", f"{r['significance']:.1f} sigma", r["where"])
+                for r in found.unexplained[:8]
+            ]
+        )
+    for one in found.advice:
+        text = (
+            f"To tell {' from '.join(one['separates'])}: take {one['capture']} "
+            f"(now {one['significance_now']:.1f} sigma, then {one['significance_then']:.1f})."
+        )
+        lines += ["", *textwrap.wrap(text, 100)]
+    if found.excluded:
+        lines += ["", "Would have been seen (95 % upper limits):"]
+        about = [f"{e['effect']}.{e['parameter']} {_limit(e)}" for e in found.excluded]
+        lines += textwrap.wrap("; ".join(about), 100, initial_indent="  ", subsequent_indent="  ")
+    if found.invisible:
+        about = [e["effect"] for e in found.invisible]
+        lines += textwrap.wrap(f"This measurement cannot show: {', '.join(about)}.", 100)
+    return "\n".join(lines)
+
+
+def shown(v: Value) -> str:
+    """A value with its unit and its interval."""
+    text = units.show(v.value, v.unit) if v.unit else f"{v.value:.4g}"
+    if v.low is not None and v.high is not None:
+        ends = [units.show(x, v.unit) if v.unit else f"{x:.4g}" for x in (v.low, v.high)]
+        text += f" ({ends[0]} to {ends[1]})"
+    return text
+
+
+def _limit(entry: Mapping[str, Any]) -> str:
+    unit = Effect.registry.find(entry["effect"]).parameters[entry["parameter"]].unit
+    return units.show(entry["upper_limit_95"], unit, 2) if unit else f"{entry['upper_limit_95']:.2g}"
+
+
+def sentence(found: Diagnosis) -> str:
+    """The verdict in words."""
+    if found.verdict == "adequate":
+        return "nothing is missing that this measurement could show."
+    if found.verdict == "setup":
+        return "the set-up explains everything, the sensor nothing."
+    names = " and ".join(title(s.change) for s in found.steps)
+    if found.verdict == "explained":
+        return f"{names} explains what the model lacked."
+    if found.verdict == "confused":
+        return f"{names}, or something that looks the same here."
+    if found.verdict == "partly_explained":
+        return f"{names} is missing, and something else remains."
+    dark = [r["capture"] for r in found.unexplained if "dark" in str(r["capture"])]
+    return f"something is missing that no known effect explains: {mechanism(found.unexplained, dark)}."
+
+
+def notes(found: Diagnosis) -> dict[Key, str]:
+    """What is written behind the new lines of the next sensor file: the data, and the 95 % intervals."""
+    out: dict[Key, str] = {}
+    today = datetime.date.today().isoformat()
+    for step in found.steps:
+        parts = []
+        for name, v in step.values.items():
+            if v.low is not None and v.high is not None:
+                ends = [units.show(x, v.unit) if v.unit else f"{x:.4g}" for x in (v.low, v.high)]
+                parts.append(f"{name} {ends[0]} to {ends[1]} (95 %)")
+        text = f"from {found.measurement}, {today}" + (f": {', '.join(parts)}" if parts else "")
+        keys = [key for key in found.values if key[0] == step.change.effect]
+        for key in keys:
+            out[key] = text
+    return out

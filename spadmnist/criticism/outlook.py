@@ -1,0 +1,263 @@
+"""Outlook: what would have been seen, and which capture would tell what these cannot."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .. import twin, units
+from ..effects import Conditions
+from ..recording import Capture, Light, Recording
+from . import fit, recordings
+from .answer import plain
+from .candidates import Change, Dial, Key, changes, first_strength, templates
+from .fit import Bench, Moved, Seen, Sensors, State
+from .search import Search, Tried
+from .setups import Explanation
+
+_RECORDINGS = 16  # of a capture that nobody has taken yet
+_MOST_EVENTS = 2e6  # of it
+_LONG = 100.0  # s of a long dark capture
+_ONE_SIDED = 1.645  # 95 %
+_SHAPES = 3  # of an effect, for its limit
+
+
+# --- which capture would tell ------------------------------------------------------------------------------------
+
+
+def advice(search: Search, state: State, found: Change, other: Tried) -> list[dict[str, Any]]:
+    """The capture that tells two explanations apart best, with the significance now and then."""
+    bench = search.bench
+    assert other.sensors is not None
+    residuals = other.residuals or {}
+    now = math.sqrt(max(search.square(residuals) - search.square(state.residuals), 0.0))
+    bench.say("which capture would tell")
+    best: tuple[float, str] | None = None
+    for words, capture, like in _menu(bench, state):
+        z = _apart(bench, state.sensors, other.sensors, capture, like)
+        if best is None or z > best[0]:
+            best = z, words
+    if best is None:
+        return []
+    return [_told(best[1], [found.effect, other.change.effect], now, math.hypot(now, best[0]))]
+
+
+def _told(words: str, separates: Sequence[str], now: float, then: float) -> dict[str, Any]:
+    return {
+        "capture": words,
+        "separates": list(separates),
+        "significance_now": plain(now),
+        "significance_then": plain(then),
+    }
+
+
+def _menu(bench: Bench, state: State) -> Iterator[tuple[str, Capture, str]]:
+    """(words, a capture that any laboratory can take, which one it resembles)."""
+    rates = {}
+    for id, seen in bench.seen.items():
+        if seen.counts is not None and seen.total > 0:
+            rates[id] = seen.total / seen.capture.conditions.exposure
+    lit = sorted((id for id in rates if not bench.seen[id].capture.light.dark), key=lambda id: rates[id])
+    dark = [id for id in rates if bench.seen[id].capture.light.dark]
+    for id in dark[:1]:
+        yield from _longer(bench.seen[id].capture, rates[id], "dark", id)
+    for id in lit[:1]:
+        yield from _longer(bench.seen[id].capture, rates[id], f"{id}", id)
+        yield from _brighter(bench, id, rates[id], 0.1)
+    if lit:
+        yield from _longer(bench.seen[lit[-1]].capture, rates[lit[-1]], f"{lit[-1]}", lit[-1])
+        yield from _brighter(bench, lit[-1], rates[lit[-1]], 4.0)
+
+
+def _longer(capture: Capture, rate: float, words: str, like: str) -> Iterator[tuple[str, Capture, str]]:
+    c = capture.conditions
+    most = min(_LONG if capture.light.dark else 10 * c.exposure, _MOST_EVENTS / rate)
+    if most < 1.5 * c.exposure:
+        return
+    if capture.modality == "tr":
+        yield f"{words}, {units.show(most, 's', 3)}", replace(capture, conditions=replace(c, exposure=most)), like
+        return
+    frames = int(most / c.frame_period)
+    longer = replace(c, frames=frames, exposure=frames * c.frame_period)
+    yield f"{words}, {frames} frames", replace(capture, conditions=longer), like
+
+
+def _brighter(bench: Bench, id: str, rate: float, times: float) -> Iterator[tuple[str, Capture, str]]:
+    capture = bench.seen[id].capture
+    level = capture.light.level
+    pixels = bench.start.layout.pixels
+    if (
+        level is None
+        or times * rate / pixels * bench.dead > 3
+        or times * rate * capture.conditions.exposure > 2 * _MOST_EVENTS
+    ):
+        return
+    words = f"a flat field {'as bright as a tenth of' if times < 1 else f'{times:g} times as bright as'} {id}"
+    yield words, replace(capture, light=replace(capture.light, level=level * times)), id
+
+
+def _apart(bench: Bench, one: Sensors, other: Sensors, capture: Capture, like: str) -> float:
+    """Standard deviations by which two models differ in a capture that was not taken."""
+    new = copy.copy(bench)
+    capture = replace(capture, id=f"{capture.id} again")
+
+    def there(sensors: Sensors) -> Sensors:
+        typical = (lambda id: sensors.usual(like)) if sensors.typical else None
+        return Sensors(lambda id, number: sensors.of(like, number), sensors.one, sensors.alike, typical)
+
+    first, second = there(one), there(other)
+    level = 1.0 if capture.light.dark else twin.photons_at(capture, bench.start.layout) or 0.0
+    sensor = first.of(capture.id, 0)
+    sensor = recordings.InTheDark.of(sensor) if capture.light.dark else sensor
+    number = np.array([10_000], np.uint64)
+    made: Recording = next(recordings.simulated(sensor, capture, np.array([level]), number, bench.seed))
+    made = replace(made, dead_time=bench.dead, _kept={})
+    counts = np.asarray(made.totals, float)
+    summaries = {}
+    for statistic in recordings.statistics_for(made.modality):
+        summary = recordings.reduced(statistic, made)
+        if summary is not None:
+            summaries[statistic.name] = summary
+    new.seen = {capture.id: Seen(made.capture, float(counts.sum()), counts, summaries)}
+    state = new.state({}, first, _RECORDINGS)
+    (moved,) = new.moved(state, [second], fit.FEW)
+    if isinstance(moved, str):
+        return 0.0
+    return math.sqrt(sum(float(t @ t) for t in new.template(state, moved).values()))
+
+
+def advice_on_totals(search: Search, state: State, setup: Explanation, other: Tried) -> list[dict[str, Any]]:
+    """Which capture tells a set-up from a change of the sensor that explains the same totals, by closed forms."""
+    bench = search.bench
+    now = math.sqrt(abs(setup.cost - other.cost(state)))
+    whole = {id for factor in setup.factors for id in factor.captures}
+    log = float(setup.logs[0])
+    best: tuple[float, str] | None = None
+    model = next(iter(bench.seen.values())).capture
+    usual = state.sensors.one
+    conditions = replace(_dark(model.conditions), exposure=_LONG)
+    tries = [("dark, 100 s", Capture("dark", "tr", Light(), conditions), 0.0)]
+    for id, seen in bench.seen.items():
+        light = seen.capture.light
+        if light.dark or light.level is None:
+            continue
+        for times in (0.1, 10.0):
+            brighter = replace(seen.capture, light=replace(light, level=light.level * times))
+            words = f"a flat field {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
+            tries.append((words, brighter, log if id in whole else 0.0))
+    assert other.sensors is not None
+    for words, capture, expected in tries:
+        level = 1.0 if capture.light.dark else twin.photons_at(capture, bench.start.layout) or 1.0
+        plain_, changed = (
+            recordings.closed_form(recordings.InTheDark.of(s) if capture.light.dark else s, capture)(level)
+            for s in (usual, other.sensors.usual(model.id))
+        )
+        apart = abs(math.log(changed / plain_) - expected)
+        z = apart / math.sqrt(1 / plain_ + capture.light.own_uncertainty**2 + 1e-6)
+        if best is None or z > best[0]:
+            best = z, words
+    assert best is not None
+    return [_told(best[1], [setup.factors[0].quantity, other.change.effect], now, math.hypot(now, best[0]))]
+
+
+def _dark(conditions: Conditions) -> Conditions:
+    return replace(conditions, wavelength=None)
+
+
+def advice_on_setup(bench: Bench, state: State, entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Which capture tells a light level from an exposure: the same light with another exposure."""
+    both: dict[str, dict[str, float]] = {}
+    for entry in entries:
+        if entry["confused"] and entry["capture"] is not None:
+            both.setdefault(entry["capture"], {})[entry["quantity"]] = entry["factor"]["value"]
+    able = {id: b for id, b in both.items() if {"light", "exposure"} <= b.keys()}
+    if not able:
+        return []
+    id = max(able, key=lambda i: abs(math.log(able[i]["light"])) / bench.level_error(state, i))
+    log = abs(math.log(able[id]["light"]))
+    capture = bench.seen[id].capture
+    own = capture.conditions.frame_time if capture.modality != "tr" else capture.conditions.exposure
+    others = sorted(
+        {s.capture.conditions.frame_time for s in bench.seen.values() if s.capture.modality != "tr"} - {own}
+    )
+    other = others[-1] if others and capture.modality != "tr" else 4 * own
+    name = "exposure" if capture.modality == "tr" else "frame time"
+    words = f"the light of {id} with a {name} of {units.show(other, 's', 3)}"
+    # a light level is the same then; so much too long an exposure counts for less or for more
+    then = log * abs(1 - own / other) / bench.level_error(state, id)
+    return [_told(words, ["light", "exposure"], 0.0, then)]
+
+
+# --- what would have been seen -----------------------------------------------------------------------------------
+
+
+def upper_limits(search: Search, state: State) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here).
+
+    The weakest limit of a few shapes: whatever the shape, more would have been seen.
+    """
+    bench = search.bench
+    wanted: list[tuple[Change, Dial, dict[Key, Any]]] = []
+    for change in changes(state.sensors.one):
+        if change.kind != "add" or len(change.strengths) != 1 or change.phases:
+            continue
+        tries = templates(change)
+        for place in sorted({round(x * (len(tries) - 1)) for x in np.linspace(0, 1, _SHAPES)}):
+            wanted.append((change, change.strengths[0], tries[place]))
+    strengths = [first_strength(dial) for _, dial, _ in wanted]
+    limits = [math.inf] * len(wanted)
+    powers: list[float] = [math.nan] * len(wanted)
+    before: list[tuple[float, float]] = [(math.nan, math.nan)] * len(wanted)
+    for turn in range(2):
+        models = [
+            state.sensors.changed({**tried, dial.key: x}) for (_, dial, tried), x in zip(wanted, strengths, strict=True)
+        ]
+        for k, moved in enumerate(bench.moved(state, models, fit.FEW)):
+            _, dial, _ = wanted[k]
+            if isinstance(moved, str):
+                continue
+            x, (size, along) = abs(strengths[k] - (dial.off or 0.0)), _size(search, state, moved)
+            if size <= 0:
+                continue
+            # how the trace grows with the strength: in proportion, until a second strength tells
+            power = 1.0
+            if turn and math.isfinite(before[k][0]) and x != before[k][0] and before[k][1] > 0:
+                power = float(np.clip(math.log(size / before[k][1]) / math.log(x / before[k][0]), 0.5, 3.0))
+            before[k], powers[k] = (x, size), power
+            limit = x * ((max(along, 0.0) + _ONE_SIDED) / size) ** (1 / power)
+            limits[k] = limit
+            strengths[k] = dial.scaled(strengths[k], float(np.clip(limit / x, 1e-4, 1e4)))
+    out: dict[Key, float] = {}
+    hidden: dict[str, None] = {}
+    for (change, dial, _), limit in zip(wanted, limits, strict=True):
+        reach = abs((dial.low if dial.off == dial.high else dial.high) - (dial.off or 0.0))
+        if limit > reach:
+            hidden[change.effect] = None
+        else:
+            out[dial.key] = max(out.get(dial.key, 0.0), limit)
+    excluded = []
+    for (effect, parameter), limit in out.items():
+        if effect in hidden:
+            continue
+        dial = next(d for c, d, _ in wanted if d.key == (effect, parameter))
+        at = (dial.off or 0.0) + (limit if dial.off != dial.high else -limit)
+        excluded.append({"effect": effect, "parameter": parameter, "upper_limit_95": plain(at)})
+    return excluded, [{"effect": name} for name in hidden]
+
+
+def _size(search: Search, state: State, moved: Moved) -> tuple[float, float]:
+    """(standard deviations of the trace of a model, those of it that the data have)."""
+    template = search.bench.template(state, moved)
+    norm = math.sqrt(sum(float(t @ t) for t in template.values()))
+    if norm <= 0:
+        return 0.0, 0.0
+    keys = list(template)
+    t = fit.stacked(template, keys)
+    own = np.concatenate([state.own[k] for k in keys], axis=1) @ t
+    spread = max(float(own.std()) / norm, 0.5)
+    return norm / spread, float(fit.stacked(state.residuals, keys) @ t) / norm / spread

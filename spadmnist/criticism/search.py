@@ -1,0 +1,468 @@
+"""Search: which change of a model brings the data nearest?
+
+A first look at every candidate with a few simulated recordings, a second at the best of them on all captures, maps
+beside them; then the numbers of those few are settled (`fit`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..effects import Effect
+from ..errors import SpadError
+from . import fit, mapping
+from .candidates import Change, Dial, Key, changes, templates
+from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
+
+Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
+
+_SCAN = 2  # recordings of each capture for a first look
+_SECOND = 6  # candidates that are looked at again
+_REFINED = 3  # of these, that are settled
+_TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
+_NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
+_TURNS = 8  # phases that are tried first
+_NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
+_LINE = 4.5  # standard deviations of a line in a spectrum
+_SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
+_LINES = 2  # frequencies that are
+_LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
+_LEAST_P = 1e-300
+EACH = 9.0  # in chi square: what a further number must be worth
+
+
+@dataclass
+class Tried:
+    """A candidate at some values: what it does, and by how much it brings the data nearer.
+
+    gain: in chi square; times: the strength, relative to that of `values`, at which it is largest; phases: of what
+    begins anew in every capture; intervals: 95 % of numbers that `settled` does not hold.
+    """
+
+    change: Change
+    values: dict[Key, Any]
+    moved: Moved
+    gain: float
+    times: float
+    sensors: Sensors | None = None
+    settled: Settled | None = None
+    maps: dict[Key, mapping.Map] | None = None
+    residuals: dict[Cell, np.ndarray] | None = None
+    phases: Phases = field(default_factory=dict)
+    more: tuple[Change, ...] = ()  # maps that only make sense together
+    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def changes(self) -> list[Change]:
+        return [self.change, *self.more]
+
+    def cost(self, state: State) -> float:
+        """What it leaves of the totals, and what a number costs."""
+        left = (self.residuals or state.residuals)[RATES]
+        return float(left @ left) + EACH
+
+    @property
+    def signed(self) -> bool:
+        return any(d.low < 0 or self.change.kind == "set" for d in self.change.strengths)
+
+    def scaled(self) -> dict[Key, Any]:
+        """The values at the strength that suits them."""
+        out = dict(self.values)
+        for dial in self.change.strengths:
+            if dial.key in out:
+                out[dial.key] = dial.scaled(float(out[dial.key]), self.times)
+        if len(self.change.strengths) > 1:  # directions side by side: the others' share comes from the fit
+            out = {**dict(self.change.fixed), **out}
+        return out
+
+
+class Search:
+    """The search for what is missing, step by step. accepted: what the model has by now; phases: of these."""
+
+    def __init__(self, bench: Bench, say: Callable[[str], None]):
+        self.bench, self.say = bench, say
+        self.accepted: list[Change] = []
+        self.phases: dict[tuple[str, Key], float] = {}
+
+    # --- looking -------------------------------------------------------------------------------------------------
+
+    def square(self, residuals: Mapping[Cell, np.ndarray]) -> float:
+        """Sum of all squared residuals."""
+        return sum(float(z @ z) for z in residuals.values())
+
+    def line_search(self, state: State, moved: Moved, signed: bool) -> tuple[float, float]:
+        """(gain in chi square, times the strength at which it is largest)."""
+        now = self.square(state.residuals)
+        best = 0.0, 1.0
+        for times in [*_TIMES, *([-t for t in _TIMES] if signed else [])]:
+            gain = now - self.square(self.bench.residuals(state, moved, times))
+            if gain > best[0]:
+                best = gain, times
+        return best
+
+    def best_phases(
+        self, state: State, turned: Sequence[Moved], turns: Sequence[Phases], times: Sequence[float] = _TIMES
+    ) -> tuple[float, float, Moved, Phases]:
+        """(gain, times, what it does, phases), each capture having the phase that suits it.
+
+        turned: what the model does at each of `turns`.
+        """
+        now = self.square(state.residuals)
+        ids, _, root, _ = self.bench.rate_space(state)
+        best: tuple[float, float, list[int]] | None = None
+        captures = list(self.bench.seen)
+        for t in times:
+            own = np.zeros((len(turned), len(captures)))
+            for k, moved in enumerate(turned):
+                for cell, z in self.bench.residuals(state, moved, t).items():
+                    if cell != RATES:
+                        own[k, captures.index(cell[0])] += float(z @ z)
+            chosen = own.argmin(axis=0)
+            if ids:
+                logs = np.array([[m.logs.get(i, 0.0) for i in ids] for m in turned])
+                where = [captures.index(i) for i in ids]
+                for _ in range(3):
+                    for n, c in enumerate(where):
+                        x = logs[chosen[where], np.arange(len(ids))]
+                        left = []
+                        for k in range(len(turned)):
+                            x[n] = logs[k, n]
+                            z = state.residuals[RATES] + t * (root @ x)
+                            left.append(own[k, c] + float(z @ z))
+                        chosen[c] = int(np.argmin(left))
+                x = logs[chosen[where], np.arange(len(ids))]
+                rates = state.residuals[RATES] + t * (root @ x)
+                total = float(rates @ rates)
+            else:
+                total = 0.0
+            gain = now - total - float(own[chosen, np.arange(len(captures))].sum())
+            if best is None or gain > best[0]:
+                best = gain, t, chosen.tolist()
+        assert best is not None
+        gain, t, picked = best
+        whole = Moved({}, {}, {})
+        phases: dict[tuple[str, Key], float] = {}
+        for id, k in zip(captures, picked, strict=True):
+            whole.logs |= {i: x for i, x in turned[k].logs.items() if i == id}
+            whole.shifts |= {c: x for c, x in turned[k].shifts.items() if c[0] == id}
+            whole.noise |= {c: x for c, x in turned[k].noise.items() if c[0] == id}
+            phases |= {(i, key): x for (i, key), x in turns[k].items() if i == id}
+        return gain, t, whole, phases
+
+    def turns(self, keys: Sequence[Key], around: Phases | None = None, width: float = 2 * math.pi) -> list[Phases]:
+        """Phases to try: all round, or about some, so far to both sides together."""
+        out: list[Phases] = []
+        for k in range(_TURNS):
+            shift = width * (k / _TURNS if around is None else k / (_TURNS - 1) - 0.5)
+            pairs = [(i, p) for i in self.bench.seen for p in keys]
+            out.append({pair: ((around or {}).get(pair, 0.0) + shift) % (2 * math.pi) for pair in pairs})
+        return out
+
+    def lines(self, state: State) -> list[tuple[float, float]]:
+        """(frequency, standard deviation), Hz, of what stands out of the data's spectra, the clearest first."""
+        found: list[tuple[float, float, float]] = []  # with how clearly
+        for (id, name), z in state.residuals.items():
+            if (id, name) == RATES or state.nulls[id, name].law != "exponential":
+                continue
+            summary = self.bench.seen[id].summaries[name]
+            if summary.axis is None or len(z) < 3:
+                continue
+            step = float(summary.axis[1] - summary.axis[0])
+            power = np.asarray(summary.values, float)
+            for cell in np.argsort(z)[:-3:-1]:
+                if z[cell] < _LINE:
+                    break
+                f, error = _between_bins(power, int(cell), step, float(summary.axis[cell]))
+                near = next((k for k, (g, e, _) in enumerate(found) if abs(g - f) < 2 * step + 3 * e), None)
+                if near is None:
+                    found.append((f, error, float(z[cell])))
+                else:
+                    g, e, weight = found[near]
+                    best = (f, error) if error < e else (g, e)
+                    found[near] = (*best, weight + float(z[cell]))
+        return [(f, error) for f, error, _ in sorted(found, key=lambda x: -x[2])[:_LINES]]
+
+    def begun(self, state: State, change: Change) -> list[dict[Key, Any]]:
+        """The values at which a candidate is tried first."""
+        tries = templates(change)
+        narrow = _lines_of(change)
+        if len(narrow) != 1:
+            return list(tries)
+        dial = narrow[0]
+        inside = [f for f, _ in self.lines(state) if dial.low <= f <= dial.high]
+        usual = float(Effect.registry.find(change.effect).parameters[dial.parameter].default)
+        return [{**tries[0], dial.key: f} for f in inside or [usual]]
+
+    def looked_at(
+        self, state: State, change: Change, tries: Sequence[Mapping[Key, Any]], only: Sequence[str] = ()
+    ) -> list[Tried]:
+        """A candidate at each of these values, at the strength that suits it. only: of some captures."""
+        return self._looked_at(state, [(change, dict(tried)) for tried in tries], only)
+
+    def _looked_at(
+        self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]], only: Sequence[str] = ()
+    ) -> list[Tried]:
+        out = []
+        still = [(change, tried) for change, tried in tries if not change.phases]
+        models, about = [], []
+        for change, tried in still:
+            try:
+                models.append(state.sensors.changed(tried))
+                about.append((change, tried))
+            except SpadError:
+                continue
+        for (change, tried), moved in zip(about, self.bench.moved(state, models, _SCAN, only), strict=True):
+            if not isinstance(moved, str):
+                one = Tried(change, tried, moved, 0.0, 1.0)
+                one.gain, one.times = self.line_search(state, moved, one.signed)
+                out.append(one)
+        for change, tried in tries:
+            if not change.phases:
+                continue
+            turns = self.turns(change.phases)
+            turned = self.bench.moved(state, [state.sensors.changed(tried, t) for t in turns], _SCAN)
+            if any(isinstance(m, str) for m in turned):
+                continue
+            gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
+            one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases)
+            for dial in _lines_of(change):
+                f = float(tried[dial.key])
+                error = next((e for g, e in self.lines(state) if g == f), dial.high)
+                one.intervals[dial.key] = max(f - 1.96 * error, dial.low), min(f + 1.96 * error, dial.high)
+            out.append(one)
+        return out
+
+    def scan(self, state: State) -> list[Tried]:
+        """Every candidate at its templates, the best first."""
+        only_rates = self.only_rates(state)
+        tries: list[tuple[Change, dict[Key, Any]]] = []
+        for change in changes(state.sensors.one):
+            if (change.strengths or change.fixed) and not (change.phases and only_rates):
+                tries += [(change, tried) for tried in self.begun(state, change)]
+        if not only_rates:
+            out = self._looked_at(state, tries, self.telling(state))
+        else:
+            out = []
+            for change, tried in tries:
+                try:
+                    moved = self.bench.told(state, state.sensors.changed(tried))
+                except SpadError:
+                    continue
+                one = Tried(change, tried, moved, 0.0, 1.0)
+                one.gain, one.times = self.line_search(state, moved, one.signed)
+                out.append(one)
+        return sorted(out, key=lambda t: -t.gain)
+
+    def only_rates(self, state: State) -> bool:
+        """Is nothing wrong but the totals?"""
+        return all(b.cell[0] == "" for b in fit.failing(fit.blocks(self.bench, state, state.residuals)))
+
+    def telling(self, state: State) -> list[str]:
+        """Up to three captures that show best what is wrong: a dark one, and those of the largest misfit."""
+        own = fit.misfits(state, state.residuals)
+        worst: dict[str, float] = {}
+        for (id, _), value in own.items():
+            worst[id] = worst.get(id, 0.0) + math.log(max(value, 1.0))
+        ids = sorted(worst, key=lambda id: -worst[id])
+        dark = [id for id in ids if self.bench.seen[id].capture.light.dark][:1]
+        return list(dict.fromkeys([*ids[: 3 - len(dark)], *dark]))
+
+    def again(self, state: State, values: dict[Key, Any], tried: list[Tried]) -> list[Tried]:
+        """The best candidates at the strength that suits them, on all captures; maps beside them."""
+        best: list[Tried] = []
+        for one in tried:
+            if one.gain > 9 and all(b.change is not one.change for b in best):
+                best.append(one)
+            if len(best) == _SECOND:
+                break
+        out: list[Tried] = []
+        models: list[Sensors] = []
+        for one in best:
+            given = one.scaled()
+            models.append(state.sensors.changed(given, one.phases))
+            out.append(
+                Tried(one.change, given, one.moved, 0.0, 1.0, models[-1], phases=one.phases, intervals=one.intervals)
+            )
+        for one in self.maps(state, values):
+            assert one.sensors is not None
+            models.append(one.sensors)
+            out.append(one)
+        kept = []
+        for one, moved in zip(out, self.bench.moved(state, models, fit.FEW), strict=True):
+            if isinstance(moved, str):
+                continue
+            one.moved = moved
+            if one.maps is None:
+                one.gain, one.times = self.line_search(state, moved, one.signed)
+                one.gain -= 2 * len(one.phases)
+            else:
+                one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, moved))
+            kept.append(one)
+        return sorted(kept, key=lambda t: -t.gain)
+
+    def maps(self, state: State, values: dict[Key, Any]) -> list[Tried]:
+        """Every map whose values differ beyond their noise, and all that are needed side by side."""
+        if self.only_rates(state):
+            return []
+        levels = mapping.levels_of(self.bench, state)
+        held = [c for c in self.accepted if c.carrier]
+        wanted = [c for c in changes(state.sensors.one) if c.carrier]
+        groups = [[c] for c in wanted]
+        pixels = [c for c in wanted if c.per == "pixel"]
+        if len(pixels) > 1 and all(c.per == "pixel" for c in held):
+            with contextlib.suppress(SpadError, np.linalg.LinAlgError):
+                together = mapping.needed(self.bench, values, held, pixels, levels)
+                if len(together) > 1:
+                    groups.insert(0, together)
+        out = []
+        for group in groups:
+            try:
+                sensors, found, mapped = mapping.sensors_with(self.bench, values, [*held, *group], levels)
+            except (SpadError, np.linalg.LinAlgError):
+                continue
+            map_ = found[group[0].carrier]  # type: ignore[index]
+            spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
+            if map_.sigma < _LEAST_SIGMA or spread < _LEAST_SPREAD:
+                continue
+            sensors = sensors.changed({}, self.phases)
+            nothing = Moved({}, {}, {})
+            out.append(Tried(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:])))
+        return out
+
+    def structured(self, state: State, tried: list[Tried]) -> list[Tried]:
+        """Patterns before maps, but only those that stand out of the map's own scatter."""
+        maps = [
+            t
+            for t in tried
+            if t.maps and t.change.per == "pixel" and mapping.bench_light_only(state.sensors.one, t.change)
+        ]
+        patterns = [t for t in tried if is_pattern(t)]
+        if not maps or not patterns:
+            return tried
+        assert maps[0].maps is not None
+        free = maps[0].maps[maps[0].change.carrier]  # type: ignore[index]
+        layout = state.sensors.one.layout
+        place = layout.centred.T
+        radius = (place**2).sum(axis=0)
+        designs = {}
+        for one in patterns:
+            if one.change.per == "row":
+                designs[one.change.name] = _indicators(mapping.groups_of(state.sensors.one, "row"))
+            elif one.change.per == "column":
+                designs[one.change.name] = _indicators(mapping.groups_of(state.sensors.one, "column"))
+            else:
+                designs[one.change.name] = np.stack([*place, radius], axis=1)
+        found = mapping.patterned(free, designs)
+        real = [t for t in patterns if found[t.change.name] < 1e-3]
+        dropped = [t for t in patterns if t not in real]
+        rest = [t for t in tried if t not in dropped]
+        if real and rest[0] in maps:
+            first = min(real, key=lambda t: found[t.change.name])
+            rest.remove(first)
+            rest.insert(0, first)
+        return rest
+
+    # --- settling ------------------------------------------------------------------------------------------------
+
+    def worth(self, second: Sequence[Tried]) -> list[Tried]:
+        """Those that may turn out best when they are settled."""
+        best = max(t.gain for t in second)
+        first = second[0]
+        return [first, *(t for t in second[1:] if t.gain > 0.3 * best)][:_REFINED]
+
+    def refine(self, state: State, one: Tried, rounds: int = 3) -> Tried:
+        """Settle the numbers of a candidate."""
+        if one.maps is not None or not one.change.dials:
+            one.residuals = self.bench.residuals(state, one.moved, noisy=True)
+            return one
+        given = one.scaled()
+        narrow = _lines_of(one.change)
+        dials = [d for d in one.change.dials if d.key in given and not d.whole and d not in narrow]
+        if one.change.phases:
+            given = self.tuned(state, one, given)
+        found = fit.settle(self.bench, state, dials, given, lambda v: state.sensors.changed(v, one.phases), rounds)
+        if isinstance(found, str):
+            return one
+        one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
+        one.sensors = state.sensors.changed(found.values, one.phases)
+        one.gain = self.square(state.residuals) - found.square - 2 * len(one.phases)
+        return one
+
+    def tuned(
+        self, state: State, one: Tried, given: dict[Key, Any], turns: Sequence[float] = _NARROWER
+    ) -> dict[Key, Any]:
+        """The values with the strength settled, and with it the phases of each capture.
+
+        turns: rad, how far about what they are phases are looked for, one search after the other.
+        """
+        for width in turns:
+            tries = self.turns(one.change.phases, one.phases, width)
+            turned = self._in_light(state, [state.sensors.changed(given, t) for t in tries])
+            if any(isinstance(m, str) for m in turned):
+                return given
+            _, times, _, one.phases = self.best_phases(state, turned, tries, _NEAR)  # type: ignore[arg-type]
+            given = {**given, **{d.key: d.scaled(float(given[d.key]), times) for d in one.change.strengths}}
+        return given
+
+    def _in_light(self, state: State, models: Sequence[Sensors]) -> list[Moved | str]:
+        lit = [id for id, seen in self.bench.seen.items() if not seen.capture.light.dark]
+        return self.bench.moved(state, models, _SWINGING, lit)
+
+    def calibrated(self, state: State, tried: Sequence[Tried], best: Tried) -> tuple[float, float]:
+        """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
+        keys = list(state.residuals)
+        z = stacked(state.residuals, keys)
+        own = np.concatenate([state.own[k] for k in keys], axis=1)
+        largest = np.zeros(len(own))
+        scores = 0.0
+        for one in [best, *tried]:
+            t = stacked(self.bench.template(state, one.moved), keys)
+            if not t.any():
+                continue
+            along = own @ t
+            spread = max(float(along.std()), 1e-9)
+            largest = np.maximum(largest, np.abs(along) / spread)
+            if one is best:
+                # what is far outside is no matter of the linear law: the gain itself, in the same measure
+                typical = float(np.mean(along**2) / max(float(t @ t), 1e-12))
+                scores = max(abs(float(z @ t)) / spread, math.sqrt(max(best.gain, 0.0) / max(typical, 0.5)))
+        location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
+        return scores, max(float(stats.gumbel_r.sf(scores, location, max(scale, 0.25))), _LEAST_P)
+
+
+def _lines_of(change: Change) -> list[Dial]:
+    """Frequencies of what swings: known to a fraction of one over the exposure, or not at all."""
+    return [d for d in change.shapes if d.unit == "Hz"] if change.phases else []
+
+
+def _between_bins(power: np.ndarray, cell: int, step: float, at: float) -> tuple[float, float]:
+    """(frequency of a line, its standard deviation): between the strongest bin and the stronger of its neighbours.
+
+    A line's amplitude falls off as 1 / distance to both sides (Rife, Vincent, Bell Syst. Tech. J. 49 (1970) 197).
+    """
+    sides = [power[cell - 1] if cell else 0.0, power[cell + 1] if cell + 1 < len(power) else 0.0]
+    other = math.sqrt(max(sides))
+    share = other / (math.sqrt(power[cell]) + other)
+    f = at + (share if sides[1] > sides[0] else -share) * step
+    # twice what no estimate can be better than
+    return f, 2 * step * math.sqrt(3 / (2 * max(float(power[cell]), 1.0))) / math.pi
+
+
+def is_pattern(one: Tried) -> bool:
+    """Rows, columns, or a shape of the light over the array?"""
+    change = one.change
+    if change.kind != "add":
+        return False
+    return change.per in ("row", "column") or getattr(Effect.registry.find(change.effect), "stage", "") == "light"
+
+
+def _indicators(groups: np.ndarray) -> np.ndarray:
+    one = np.eye(int(groups.max()) + 1)[groups]
+    return np.asarray(one[:, 1:])
