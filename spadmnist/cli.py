@@ -311,7 +311,7 @@ def simulate(
 
     _load(plugin_files)
     model = config.read_sensor(sensor)
-    opened = library.open(measurement)
+    opened = library.open(measurement, planned=True)
     with _terminal() as progress:
         twin.simulate(model, opened, output, seed, progress)
     if as_json:
@@ -668,7 +668,7 @@ def compare(
     "-o",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Folder for the next sensor.yaml and its maps.",
+    help="Folder for the report, an HTML page, and for the next sensor.yaml with its maps.",
 )
 @click.option("--max-steps", type=click.IntRange(1, 12), default=4, metavar="N", help="At most so many.  [default: 4]")
 @click.option("--quick", is_flag=True, help="Fewer simulations: a first answer.")
@@ -705,10 +705,16 @@ def diagnose(
 
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    if output is not None:
+        from . import pages
+
+        pages.check_place(output, "diagnosis")
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
         with _writing(output):
             found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, answer.notes(found)))
+        page = pages.diagnosis(found, output)
+        _say(f"Report: {page}")
     if json_file is not None:
         with _writing(json_file):
             disk.commit_file(json_file, (answer.canonical(found) + "\n").encode(), json_file.parent)

@@ -122,13 +122,14 @@ def is_measurement(path: str | Path) -> bool:
     return (path / FILE).exists() if path.is_dir() else path.suffix.lower() in (".yaml", ".yml")
 
 
-def open(path: str | Path, readout: str | None = None) -> Measurement:
+def open(path: str | Path, readout: str | None = None, planned: bool = False) -> Measurement:
     """Open a measurement: its folder, its YAML file, or the folder of a dataset whose source is `uniform`.
 
     readout: of a dataset, which one to take (`tr`, `str`, `qis` or `counts`), for all of one image show the same
-    events; without it the first of them that was recorded. The headers of all files are checked here, data are read
-    when they are asked for. Raises ConfigError with every mistake of the YAML, InputError for a file that cannot be
-    used.
+    events; without it the first of them that was recorded. planned: captures whose files are not there yet will do,
+    for a simulation asks for their conditions alone (but for those of counts, whose bits the file knows). The headers
+    of all files are checked here, data are read when they are asked for. Raises ConfigError with every mistake of the
+    YAML, InputError for a file that cannot be used.
     """
     path = Path(path)
     if path.is_dir() and not (path / FILE).exists():
@@ -138,7 +139,7 @@ def open(path: str | Path, readout: str | None = None) -> Measurement:
             f"{path} is not a measurement: it has no {FILE} (spadmnist import makes one of files of other programs)"
         )
     source = document.read(path / FILE if path.is_dir() else path)
-    return _Reader(source, path if path.is_dir() else path.parent).measurement()
+    return _Reader(source, path if path.is_dir() else path.parent, planned).measurement()
 
 
 open_measurement = open  # its name in the package
@@ -174,6 +175,7 @@ class _Reader:
 
     source: Document
     base: Path
+    planned: bool = False
     problems: list[str] = field(default_factory=list)
 
     def say(self, path: Path_, sentence: str) -> None:
@@ -197,7 +199,7 @@ class _Reader:
         """With what only the files know. The first of them that cannot be used is told in full, others are named."""
         known, wrong = [], []
         for capture, path in captures:
-            if path is None:
+            if path is None or (self.planned and capture.modality != "counts" and not path.exists()):
                 known.append(capture)
                 continue
             try:

@@ -105,8 +105,8 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
 @pytest.mark.parametrize(
     ("package", "owners"),
     [
-        ("matplotlib", {"report.py", "pages.py"}),
-        ("jinja2", {"pages.py"}),
+        ("matplotlib", {"report.py", *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis"))}),
+        ("jinja2", {"pages/_frame.py"}),
         ("click", {"cli.py"}),
         ("tqdm", {"cli.py"}),
         ("yaml", {"document.py"}),

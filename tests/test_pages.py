@@ -27,6 +27,7 @@ from spadmnist.criticism import compare
 from spadmnist.criticism.compare import Check, Comparison, Nuisance
 from spadmnist.criticism.nulls import Judgement
 from spadmnist.errors import SpadError
+from spadmnist.pages import _comparison, _figures, _frame
 from spadmnist.recording import Capture, Light
 from spadmnist.statistics import Statistic, Summary
 
@@ -283,10 +284,10 @@ def test_the_clearest_of_every_statistic_is_shown_and_few_of_one() -> None:
     checks = [replace(check_of("rows", 10.0 ** -(60 - k), f"c{k}"), passes=False) for k in range(20)]
     checks += [replace(check_of("rows", 1e-20, f"c{k}", "other"), passes=False) for k in range(20)]
     checks += [replace(check_of("rows", 1e-8, "c0", f"kind_{k}"), passes=False) for k in range(9)]
-    shown = pages._chosen(sorted(checks, key=lambda c: c.p_value))
+    shown = _comparison._chosen(sorted(checks, key=lambda c: c.p_value))
     assert len(shown) == 12
     assert [c.statistic for c in shown] == ["rows", "rows", "other", *(f"kind_{k}" for k in range(9))]
-    assert len(pages._chosen(checks[:20])) == 3
+    assert len(_comparison._chosen(checks[:20])) == 3
     assert shown[0] is checks[0]
 
 
@@ -302,7 +303,7 @@ def test_nothing_to_check_and_one_check(tmp_path: Path) -> None:
     [(0.0, "< 10⁻¹²"), (1e-300, "< 10⁻¹²"), (3.2e-7, "3·10⁻⁷"), (0.00312, "0.0031"), (0.5, "0.5"), (1.0, "1")],
 )
 def test_a_p_value_in_words(value: float, text: str) -> None:
-    assert pages._p(value) == text
+    assert _frame.p_value(value) == text
 
 
 @pytest.mark.parametrize(
@@ -318,7 +319,7 @@ def test_a_p_value_in_words(value: float, text: str) -> None:
     ],
 )
 def test_a_number_in_words(value: float, text: str) -> None:
-    assert pages._number(value) == text
+    assert _frame.number(value) == text
 
 
 # --- what it shows --------------------------------------------------------------------------------------------------
@@ -327,7 +328,7 @@ def test_a_number_in_words(value: float, text: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("factor", [4.0, 0.0])
 def test_every_kind_of_summary_has_a_picture(kind: str, factor: float) -> None:
-    picture = pages._picture(check_of(kind, 1e-9, factor=factor))
+    picture = _comparison._picture(check_of(kind, 1e-9, factor=factor))
     assert picture is not None
     form, data = decoded(picture.source)
     assert form == ("png" if kind == "many" else "svg+xml")
@@ -352,11 +353,11 @@ def marks(data: bytes, colour: str) -> list[tuple[float, float]]:
 
 
 def test_a_picture_has_a_dot_for_each_cell_and_a_ring_at_the_clearest() -> None:
-    picture = pages._picture(check_of("rows", 1e-9, factor=4.0))
+    picture = _comparison._picture(check_of("rows", 1e-9, factor=4.0))
     assert picture is not None
     data = decoded(picture.source)[1]
-    dots = marks(data, f"fill: {pages._MEASURED}")
-    rings = marks(data, f"stroke: {pages._WORST}")
+    dots = marks(data, f"fill: {_figures.MEASURED}")
+    rings = marks(data, f"stroke: {_figures.WORST}")
     by_place: dict[float, list[float]] = {}
     for x, y in dots:
         by_place.setdefault(round(x, 1), []).append(y)
@@ -370,7 +371,7 @@ def test_a_picture_has_a_dot_for_each_cell_and_a_ring_at_the_clearest() -> None:
 def test_one_odd_pixel_of_a_large_map_is_seen() -> None:
     values = np.zeros((700, 512))
     values[401, 77], values[12, 500] = -9.0, 7.0
-    reduced = pages._largest_of(values, 3)
+    reduced = _figures._largest_of(values, 3)
     assert reduced.shape == (234, 171)
     assert reduced[401 // 3, 77 // 3] == -9.0 and reduced[4, 166] == 7.0 and np.count_nonzero(reduced) == 2
 
@@ -378,7 +379,7 @@ def test_one_odd_pixel_of_a_large_map_is_seen() -> None:
 def test_the_clearest_cell_of_too_many_is_drawn() -> None:
     residuals = np.random.Generator(np.random.SFC64(1)).normal(size=100_000)
     residuals[54_321] = -30.0
-    some = pages._thinned(residuals, 20_000)
+    some = _figures._thinned(residuals, 20_000)
     assert 54_321 in some and 15_000 < some.size <= 20_000 and (np.diff(some) > 0).all()
 
 
@@ -389,23 +390,23 @@ def test_the_band_holds_what_it_says() -> None:
         ("normal", draws.normal(5.0, 2.0, 100_000)),
         ("poisson", draws.poisson(5000.0, 100_000)),
     ):
-        low, high = pages._band(law, np.array([values.mean()]), np.array([values.std()]))
+        low, high = _figures._band(law, np.array([values.mean()]), np.array([values.std()]))
         inside = np.mean((values >= low[0]) & (values <= high[0]))
         assert inside == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 1e5)), law
 
 
 def test_an_axis_that_is_no_axis_is_not_used() -> None:
     good, _ = summary_of("intervals")
-    assert pages._axis_of(good)[1:] == ("interval (s)", True)
+    assert _figures._axis_of(good)[1:] == ("interval (s)", True)
     assert good.axis is not None
     for axis in (None, good.axis[:-1], np.where(good.axis > 1e-6, np.nan, good.axis), np.tile(good.axis[:12], 2)):
-        assert pages._axis_of(replace(good, axis=axis))[0] is None
+        assert _figures._axis_of(replace(good, axis=axis))[0] is None
     long, _ = summary_of("rows", cells=100)
-    axis, label, _ = pages._axis_of(replace(long, axis=None))
+    axis, label, _ = _figures._axis_of(replace(long, axis=None))
     assert axis is not None and axis.size == 100 and label == "cell, 0 to 99"
     zero = replace(good, axis=good.axis - good.axis[0])  # a lag of 0 is not on a logarithmic scale
-    assert pages._axis_of(zero)[2] is False
-    falling = pages._picture(replace(check_of("intervals", 1e-9), summary=replace(good, axis=good.axis[::-1])))
+    assert _figures._axis_of(zero)[2] is False
+    falling = _comparison._picture(replace(check_of("intervals", 1e-9), summary=replace(good, axis=good.axis[::-1])))
     assert falling is not None
 
 
@@ -420,7 +421,7 @@ def test_numbers_beyond_all_bounds_are_drawn() -> None:
             summary=replace(check.summary, values=values),
             judgement=replace(check.judgement, residuals=residuals, worst=1),
         )
-        picture = pages._picture(broken)
+        picture = _comparison._picture(broken)
         assert picture is not None and len(decoded(picture.source)[1]) > 5000
 
 
@@ -430,7 +431,7 @@ def test_a_statistic_of_ones_own_that_fails_to_name_a_cell_does_not_cost_the_pag
 
     check = check_of("names", 1e-9)
     assert check.summary is not None
-    picture = pages._picture(replace(check, summary=replace(check.summary, where=where)))
+    picture = _comparison._picture(replace(check, summary=replace(check.summary, where=where)))
     assert picture is not None and b"cell 5" in decoded(picture.source)[1]
 
 
@@ -454,17 +455,17 @@ def test_the_picture_of_the_light_shows_what_is_stated(uncertainty: float, shift
     for k in range(3):
         capture = Capture(f"flat-{k}", "tr", Light(500e-9, 1.0, "irradiance", uncertainty, 0.002), conditions)
         levels.append((capture, shift + 0.001 * k, 0.003, 1.0))
-    nuisances, _ = compare._light(levels, [])
+    nuisances, _ = compare.light_of(levels, [])
     assert nuisances[0].capture is None and len(nuisances) == 4
     assert nuisances[0].stated == uncertainty and nuisances[1].stated == 0.002
-    form, data = decoded(pages._light_picture(nuisances).source)
+    form, data = decoded(_comparison._light_picture(nuisances).source)
     assert form == "svg+xml" and b"all lit captures" in data and b"flat-2" in data
     assert f"within {196 * uncertainty:.2g} %".encode() in data
 
 
 def test_many_lights_are_a_picture_of_the_oddest(tmp_path: Path) -> None:
     many = [Nuisance(f"flat-{k}", "light", 1.0, 0.99, 1.01, k / 100) for k in range(150)]
-    picture = pages._light_picture([Nuisance(None, "light", 1.0, 0.99, 1.01, 0.0), *many])
+    picture = _comparison._light_picture([Nuisance(None, "light", 1.0, 0.99, 1.01, 0.0), *many])
     data = decoded(picture.source)[1].decode()
     assert "all lit captures" in data and "flat-149" in data and "flat-3<" not in data and "151" in picture.note
 
@@ -482,8 +483,8 @@ def test_it_is_one_small_file_and_always_the_same(tmp_path: Path, failing_page: 
 
 
 def test_twelve_large_maps_are_still_a_small_page() -> None:
-    picture = pages._picture(check_of("large map", 1e-9, factor=4.0))
-    assert picture is not None and pages._PICTURES * len(picture.source) < 2_200_000
+    picture = _comparison._picture(check_of("large map", 1e-9, factor=4.0))
+    assert picture is not None and _comparison._PICTURES * len(picture.source) < 2_200_000
 
 
 def test_a_thousand_captures_are_still_a_page(tmp_path: Path) -> None:
@@ -509,7 +510,7 @@ def test_other_peoples_files_stay(tmp_path: Path) -> None:
             pages.comparison(adequate(), tmp_path)
         assert page.read_text() == other
     page.unlink()
-    (tmp_path / "elsewhere.html").write_text(f"<head>{pages._MARK}")
+    (tmp_path / "elsewhere.html").write_text(f"<head>{_frame._mark('comparison')}")
     page.symlink_to(tmp_path / "elsewhere.html")
     with pytest.raises(SpadError, match="left alone"):
         pages.comparison(adequate(), tmp_path)
@@ -639,13 +640,13 @@ def test_a_browser_shows_words_and_pictures(tmp_path: Path, failing_page: tuple[
     assert 0.005 < dark.mean() < 0.2
     strips = dark.reshape(20, 200, 1280).any(axis=(1, 2))
     assert strips.all()  # nowhere a blank screen
-    assert near(seen, pages._BAND).sum() > 5000  # drawn, not only linked
-    assert near(seen, pages._MODEL).sum() > 1000
+    assert near(seen, _figures.BAND).sum() > 5000  # drawn, not only linked
+    assert near(seen, _figures.MODEL).sum() > 1000
     background = near(seen, "#fafaf8") | near(seen, "#ffffff")
     assert background[:, :100].all() and background[:, -100:].all()  # nothing runs over the edge
     # of a page whose pictures are forbidden the same test fails
     page.write_text(page.read_text().replace("img-src data:;", ""))
-    assert near(screenshot(page, tmp_path), pages._MODEL).sum() < 1000
+    assert near(screenshot(page, tmp_path), _figures.MODEL).sum() < 1000
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import units
 from ..effects import Effect
+from ..statistics import Summary
 from .candidates import Change, Dial, Key
 from .fit import Cell
 
@@ -56,6 +57,7 @@ class Step:
     alternatives: list[dict[str, Any]] = field(default_factory=list)
     dials: tuple[Dial, ...] = ()
     phased: bool = False
+    chips: bool = False
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
@@ -76,17 +78,19 @@ class Step:
 
 @dataclass(frozen=True)
 class Trace:
-    """A check before and after, for a picture: (cells,) each; spread is that of the last model."""
+    """A check before and after, for a picture: (cells,) what each model expects, and its residuals.
+
+    spread: the scatter of the last model.
+    """
 
     statistic: str
     capture: str
-    label: str
-    log: bool
-    axis: np.ndarray | None
-    measured: np.ndarray
+    summary: Summary
     before: np.ndarray
     after: np.ndarray
     spread: np.ndarray
+    residuals_before: np.ndarray
+    residuals_after: np.ndarray
 
 
 @dataclass
@@ -141,14 +145,23 @@ def title(change: Change) -> str:
 def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
     """One sentence on what the remainder does."""
     names = {str(r["statistic"]) for r in found}
-    together = names & {"neighbours", "far_pairs", "multiplicity", "spacing", "array_fano"}
-    same = names & {"intervals", "edge_intervals", "autocorrelation", "rescaled", "rescaled_lag"}
+    same = {
+        "intervals",
+        "fine_intervals",
+        "edge_intervals",
+        "autocorrelation",
+        "rescaled",
+        "rescaled_lag",
+        "pixel_fano",
+    }
     if "far_pairs" in names:
         who = "pixels far from each other share it"
-    elif "neighbours" in names or together:
+    elif names & {"neighbours", "multiplicity"}:
         who = "pixels that are close to each other share it"
-    elif same:
+    elif names & same:
         who = "it stays in its own pixel"
+    elif names & {"spacing", "array_fano", "spectrum", "trend"}:
+        who = "the whole array shares it"
     else:
         who = "it is a matter of rates and maps"
     in_dark = any(r["capture"] in dark for r in found)
@@ -229,11 +242,11 @@ def sentence(found: Diagnosis) -> str:
         return "the set-up explains everything, the sensor nothing."
     names = " and ".join(title(s.change) for s in found.steps)
     if found.verdict == "explained":
-        return f"{names} explains what the model lacked."
+        return f"{names} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
     if found.verdict == "confused":
         return f"{names}, or something that looks the same here."
     if found.verdict == "partly_explained":
-        return f"{names} is missing, and something else remains."
+        return f"{names} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
     dark = [r["capture"] for r in found.unexplained if "dark" in str(r["capture"])]
     return f"something is missing that no known effect explains: {mechanism(found.unexplained, dark)}."
 

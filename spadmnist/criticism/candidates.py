@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..effects import Effect
+from ..effects import Conditions, Effect
 from ..plugins import ByWavelength, Parameter
 from ..sensor import Sensor
 
@@ -22,7 +22,7 @@ Key = tuple[str, str]  # effect, parameter
 Values = Mapping[Key, Any]
 
 _SHAPES = 4  # values of a shape that are tried between the ends of where it is looked for
-_MOST = 10  # templates of one candidate
+_MOST = 6  # templates of one candidate
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,19 @@ def with_values(sensor: Sensor, values: Values) -> Sensor:
     return Sensor(sensor.layout, effects, sensor.rules, sensor.chip_seed, sensor.name).settled()
 
 
+def on_chip(sensor: Sensor, seed: int) -> Sensor:
+    """The sensor as another chip of its kind: what chance decides for each pixel falls otherwise."""
+    return Sensor(sensor.layout, sensor.effects, sensor.rules, seed, sensor.name).settled()
+
+
+def chancy(sensor: Sensor) -> bool:
+    """Does chance decide what its pixels are like?"""
+    second = Conditions(1.0, 1, 1.0, 1.0, None)
+    light = np.ones((1, sensor.layout.pixels))
+    one, other = (on_chip(sensor, seed).expected(light, second) for seed in (1, 2))
+    return not all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
 def _dial(effect: str, declared: Parameter, off: float | None) -> Dial:
     assert declared.search is not None
     low, high = map(float, declared.search)
@@ -135,7 +148,7 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Chang
     phases = tuple((name, k) for k, p in wholes.items() if p.unit == "rad")
     off = {k: p for k, p in wholes.items() if p.off is not None and (name, k) not in phases}
     shapes = tuple(_dial(name, p, None) for k, p in wholes.items() if k not in off and (name, k) not in phases)
-    lines = [p for p in parameters.values() if p.per in ("row", "column") and p.off is not None]
+    lines = [p for p in parameters.values() if p.per in ("row", "column", "code") and p.off is not None]
     if lines:
         one = lines[0]
         yield Change("add", name, None, (), per=one.per, carrier=(name, one.name), relative=one.off == 1.0)

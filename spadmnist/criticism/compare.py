@@ -197,7 +197,9 @@ def compare(
     nuisances, common = light_of(levels, captures)
     checks += common
     checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
-    misfit = float(np.mean([j.misfit for j, _ in judged])) if judged else 1.0
+    # of means alone there are no statistics: their totals stand in
+    squares = [j.misfit for j, _ in judged] or [c.misfit for c in checks if c.statistic == "rate"]
+    misfit = float(np.mean(squares)) if squares else 1.0
     own = np.mean([null.own / max(null.own.mean(), 1e-30) for _, null in judged], axis=0) if judged else np.ones(1)
     verdict = "adequate" if all(c.passes for c in checks) else "fails"
     return Comparison(

@@ -25,12 +25,14 @@ from ..sensor import Sensor
 from ..statistics import Summary
 from . import compare as comparing
 from . import recordings
-from .candidates import Dial, Key, Values, with_values
+from .candidates import Dial, Key, Values, on_chip, with_values
 from .nulls import Null, _standardized, learn
 
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _LEAST_SPREAD = 0.03  # other models' totals must not lie outside
+_SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
+_BLIND = 0.05  # squared slope of a number that nothing tells
 FEW = 4  # recordings that tell the difference between two models
 
 
@@ -104,20 +106,27 @@ class Sensors:
         """One sensor for every recording of every capture."""
         return Sensors(lambda capture, number: sensor, sensor)
 
-    def changed(self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None) -> Sensors:
-        """These sensors with some values set; phases: those of each capture."""
+    def changed(
+        self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None, chips: bool = False
+    ) -> Sensors:
+        """These sensors with some values set; phases: those of each capture.
+
+        chips: every recording is of a chip of its own, for which of the pixels it is that chance hit is not known.
+        """
 
         def own(capture: str) -> dict[Key, Any]:
             return {**values, **{key: x for (id, key), x in (phases or {}).items() if id == capture}}
 
         def of(capture: str, number: int) -> Sensor:
-            return with_values(self.of(capture, number), own(capture))
+            sensor = self.of(capture, number)
+            return with_values(on_chip(sensor, number + 1) if chips else sensor, own(capture))
 
         def usual(capture: str) -> Sensor:
             return with_values(self.usual(capture), own(capture))
 
         typical = functools.lru_cache(maxsize=64)(usual)
-        return Sensors(of, with_values(self.one, values), self.alike, typical if self.typical else None)
+        known = typical if self.typical or chips else None
+        return Sensors(of, with_values(self.one, values), self.alike and not chips, known)
 
 
 def _task(
@@ -127,11 +136,15 @@ def _task(
     numbers: np.ndarray,
     seed: int,
     dead: float,
+    hasty: bool = False,
 ) -> Made | str:
-    """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each."""
+    """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each.
+
+    hasty: without statistics that cost much.
+    """
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = recordings.statistics_for(capture.modality)
+    known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
 
     def take(recording: Recording) -> None:
         recording = replace(recording, dead_time=dead, _kept={})
@@ -205,7 +218,7 @@ class Bench:
     # --- simulating ----------------------------------------------------------------------------------------------
 
     def simulate(
-        self, wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]], pieces: int = 1
+        self, wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]], pieces: int = 1, hasty: bool = False
     ) -> list[Made | str]:
         """Recordings for each of (sensors, capture, photons, numbers), in their order."""
         tasks = []
@@ -216,7 +229,7 @@ class Bench:
                     models = [recordings.Packed.of(sensors.of(id, 0))]
                 else:
                     models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
-                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead))
+                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, hasty))
         self.simulations += sum(len(n) for _, _, _, n in wanted)
         results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
         out: list[Made | str] = []
@@ -384,9 +397,12 @@ class Bench:
     # --- other models beside a state ------------------------------------------------------------------------------
 
     def moved(
-        self, state: State, models: Sequence[Sensors], few: int = FEW, only: Sequence[str] = ()
+        self, state: State, models: Sequence[Sensors], few: int = FEW, only: Sequence[str] = (), hasty: bool = True
     ) -> list[Moved | str]:
-        """What each of these models would change. few: recordings of each capture; only: of some captures."""
+        """What each of these models would change.
+
+        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much.
+        """
         numbers = np.arange(few, dtype=np.uint64)
         ids = [id for id in state.made if not only or id in only]
         wanted = []
@@ -394,7 +410,7 @@ class Bench:
             for id in ids:
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = self.simulate(wanted, pieces=1)
+        results = self.simulate(wanted, pieces=1, hasty=hasty)
         out: list[Moved | str] = []
         for i in range(len(models)):
             part = results[i * len(ids) : (i + 1) * len(ids)]
@@ -550,8 +566,10 @@ def misfits(state: State, residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, fl
 
 
 def misfit(state: State, residuals: Mapping[Cell, np.ndarray]) -> float:
-    """Mean over the blocks."""
+    """Mean over the blocks; where only means were measured, of their totals."""
     all_ = list(misfits(state, residuals).values())
+    if not all_ and len(residuals[RATES]):
+        return float(np.mean(residuals[RATES] ** 2))
     return float(np.mean(all_)) if all_ else 1.0
 
 
@@ -636,8 +654,13 @@ def settle(
     sensors_of: Callable[[Mapping[Key, Any]], Sensors],
     rounds: int = 3,
     few: int = FEW,
+    stronger: tuple[float, float] = (1.0, 1.0),
 ) -> Settled | str:
-    """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated."""
+    """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated.
+
+    stronger: (factor, power). Of faint effects, what one `factor` times as strong does is simulated, and taken for
+    factor^power times what it does itself.
+    """
     dials = tuple(dials)
     keys = list(state.residuals)
     fixed = dict(values)
@@ -646,57 +669,78 @@ def settle(
         return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(dials, u, strict=True)}}
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | str]:
-        found = bench.moved(state, [sensors_of(at(u)) for u in points], few)
-        return [m if isinstance(m, str) else stacked(bench.residuals(state, m), keys) for m in found]
+        found = bench.moved(state, [sensors_of(boosted(at(u))) for u in points], few)
+        times = stronger[0] ** -stronger[1]
+        return [m if isinstance(m, str) else stacked(bench.residuals(state, m, times), keys) for m in found]
+
+    def aside(u: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
+        # to both sides: what chance does to the point itself must not be in the slope
+        out = []
+        for i, dial in enumerate(dials):
+            for h in (steps[i], -steps[i]):
+                other = u.copy()
+                other[i] = dial.coordinate(dial.value(u[i] + h))
+                out.append(other)
+        return out
+
+    def slopes_of(found: Sequence[np.ndarray | str], u: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        places = aside(u, steps)
+        out = np.zeros((sum(len(state.residuals[k]) for k in keys), len(dials)))
+        for i in range(len(dials)):
+            up, down = found[2 * i], found[2 * i + 1]
+            apart = places[2 * i][i] - places[2 * i + 1][i]
+            if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
+                out[:, i] = (up - down) / apart
+        return out
+
+    def boosted(values: dict[Key, Any]) -> dict[Key, Any]:
+        if stronger[0] == 1:
+            return values
+        up = {d.key: d.scaled(float(values[d.key]), stronger[0]) for d in dials if d.off is not None}
+        return {**values, **up}
 
     u = point_of(dials, values)
     own = np.concatenate([state.own[k] for k in keys], axis=1)  # (recordings, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
-    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
-    damping = 0.0
-    for turn in range(rounds):
-        moves = [u]
-        for i, dial in enumerate(dials):
-            # to both sides: what chance does to the point itself must not be in the slope
-            for h in (steps[i], -steps[i]):
-                other = u.copy()
-                other[i] = dial.coordinate(dial.value(u[i] + h))
-                moves.append(other)
-        found = evaluate(moves)
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    slopes, there, damping, promised = np.zeros((0, len(dials))), u, 0.0, 0.0
+    limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
+    reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in dials])
+    for turn in range(2 * rounds):
+        # slopes hold for a while: they are found anew where the point has moved on, or did not gain what they promised
+        anew = turn == 0 or bool(np.any(np.abs(u - there) > reach))
+        found = evaluate([u, *(aside(u, steps) if anew else [])])
         if isinstance(found[0], str):
             return found[0]
         z = found[0]
-        slopes = np.zeros((z.size, len(dials)))
-        for i in range(len(dials)):
-            up, down = found[2 * i + 1], found[2 * i + 2]
-            apart = moves[2 * i + 1][i] - moves[2 * i + 2][i]
-            if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
-                slopes[:, i] = (up - down) / apart
         square = float(z @ z)
+        if best is not None and not anew and best[0] - square < 0.3 * promised:
+            if promised < 4:
+                break
+            found = [z, *evaluate(aside(u, steps))]
+            anew = True
+        if anew:
+            slopes, there = slopes_of(found[1:], u, steps), u
         if best is None or square < best[0]:
-            best, damping = (square, u, z, slopes), damping / 3
+            best, damping = (square, u, z), damping / 3
         else:
             damping = max(3 * damping, 0.3)
-        square, u0, z, slopes = best
+        square, u0, z = best
         normal = slopes.T @ slopes
         step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (slopes.T @ z)
-        limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
         step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
         u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u0 + step, strict=True)])
-        gain = float(square - ((z + slopes @ (u - u0)) ** 2).sum())
-        covariance = covariance_of(slopes, own)
-        error = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+        promised = float(square - ((z + slopes @ (u - u0)) ** 2).sum())
+        error = np.sqrt(np.maximum(np.diag(covariance_of(slopes, own)), 1e-30))
         # never so short that what is taken for noise, or not, makes a slope
-        steps = np.clip(3 * error, [0.05 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.4)
-        if turn and (gain < 1.0 or np.all(np.abs(u - u0) < 0.3 * error)):
+        steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.5)
+        if turn and (promised < 1.0 or np.all(np.abs(u - u0) < 0.3 * error)):
             break
     assert best is not None
-    last = evaluate([u])[0]
-    if not isinstance(last, str) and float(last @ last) < best[0] + 1.0:
-        best = float(last @ last), u, last, best[3]
-    square, u, z, slopes = best
-    covariance = covariance_of(slopes, own)
-    return Settled(dials, u, covariance, _split(z, state, keys), _split(slopes, state, keys), square, at(u))
+    square, u, z = best
+    return Settled(
+        dials, u, covariance_of(slopes, own), _split(z, state, keys), _split(slopes, state, keys), square, at(u)
+    )
 
 
 def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -705,7 +749,10 @@ def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
     estimates = own @ solve.T
     n = len(own)
     # what so many recordings miss by chance: a little wider
-    return np.atleast_2d(np.cov(estimates.T)) * (n + 2) / max(n - 2, 1)
+    covariance = np.atleast_2d(np.cov(estimates.T)) * (n + 2) / max(n - 2, 1)
+    blind = np.einsum("ij,ij->j", slopes, slopes) < _BLIND
+    covariance[blind, blind] = np.inf  # nothing tells it
+    return covariance
 
 
 def _split(stack: np.ndarray, state: State, keys: Sequence[Cell]) -> dict[Cell, np.ndarray]:

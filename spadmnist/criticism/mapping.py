@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ..errors import SpadError
 from ..sensor import Sensor
 from .candidates import Change, Key, Values, with_values
 from .fit import Bench, Sensors
@@ -23,6 +24,8 @@ from .recordings import InTheDark
 _TAILS = 3.0  # degrees of freedom of the prior
 _TURNS = 12
 _MOST = 6.0  # of a logarithm
+CODES = "codes"
+_PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
 
 
@@ -91,6 +94,10 @@ def settle_maps(
 
     The array's own mean rate is the light's matter in lit captures, so they tell the pixels' differences only.
     """
+    codes = {c.carrier: settle_codes(bench, c, use) for c in wanted if c.per == "code" and c.carrier is not None}
+    wanted = [c for c in wanted if c.per != "code"]
+    if not wanted:
+        return codes
     start = with_values(bench.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
     lines = [
         _Line(bench, id, levels[id]) for id, s in bench.seen.items() if s.counts is not None and (not use or id in use)
@@ -177,7 +184,7 @@ def settle_maps(
             square = float(np.mean(weight * (delta[i] - _middle(delta[i])) ** 2 + post[i]))
             sigma[i] = min(max(math.sqrt(square), 1e-4), 3.0)
             precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + delta[i] ** 2)
-    out = {}
+    out = codes
     for i, change in enumerate(wanted):
         assert change.carrier is not None
         error = np.sqrt(np.maximum(post[i], 0))
@@ -205,8 +212,53 @@ def levels_of(bench: Bench, state: Any) -> dict[str, float]:
     return {id: 1.0 if s.capture.light.dark else state.rates[id].level for id, s in bench.seen.items()}
 
 
+def settle_codes(bench: Bench, change: Change, use: Sequence[str] = ()) -> Map:
+    """Lengths of a converter's codes from how often each occurs, in the captures in `use` (all).
+
+    Their period is the one in which they differ most clearly. Raises SpadError where no capture has codes.
+    """
+    folded: dict[int, np.ndarray] = {}
+    for id, seen in bench.seen.items():
+        summary = seen.summaries.get(CODES)
+        if summary is None or (use and id not in use):
+            continue
+        for period, part in code_periods(len(summary.values)).items():
+            folded[period] = folded.get(period, 0.0) + summary.values[part]
+    assert change.carrier is not None
+    found: Map | None = None
+    least = 2.0
+    for period, counts in folded.items():
+        mean = max(float(counts.mean()), 1.0)
+        p = float(stats.chi2.sf(float(((counts - mean) ** 2).sum()) / mean, period - 1))
+        if p >= least:
+            continue
+        least, raw, noise = p, np.maximum(counts, 0.5) / mean - 1, 1 / mean
+        sigma = math.sqrt(max(float(np.mean(raw**2)) - noise, 1e-8))
+        share = sigma**2 / (sigma**2 + noise)
+        logs = np.log(np.maximum(1 + raw * share, 1e-3))
+        error = np.full(period, math.sqrt(noise * share))
+        spread = np.full(period, math.sqrt(noise))
+        found = Map(change.carrier, 1.0, np.arange(period), logs, error, np.log1p(raw), spread, sigma)
+    if found is None:
+        raise SpadError("no capture has stamps with codes")
+    return found
+
+
+def code_periods(cells: int) -> dict[int, slice]:
+    """Where the statistic `codes` has the codes of each period."""
+    out: dict[int, slice] = {}
+    start = 0
+    for period in _PERIODS:
+        if start + period <= cells:
+            out[period] = slice(start, start + period)
+            start += period
+    return out
+
+
 def information(bench: Bench, values: Values, change: Change, levels: dict[str, float]) -> dict[str, float]:
     """How much each capture tells of the map's mean: the sum of squared slopes over variances."""
+    if change.per == "code":
+        return {id: seen.total * (CODES in seen.summaries) for id, seen in bench.seen.items()}
     start = with_values(bench.start, values)
     effect = start.effect(change.carrier[0])  # type: ignore[index]
     if effect is None:

@@ -15,7 +15,7 @@ from ..effects import Conditions
 from ..recording import Capture, Light, Recording
 from . import fit, recordings
 from .answer import plain
-from .candidates import Change, Dial, Key, changes, first_strength, templates
+from .candidates import Change
 from .fit import Bench, Moved, Seen, Sensors, State
 from .search import Search, Tried
 from .setups import Explanation
@@ -24,7 +24,6 @@ _RECORDINGS = 16  # of a capture that nobody has taken yet
 _MOST_EVENTS = 2e6  # of it
 _LONG = 100.0  # s of a long dark capture
 _ONE_SIDED = 1.645  # 95 %
-_SHAPES = 3  # of an effect, for its limit
 
 
 # --- which capture would tell ------------------------------------------------------------------------------------
@@ -125,7 +124,7 @@ def _apart(bench: Bench, one: Sensors, other: Sensors, capture: Capture, like: s
             summaries[statistic.name] = summary
     new.seen = {capture.id: Seen(made.capture, float(counts.sum()), counts, summaries)}
     state = new.state({}, first, _RECORDINGS)
-    (moved,) = new.moved(state, [second], fit.FEW)
+    (moved,) = new.moved(state, [second], fit.FEW, hasty=False)
     if isinstance(moved, str):
         return 0.0
     return math.sqrt(sum(float(t @ t) for t in new.template(state, moved).values()))
@@ -196,58 +195,54 @@ def advice_on_setup(bench: Bench, state: State, entries: Sequence[Mapping[str, A
 # --- what would have been seen -----------------------------------------------------------------------------------
 
 
-def upper_limits(search: Search, state: State) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def upper_limits(
+    search: Search, state: State, tried: Sequence[Tried]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here).
 
-    The weakest limit of a few shapes: whatever the shape, more would have been seen.
+    tried: every candidate as it was looked at in all captures. The weakest limit of its shapes: whatever the shape,
+    more would have been seen. What each would do at its limit is simulated once more.
     """
     bench = search.bench
-    wanted: list[tuple[Change, Dial, dict[Key, Any]]] = []
-    for change in changes(state.sensors.one):
+    weakest: dict[str, tuple[float, float, Tried]] = {}
+    for one in tried:
+        change = one.change
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
-        tries = templates(change)
-        for place in sorted({round(x * (len(tries) - 1)) for x in np.linspace(0, 1, _SHAPES)}):
-            wanted.append((change, change.strengths[0], tries[place]))
-    strengths = [first_strength(dial) for _, dial, _ in wanted]
-    limits = [math.inf] * len(wanted)
-    powers: list[float] = [math.nan] * len(wanted)
-    before: list[tuple[float, float]] = [(math.nan, math.nan)] * len(wanted)
-    for turn in range(2):
-        models = [
-            state.sensors.changed({**tried, dial.key: x}) for (_, dial, tried), x in zip(wanted, strengths, strict=True)
-        ]
-        for k, moved in enumerate(bench.moved(state, models, fit.FEW)):
-            _, dial, _ = wanted[k]
-            if isinstance(moved, str):
-                continue
-            x, (size, along) = abs(strengths[k] - (dial.off or 0.0)), _size(search, state, moved)
-            if size <= 0:
-                continue
-            # how the trace grows with the strength: in proportion, until a second strength tells
-            power = 1.0
-            if turn and math.isfinite(before[k][0]) and x != before[k][0] and before[k][1] > 0:
-                power = float(np.clip(math.log(size / before[k][1]) / math.log(x / before[k][0]), 0.5, 3.0))
-            before[k], powers[k] = (x, size), power
-            limit = x * ((max(along, 0.0) + _ONE_SIDED) / size) ** (1 / power)
-            limits[k] = limit
-            strengths[k] = dial.scaled(strengths[k], float(np.clip(limit / x, 1e-4, 1e4)))
-    out: dict[Key, float] = {}
-    hidden: dict[str, None] = {}
-    for (change, dial, _), limit in zip(wanted, limits, strict=True):
-        reach = abs((dial.low if dial.off == dial.high else dial.high) - (dial.off or 0.0))
-        if limit > reach:
-            hidden[change.effect] = None
-        else:
-            out[dial.key] = max(out.get(dial.key, 0.0), limit)
+        size, along = _size(search, state, one.moved)
+        times = (max(along, 0.0) + _ONE_SIDED) / size if size > 0 else math.inf
+        if change.effect not in weakest or times > weakest[change.effect][0]:
+            weakest[change.effect] = times, size, one
+    hidden = [name for name, (times, _, one) in weakest.items() if _strength(one, times) is None]
+    seen = {name: entry for name, entry in weakest.items() if name not in hidden}
+    models = []
+    for times, _, one in seen.values():
+        dial = one.change.strengths[0]
+        models.append(state.sensors.changed({**one.values, dial.key: _strength(one, times)}))
     excluded = []
-    for (effect, parameter), limit in out.items():
-        if effect in hidden:
-            continue
-        dial = next(d for c, d, _ in wanted if d.key == (effect, parameter))
-        at = (dial.off or 0.0) + (limit if dial.off != dial.high else -limit)
-        excluded.append({"effect": effect, "parameter": parameter, "upper_limit_95": plain(at)})
-    return excluded, [{"effect": name} for name in hidden]
+    for (name, (times, size, one)), moved in zip(seen.items(), bench.moved(state, models, fit.FEW), strict=True):
+        dial = one.change.strengths[0]
+        if not isinstance(moved, str) and not 0.5 < times < 2:
+            # how the trace grows with the strength: in proportion, or with its square
+            there, _ = _size(search, state, moved)
+            if there > 0.2:
+                power = float(np.clip(math.log(there / size) / math.log(times), 1.0, 2.0))
+                times = times ** (1 / power)
+        limit = _strength(one, times)
+        if limit is None:
+            hidden.append(name)
+        else:
+            excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(limit)})
+    return excluded, [{"effect": name} for name in sorted(hidden)]
+
+
+def _strength(one: Tried, times: float) -> float | None:
+    """So many times the strength of a candidate; None beyond where it is looked for."""
+    dial = one.change.strengths[0]
+    off = dial.off or 0.0
+    value = off + (float(one.values[dial.key]) - off) * times
+    inside = math.isfinite(value) and (value <= dial.high if dial.off != dial.high else value >= dial.low)
+    return value if inside else None
 
 
 def _size(search: Search, state: State, moved: Moved) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from ..sensor import Sensor
 from ..statistics import Statistic, Summary
 from ..streams import Streams
 from . import memory
+from .candidates import Key, with_values
 from .nulls import Null, learn
 
 REPLICATES = 96
@@ -53,6 +54,35 @@ def simulated(
         yield from twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
 
 
+def whatever_phases(
+    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
+) -> Iterator[Recording]:
+    """As `simulated`; what swings begins somewhere else in every recording, for nobody knows where it was."""
+    keys = swinging(sensor)
+    if not keys:
+        yield from simulated(sensor, capture, photons, numbers, seed)
+        return
+    for k, number in enumerate(numbers):
+        rng = np.random.Generator(np.random.Philox(key=[seed, int(number)]))
+        turned = with_values(sensor, {key: 2 * math.pi * rng.random() for key in keys})
+        turned = InTheDark.of(turned) if isinstance(sensor, InTheDark) else turned
+        yield from simulated(turned, capture, photons[k : k + 1], numbers[k : k + 1], seed)
+
+
+def swinging(sensor: Sensor) -> list[Key]:
+    """Parameters that are phases: in rad."""
+    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.unit == "rad"]
+
+
+def still(sensor: Sensor) -> Sensor:
+    """The sensor without what swings, as it is in the mean over all phases."""
+    names = {name for name, _ in swinging(sensor)}
+    if not names:
+        return sensor
+    rest = [effect for effect in sensor.effects if effect.name not in names]
+    return Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name).settled()
+
+
 class InTheDark(Sensor):
     """A sensor without light whose dark rates are all scaled by what would be the photons/s.
 
@@ -62,6 +92,7 @@ class InTheDark(Sensor):
 
     @staticmethod
     def of(sensor: Sensor) -> Sensor:
+        """The same sensor, in the dark."""
         s = sensor
         return InTheDark(s.layout, s.effects, s.rules, s.chip_seed, s.name, True)
 
@@ -125,10 +156,12 @@ class Packed:
 
     @staticmethod
     def of(sensor: Sensor) -> Packed:
+        """A sensor, packed."""
         return Packed(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
 
     @property
     def sensor(self) -> Sensor:
+        """The sensor, unpacked."""
         for file in self.files:
             plugins.load_file(file)
         return _unpacked(self.packed)
@@ -150,7 +183,7 @@ def _recordings_of(
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
     known = statistics_for(capture.modality)
-    for recording in simulated(sensor, capture, photons, numbers, seed):
+    for recording in whatever_phases(sensor, capture, photons, numbers, seed):
         totals.append(int(recording.totals.sum()))
         for statistic in known:
             summary = reduced(statistic, recording)
@@ -193,7 +226,8 @@ def model_of(
         stated: float | None = 1.0
     else:
         stated = twin.photons_at(capture, sensor.layout)
-    expected = closed_form(sensor, capture)
+    usual = still(sensor)
+    expected = closed_form(InTheDark.of(usual) if capture.light.dark else usual, capture)
     centre = level_for(expected, total, stated)
     uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
     half = max(LEAST_SPREAD, SPREAD * uncertainty)

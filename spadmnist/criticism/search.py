@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from . import fit, mapping
-from .candidates import Change, Dial, Key, changes, templates
+from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
@@ -30,6 +30,11 @@ _TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 _NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _TURNS = 8  # phases that are tried first
 _NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
+_PROMISING = 25.0  # in chi square, of what is worth a state of its own
+_MAP = "pixel_map"
+_LEAST_CHANCE = 1e-3  # of a map that is tried
+_STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
+_PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _LINE = 4.5  # standard deviations of a line in a spectrum
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _LINES = 2  # frequencies that are
@@ -52,10 +57,14 @@ class Tried:
     gain: float
     times: float
     sensors: Sensors | None = None
+    power: float = 1.0  # what it does grows with this power of its strength
+    chance: float | None = None  # p-value, where it is known by itself
     settled: Settled | None = None
     maps: dict[Key, mapping.Map] | None = None
     residuals: dict[Cell, np.ndarray] | None = None
     phases: Phases = field(default_factory=dict)
+    chips: bool = False  # chance decides which pixels it hits
+    faint: bool = False  # settled by what a stronger one does
     more: tuple[Change, ...] = ()  # maps that only make sense together
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
 
@@ -75,9 +84,10 @@ class Tried:
     def scaled(self) -> dict[Key, Any]:
         """The values at the strength that suits them."""
         out = dict(self.values)
+        factor = math.copysign(abs(self.times) ** (1 / self.power), self.times)
         for dial in self.change.strengths:
             if dial.key in out:
-                out[dial.key] = dial.scaled(float(out[dial.key]), self.times)
+                out[dial.key] = dial.scaled(float(out[dial.key]), factor)
         if len(self.change.strengths) > 1:  # directions side by side: the others' share comes from the fit
             out = {**dict(self.change.fixed), **out}
         return out
@@ -214,20 +224,24 @@ class Search:
         models, about = [], []
         for change, tried in still:
             try:
-                models.append(state.sensors.changed(tried))
-                about.append((change, tried))
+                chips = change.kind == "add" and chancy(with_values(state.sensors.one, tried))
+                models.append(state.sensors.changed(tried, chips=chips))
+                about.append((change, tried, chips))
             except SpadError:
                 continue
-        for (change, tried), moved in zip(about, self.bench.moved(state, models, _SCAN, only), strict=True):
+        for (change, tried, chips), moved in zip(
+            about, self.bench.moved(state, models, _SCAN, only, True), strict=True
+        ):
             if not isinstance(moved, str):
-                one = Tried(change, tried, moved, 0.0, 1.0)
+                one = Tried(change, tried, moved, 0.0, 1.0, chips=chips)
                 one.gain, one.times = self.line_search(state, moved, one.signed)
                 out.append(one)
         for change, tried in tries:
             if not change.phases:
                 continue
             turns = self.turns(change.phases)
-            turned = self.bench.moved(state, [state.sensors.changed(tried, t) for t in turns], _SCAN)
+            models = [state.sensors.changed(tried, t) for t in turns]
+            turned = self.bench.moved(state, models, _SCAN, hasty=True)
             if any(isinstance(m, str) for m in turned):
                 continue
             gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
@@ -239,15 +253,17 @@ class Search:
             out.append(one)
         return out
 
-    def scan(self, state: State) -> list[Tried]:
-        """Every candidate at its templates, the best first."""
+    def scan(self, state: State, everywhere: bool = False) -> list[Tried]:
+        """Every candidate at its templates, the best first. everywhere: in all captures, not the telling ones alone."""
         only_rates = self.only_rates(state)
         tries: list[tuple[Change, dict[Key, Any]]] = []
         for change in changes(state.sensors.one):
-            if (change.strengths or change.fixed) and not (change.phases and only_rates):
+            if change.phases and (only_rates or (everywhere and not self.lines(state))):
+                continue  # without a line in any spectrum nothing swings
+            if change.strengths or change.fixed:
                 tries += [(change, tried) for tried in self.begun(state, change)]
         if not only_rates:
-            out = self._looked_at(state, tries, self.telling(state))
+            out = self._looked_at(state, tries, () if everywhere else self.telling(state))
         else:
             out = []
             for change, tried in tries:
@@ -262,7 +278,56 @@ class Search:
 
     def only_rates(self, state: State) -> bool:
         """Is nothing wrong but the totals?"""
-        return all(b.cell[0] == "" for b in fit.failing(fit.blocks(self.bench, state, state.residuals)))
+        failed = fit.failing(fit.blocks(self.bench, state, state.residuals))
+        return bool(failed) and all(b.cell[0] == "" for b in failed)
+
+    def chance(self, state: State, tried: Sequence[Tried], values: dict[Key, Any]) -> float:
+        """p-value of what resembles the trace of any candidate most, maps among them, if the model is right."""
+        keys = list(state.residuals)
+        z = stacked(state.residuals, keys)
+        own = np.concatenate([state.own[k] for k in keys], axis=1)
+        largest, seen = np.zeros(len(own)), 0.0
+        for one in tried:
+            t = stacked(self.bench.template(state, one.moved), keys)
+            if not t.any():
+                continue
+            along = own @ t
+            spread = max(float(along.std()), 0.5 * math.sqrt(float(t @ t)))
+            largest = np.maximum(largest, np.abs(along) / spread)
+            seen = max(seen, abs(float(z @ t)) / spread)
+        p = 1.0
+        if seen > 0:
+            location, scale = stats.gumbel_r.fit(largest)
+            p = float(stats.gumbel_r.sf(seen, location, max(scale, 0.25)))
+        levels = mapping.levels_of(self.bench, state)
+        maps = [self.map_chance(state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
+        return min(1.0, 2 * min([p, *(q * len(maps) for q in maps)]))
+
+    def map_chance(self, state: State, change: Change, values: dict[Key, Any], levels: dict[str, float]) -> float:
+        """p-value of a map: pixels (rows, columns) that differ alike in all captures that could show it."""
+        try:
+            told = mapping.information(self.bench, values, change, levels)
+        except (SpadError, np.linalg.LinAlgError):
+            return 1.0
+        name = mapping.CODES if change.per == "code" else _MAP
+        cells = [(id, name) for id in told if told[id] > 0 and (id, name) in state.residuals]
+        if cells:
+            size = max(len(state.residuals[cell]) for cell in cells)
+            cells = [cell for cell in cells if len(state.residuals[cell]) == size]
+        if not cells:
+            return 1.0
+        weight = np.sqrt([told[id] for id, _ in cells])
+        weight /= math.sqrt(float(weight @ weight))
+        z = sum(w * state.residuals[cell] for w, cell in zip(weight, cells, strict=True))
+        own = sum(w * state.own[cell] for w, cell in zip(weight, cells, strict=True))
+        if change.per == "code":
+            parts = mapping.code_periods(size)
+            return min(1.0, len(parts) * min(_spread_chance(z[part], own[:, part]) for part in parts.values()))
+        groups = mapping.groups_of(state.sensors.one, change.per)
+        count = np.sqrt(np.bincount(groups))
+        data = np.bincount(groups, z) / count
+        usual = np.stack([np.bincount(groups, row) / count for row in own])
+        return _spread_chance(data, usual)
 
     def telling(self, state: State) -> list[str]:
         """Up to three captures that show best what is wrong: a dark one, and those of the largest misfit."""
@@ -285,10 +350,22 @@ class Search:
         out: list[Tried] = []
         models: list[Sensors] = []
         for one in best:
+            # a faint trace drowns in what is left of chance: a stronger one tells what it looks like
+            size = self.size(state, one.moved)
+            one.times = math.copysign(max(abs(one.times), min(_STRONG / max(size, 1e-9), 1.0)), one.times)
             given = one.scaled()
             models.append(state.sensors.changed(given, one.phases))
             out.append(
-                Tried(one.change, given, one.moved, 0.0, 1.0, models[-1], phases=one.phases, intervals=one.intervals)
+                Tried(
+                    one.change,
+                    given,
+                    one.moved,
+                    size,
+                    one.times,
+                    models[-1],
+                    phases=one.phases,
+                    intervals=one.intervals,
+                )
             )
         for one in self.maps(state, values):
             assert one.sensors is not None
@@ -298,14 +375,27 @@ class Search:
         for one, moved in zip(out, self.bench.moved(state, models, fit.FEW), strict=True):
             if isinstance(moved, str):
                 continue
+            if one.maps is None:
+                before, x = one.gain, abs(one.times)
+                size = self.size(state, moved)
+                if min(size, before) > 5 and not 0.7 < x < 1.4 and one.change.kind == "add":
+                    one.power = float(np.clip(math.log(size / before) / math.log(x), 1.0, 2.0))
             one.moved = moved
             if one.maps is None:
                 one.gain, one.times = self.line_search(state, moved, one.signed)
                 one.gain -= 2 * len(one.phases)
+                if one.chips and one.gain > _PROMISING:
+                    one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
             else:
                 one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, moved))
+                if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
+                    one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, _LEAST_P) / 2)) ** 2)
             kept.append(one)
         return sorted(kept, key=lambda t: -t.gain)
+
+    def size(self, state: State, moved: Moved) -> float:
+        """Standard deviations of what a model would change."""
+        return math.sqrt(sum(float(t @ t) for t in self.bench.template(state, moved).values()))
 
     def maps(self, state: State, values: dict[Key, Any]) -> list[Tried]:
         """Every map whose values differ beyond their noise, and all that are needed side by side."""
@@ -332,8 +422,13 @@ class Search:
             if map_.sigma < _LEAST_SIGMA or spread < _LEAST_SPREAD:
                 continue
             sensors = sensors.changed({}, self.phases)
+            chance = min(self.map_chance(state, c, values, levels) for c in group)
+            if chance > _LEAST_CHANCE:
+                continue
             nothing = Moved({}, {}, {})
-            out.append(Tried(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:])))
+            out.append(
+                Tried(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), chance=chance)
+            )
         return out
 
     def structured(self, state: State, tried: list[Tried]) -> list[Tried]:
@@ -375,7 +470,7 @@ class Search:
         """Those that may turn out best when they are settled."""
         best = max(t.gain for t in second)
         first = second[0]
-        return [first, *(t for t in second[1:] if t.gain > 0.3 * best)][:_REFINED]
+        return [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
 
     def refine(self, state: State, one: Tried, rounds: int = 3) -> Tried:
         """Settle the numbers of a candidate."""
@@ -387,13 +482,55 @@ class Search:
         dials = [d for d in one.change.dials if d.key in given and not d.whole and d not in narrow]
         if one.change.phases:
             given = self.tuned(state, one, given)
-        found = fit.settle(self.bench, state, dials, given, lambda v: state.sensors.changed(v, one.phases), rounds)
+        size = self.size(state, one.moved) * abs(one.times)
+        boost = max(1.0, (_STRONG / max(size, 1e-3)) ** (1 / one.power))
+        found = fit.settle(
+            self.bench,
+            state,
+            dials,
+            given,
+            lambda v: state.sensors.changed(v, one.phases, one.chips),
+            rounds,
+            stronger=(boost, one.power),
+        )
         if isinstance(found, str):
             return one
+        if not one.faint and boost == 1 and fit.failing(fit.blocks(self.bench, state, found.residuals)):
+            found = self._probed(state, one, found)
+        one.faint = boost > 1
         one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
-        one.sensors = state.sensors.changed(found.values, one.phases)
+        one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
         one.gain = self.square(state.residuals) - found.square - 2 * len(one.phases)
+        if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
+            one.gain = max(one.gain, self.beside(state, one.sensors))
         return one
+
+    def _probed(self, state: State, one: Tried, found: Settled) -> Settled:
+        """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge."""
+        for dial in one.change.shapes:
+            if dial not in found.dials or not dial.log:
+                continue
+            at = float(found.values[dial.key])
+            steps = [s * x for x in _PROBES for s in (-1, 1)]
+            tries = [{**found.values, dial.key: dial.value(dial.coordinate(at) + x)} for x in steps]
+            models = [state.sensors.changed(t, one.phases, one.chips) for t in tries]
+            best = found.square - 6
+            for tried, x, moved in zip(tries, steps, self.bench.moved(state, models, fit.FEW), strict=True):
+                if isinstance(moved, str):
+                    continue
+                residuals = self.bench.residuals(state, moved)
+                if self.square(residuals) < best:
+                    best = self.square(residuals)
+                    point = np.array([d.coordinate(float(tried[d.key])) for d in found.dials])
+                    found = replace(found, point=point, residuals=residuals, square=best, values=tried)
+                    i = found.dials.index(dial)
+                    # no slope told it, so that its neighbours must
+                    found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
+        return found
+
+    def beside(self, state: State, sensors: Sensors) -> float:
+        """By how much the data lie nearer to another model, each judged by its own scatter."""
+        return self.square(state.residuals) - self.square(self.bench.state({}, sensors).residuals)
 
     def tuned(
         self, state: State, one: Tried, given: dict[Key, Any], turns: Sequence[float] = _NARROWER
@@ -417,6 +554,8 @@ class Search:
 
     def calibrated(self, state: State, tried: Sequence[Tried], best: Tried) -> tuple[float, float]:
         """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
+        if best.chance is not None:
+            return float(stats.norm.isf(max(best.chance, _LEAST_P) / 2)), best.chance
         keys = list(state.residuals)
         z = stacked(state.residuals, keys)
         own = np.concatenate([state.own[k] for k in keys], axis=1)
@@ -427,7 +566,7 @@ class Search:
             if not t.any():
                 continue
             along = own @ t
-            spread = max(float(along.std()), 1e-9)
+            spread = max(float(along.std()), 0.5 * math.sqrt(float(t @ t)))
             largest = np.maximum(largest, np.abs(along) / spread)
             if one is best:
                 # what is far outside is no matter of the linear law: the gain itself, in the same measure
@@ -435,6 +574,17 @@ class Search:
                 scores = max(abs(float(z @ t)) / spread, math.sqrt(max(best.gain, 0.0) / max(typical, 0.5)))
         location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
         return scores, max(float(stats.gumbel_r.sf(scores, location, max(scale, 0.25))), _LEAST_P)
+
+
+def _spread_chance(data: np.ndarray, usual: np.ndarray) -> float:
+    """p-value of values that differ; usual: (recordings, values) those of the model itself."""
+    square, squares = float(np.mean(data**2)), np.mean(usual**2, axis=1)
+    mean, variance = float(squares.mean()), float(squares.var(ddof=1)) * (1 + math.sqrt(5 / len(squares)))
+    shape = mean**2 / max(variance, 1e-12)
+    p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
+    wide = max(1.0, float(np.sqrt(mean)))
+    p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
+    return min(1.0, 2 * min(p_sum, p_cell))
 
 
 def _lines_of(change: Change) -> list[Dial]:

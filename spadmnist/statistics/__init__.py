@@ -55,6 +55,7 @@ class Statistic(Plugin, abstract=True):
 
     registry: ClassVar[Registry] = Registry("statistic")
     modalities: ClassVar[tuple[str, ...]] = ()  # of "tr", "str", "qis", "counts"
+    costly: ClassVar[bool] = False  # left out where very many models are looked at for the first time
     unit: ClassVar[str] = "1"  # of its values
 
     def reduce(self, recording: Recording) -> Summary | None:

@@ -37,6 +37,7 @@ class Neighbours(Statistic):
 
     modalities = ("tr", "str", "qis", "counts")
     unit = "standard deviations"
+    costly = True
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Scores of pairs beyond chance."""
@@ -69,6 +70,7 @@ class FarPairs(Statistic):
 
     modalities = ("tr", "str", "qis", "counts")
     unit = "standard deviations"
+    costly = True
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Scores of pairs beyond chance."""

@@ -1,0 +1,11 @@
+"""Pages: what was found, as one HTML file that needs nothing else: no network, no script, no other file.
+
+Names come from users' files, so all text is escaped by the template, every picture is an image of its own, and the
+page forbids the browser to fetch or run anything. The same answer gives the same bytes.
+"""
+
+from ._comparison import comparison
+from ._diagnosis import diagnosis
+from ._frame import check_place
+
+__all__ = ["check_place", "comparison", "diagnosis"]

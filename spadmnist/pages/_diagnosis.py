@@ -1,0 +1,495 @@
+"""The page of `diagnose`: what is missing, and the ladder of errors from the first model to the last."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import reference, units
+from ..criticism import answer
+from ..criticism.answer import Diagnosis, Step, Trace, Value
+from . import _figures as figures
+from ._figures import MEASURED, ROUGH, Cells, Picture
+from ._frame import number, title_of, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BROAD, _NARROW = 5.9, 3.8  # inches; the ladder beside its table, and on a telephone
+_FLOOR, _REACHED, _ABOVE, _PLACEBO = "#e3efe6", "#3f7f57", "#c8584c", "#bcc2c6"
+_LINE = 14  # letters of a name below a bar
+_LETTER = 0.078  # inches that one takes
+_MOST = 200  # rows of a table
+_BEYOND = 1e4  # sigmas: more are no more than that
+_COLUMNS = {
+    "mean_rate": "mean rate",
+    "map": "map",
+    "linearity": "linearity",
+    "intervals": "intervals",
+    "neighbours": "neighbours",
+}
+_VERDICTS = {  # the word, and how the page looks
+    "adequate": ("Adequate", "good"),
+    "explained": ("Explained", "good"),
+    "setup": ("Set-up", "open"),
+    "confused": ("Confused", "open"),
+    "partly_explained": ("Partly explained", "open"),
+    "unexplained": ("Unexplained", "fails"),
+}
+_KINDS = {
+    "add": "an effect that the model lacks",
+    "set": "a number of the model that is another",
+    "per_pixel": "a number of the model that varies from pixel to pixel",
+}
+_OF_A_MAP = {
+    "sigma": "relative spread of the bulk of the pixels",
+    "low_fraction": "share of pixels that lie far below the bulk",
+    "low_ratio": "mean of these, relative to the middle of all",
+    "high_fraction": "share of pixels that lie far above the bulk",
+}
+
+
+def diagnosis(found: Diagnosis, folder: Path) -> Path:
+    """Write the page of a diagnosis as `report.html` in a folder, which is made if it is not there; its path.
+
+    A page that an earlier diagnosis left there is replaced, whatever else lies there stays as it is. Raises SpadError
+    as `check_place` does, or where the file cannot be written.
+    """
+    return write(folder, "diagnosis", _TEMPLATE, _words(found))
+
+
+# --- words ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Number:
+    name: str
+    value: str
+    interval: str
+    about: str
+
+
+@dataclass(frozen=True)
+class _Card:
+    """A step, or a check: what stands above and below its picture."""
+
+    title: str
+    step: Step | None = None
+    kind: str = ""
+    about: str = ""
+    numbers: Sequence[_Number] = ()
+    trace: Trace | None = None
+    picture: Picture | None = None
+    before: float = 0.0
+    after: float = 0.0
+
+
+def _words(found: Diagnosis) -> dict[str, Any]:
+    word, look = _VERDICTS.get(found.verdict, (found.verdict, "open"))
+    ladder = sorted(found.ladder, key=lambda row: bool(row["placebo"]))
+    dark = [str(r["capture"]) for r in found.unexplained if "dark" in str(r["capture"])]
+    return {
+        "found": found,
+        "verdict": word,
+        "look": look,
+        "sentence": answer.sentence(found),
+        "next": Path(found.file).name if found.file else None,
+        "ladder": ladder,
+        "broad": _ladder_picture(ladder, found.null_95, _BROAD) if ladder else None,
+        "narrow": _ladder_picture(ladder, found.null_95, _NARROW) if ladder else None,
+        "columns": _COLUMNS,
+        "steps": [_step(step) for step in found.steps],
+        "traces": [_checked(trace) for trace in found.traces],
+        "remains": found.unexplained[:_MOST],
+        "titles": {str(r["statistic"]): title_of(str(r["statistic"])) for r in found.unexplained},
+        "mechanism": answer.mechanism(found.unexplained, dark) if found.unexplained else "",
+        "limits": [(e, *_limit(e)) for e in found.excluded[:_MOST]],
+        "hidden": [(e["effect"], _about(e["effect"])) for e in found.invisible[:_MOST]],
+        "name": _name,
+        "about": _about,
+    }
+
+
+def _described(effect: str) -> dict[str, Any]:
+    """What the reference says of an effect; nothing where it is not at hand."""
+    try:
+        described = reference.as_data("effect", effect)
+    except KeyError:
+        return {"about": "", "parameters": {}}
+    assert isinstance(described, dict)
+    return described
+
+
+def _about(effect: str) -> str:
+    """The first sentence of an effect's docstring."""
+    first = " ".join(str(_described(effect)["about"] or "").split("\n\n")[0].replace("`", "").split())
+    return re.split(r"(?<=[.!?])\s", first, maxsplit=1)[0]
+
+
+def _name(entry: Mapping[str, Any]) -> str:
+    """What people call an alternative, as `answer.title` does a change."""
+    if entry["change"] == "add":
+        return str(entry["effect"])
+    return f"{entry['effect']}.{entry['parameter']}" + (" per pixel" if entry["change"] == "per_pixel" else "")
+
+
+def _step(step: Step) -> _Card:
+    declared = _described(step.change.effect)["parameters"]
+    words = _OF_A_MAP if step.change.carrier else {}
+    numbers = []
+    for name, value in step.values.items():
+        own = declared.get(name, {})
+        about = words.get(name, own.get("about", ""))
+        numbers.append(_Number(name, *_shown(value, own.get("unit", "")), about))
+    about = _about(step.change.effect)
+    if step.change.parameter in declared:
+        about = f"{step.change.parameter}: {declared[step.change.parameter]['about']}. {about}"
+    return _Card(answer.title(step.change), step, _KINDS.get(step.change.kind, step.change.kind), about, numbers)
+
+
+def _shown(value: Value, declared: str) -> tuple[str, str]:
+    """(a value, its 95 % interval) for people."""
+    if declared == "bool":
+        return ("yes" if value.value else "no"), ""
+    interval = ""
+    if value.low is not None and value.high is not None:
+        interval = f"{_quantity(value.low, value.unit)} to {_quantity(value.high, value.unit)}"
+    return _quantity(value.value, value.unit), interval
+
+
+def _quantity(value: float, unit: str, digits: int = 4) -> str:
+    return units.show(value, unit, digits) if unit and units.is_known(unit) else f"{value:.{digits}g}"
+
+
+def _limit(entry: Mapping[str, Any]) -> tuple[str, str]:
+    """(upper limit, what the parameter is)."""
+    own = _described(entry["effect"])["parameters"].get(entry["parameter"], {})
+    return _quantity(entry["upper_limit_95"], own.get("unit", ""), 2), own.get("about", "")
+
+
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+
+def _checked(trace: Trace) -> _Card:
+    earlier, now = (
+        np.clip(figures.finite(z), -_BEYOND, _BEYOND) for z in (trace.residuals_before, trace.residuals_after)
+    )
+    picture = None
+    if now.size:
+        before, after, spread = (figures.finite(values) for values in (trace.before, trace.after, trace.spread))
+        worst = int(np.argmax(np.abs(earlier)))
+        cells = Cells(trace.statistic, trace.summary, after, spread, now, worst, before, earlier)
+        words = f"{trace.statistic} of {trace.capture}: measured, model before, model after"
+        picture = figures.picture(cells, words)
+    squares = [float(np.mean(z**2)) if z.size else 0.0 for z in (earlier, now)]
+    return _Card(title_of(trace.statistic), trace=trace, picture=picture, before=squares[0], after=squares[1])
+
+
+def _ladder_picture(rows: Sequence[Mapping[str, Any]], floor: float, width: float) -> Picture:
+    words = ", ".join(f"{row['model']}: {number(row['misfit'])}" for row in rows)
+    words = f"The ladder of errors: misfit of each model. {words}; noise floor: {number(floor)}"
+    return Picture(figures.drawn(_draw_ladder, rows, floor, width), words)
+
+
+def _draw_ladder(figure: Figure, rows: Sequence[Mapping[str, Any]], floor: float, width: float) -> None:
+    """Misfits as bars on a logarithmic axis, each fall between two of them; the noise floor; the placebo aside."""
+    misfits = np.array([min(max(float(row["misfit"]), 1e-3), 1e12) for row in rows])
+    floor = max(floor, 1e-3)
+    aside = np.array([bool(row["placebo"]) for row in rows])
+    x = np.arange(len(rows)) + 0.3 * aside
+    low, high = min(0.5, 0.6 * float(misfits.min()), 0.6 * floor), max(float(misfits.max()), floor)
+    high *= (high / low) ** 0.12
+    names = [_broken(str(row["model"])) for row in rows]
+    longest = max(len(line) for name in names for line in name.split("\n"))
+    tight = (width - 1.3) / (float(x[-1]) + 1) < _LETTER * longest
+    figure.set_size_inches(width, 4.6 if tight else 3.9)
+    axes = figure.subplots()
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    axes.set_xlim(-0.5, float(x[-1]) + 0.5)
+    axes.axhspan(low, floor, color=_FLOOR, linewidth=0, zorder=0)
+    axes.axhline(floor, color=_REACHED, linewidth=1.2, linestyle=(0, (5, 3)), zorder=3)
+    axes.annotate(
+        f"noise\nfloor\n{number(floor)}",
+        (1.0, floor),
+        xycoords=("axes fraction", "data"),
+        xytext=(5, 0),
+        textcoords="offset points",
+        va="center",
+        color=_REACHED,
+    )
+    for at, misfit, placebo in zip(x, misfits, aside, strict=True):
+        reached = misfit <= floor
+        colour = _PLACEBO if placebo else _REACHED if reached else _ABOVE
+        axes.bar(at, misfit - low, bottom=low, width=0.62, color=colour, linewidth=0, zorder=2)
+        axes.annotate(
+            number(misfit),
+            (at, max(misfit, floor) if misfit > 0.6 * floor else misfit),  # not across the line
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            color=ROUGH if placebo else _REACHED if reached else MEASURED,
+            fontweight="normal" if placebo else "bold",
+            fontsize=11,
+            zorder=4,
+        )
+    steps = misfits[~aside]
+    for k, (before, after) in enumerate(itertools.pairwise(steps)):
+        if math.log(before / max(after, floor)) < 0.18 * math.log(high / low):
+            continue  # no room for an arrow
+        axes.plot([k + 0.31, k + 1.12], [before, before], color=ROUGH, linewidth=0.8, linestyle=(0, (2, 2)))
+        arrow = {"arrowstyle": "-|>", "color": ROUGH, "shrinkA": 0, "shrinkB": 18, "linewidth": 1.1}
+        axes.annotate("", (k + 1, max(after, floor)), xytext=(k + 1, before), arrowprops=arrow, zorder=4)
+    turned: dict[str, Any] = {}
+    if tight:
+        names = [figures.shortened(str(row["model"]), 32) for row in rows]
+        turned = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(x, names, **turned)
+    axes.tick_params(axis="x", length=0, labelcolor=MEASURED)
+    axes.set_ylabel("misfit")
+    figures.powers(axes.yaxis)
+
+
+def _broken(name: str) -> str:
+    """A name in lines that fit below a bar."""
+    lines = [""]
+    for part in re.split(r"(?<=[ _.:])", figures.shortened(name, 60)):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > _LINE:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.strip() for line in lines)
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+_TEMPLATE = """\
+{% extends "frame" %}
+{% block title %}{{ found.sensor }} beside {{ found.measurement }}: {{ verdict | lower }}{% endblock %}
+{% block kind %}Diagnosis of a model by a measurement{% endblock %}
+{% block style %}
+main { max-width: 1160px; }
+.verdict.open { border-left-color: #d98a1f; }
+.ladder { display: grid; grid-template-columns: minmax(0, 10fr) minmax(0, 11fr); gap: 20px; align-items: start; }
+.ladder figure { background: #fff; border: 1px solid #dfe2e4; padding: 10px 12px; margin: 0; }
+.ladder img { width: 100%; height: auto; display: block; }
+.ladder .narrow { display: none; }
+.rungs td:not(:first-child), .rungs th:not(:first-child) { text-align: right; font-variant-numeric: tabular-nums; }
+.rungs td:first-child { min-width: 8.5em; overflow-wrap: break-word; }
+.rungs th { overflow-wrap: normal; padding: 3px 5px; } .rungs td:not(:first-child) { white-space: nowrap; }
+.rungs .placebo td { color: #77818a; }
+.rungs .floor td { border-top: 2px dashed #4b8b62; color: #3d7350; }
+.list th { overflow-wrap: normal; }
+.list td:first-child { min-width: 9em; overflow-wrap: break-word; } .remains td:last-child { min-width: 10em; }
+.list .figure { white-space: nowrap; font-variant-numeric: tabular-nums; }
+.chosen td { font-weight: 600; }
+.beside { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
+.fall { font-size: 1.5rem; font-weight: 650; font-variant-numeric: tabular-nums; }
+@media (max-width: 900px) { .ladder, .beside { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
+@media (max-width: 600px) {
+  main { padding: 16px 12px 40px; }
+  h1 { font-size: 1.35rem; }
+  .ladder .narrow { display: block; } .ladder .broad { display: none; }
+  .facts { grid-template-columns: 1fr; } .facts dd { margin-bottom: .4rem; }
+  .card { padding: 12px 12px 8px; }
+  .pan { overflow-x: auto; } .pan img { min-width: 620px; }
+}
+{% endblock %}
+{% block body %}
+<section class="verdict {{ look }}">
+<h1>{{ verdict }}: {{ sentence }}</h1>
+<p class="lead">{% if found.steps %}\
+The misfit {{ "fell" if found.after < found.before else "went" }} from <b>{{ found.before | number }}</b> to \
+<b>{{ found.after | number }}</b>{% else %}The misfit is <b>{{ found.before | number }}</b>{% endif %}; \
+chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 100 measurements.</p>
+<p class="small">{{ found.sensor or "A sensor without a name" }} beside {{ found.measurement }}\
+{% if next %} &middot; the next model lies beside this page: <b>{{ next }}</b>{% endif %}\
+{% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
+</section>
+
+{% if ladder %}
+<h2>The ladder of errors</h2>
+<div class="ladder">
+<figure><img class="broad" src="{{ broad.source }}" alt="{{ broad.alternative }}">\
+<img class="narrow" src="{{ narrow.source }}" alt="{{ narrow.alternative }}"></figure>
+<div class="wide"><table class="rungs">
+<thead><tr><th>model</th><th>misfit</th>\
+{% for label in columns.values() %}<th>{{ label }}, %</th>{% endfor %}</tr></thead>
+<tbody>
+{% for row in ladder %}
+<tr{% if row.placebo %} class="placebo"{% endif %}><td>{{ row.model }}</td>\
+<td{% if row.misfit <= found.null_95 and not row.placebo %} class="passes"{% endif %}>{{ row.misfit | number }}</td>\
+{% for key in columns %}<td>{{ "%.3f" | format(100 * row.errors.get(key, 0.0)) }}</td>{% endfor %}</tr>
+{% endfor %}
+<tr class="floor"><td>noise floor (95 %)</td><td>{{ found.null_95 | number }}</td>\
+{% for key in columns %}<td></td>{% endfor %}</tr>
+</tbody></table>
+</div>
+</div>
+<p class="small">The misfit is the mean squared difference between data and model in units of the model's own scatter,
+on captures that the model was not settled by; it can hardly fall below 1. A bar that reaches the dashed line is as
+good as a right model.{% for row in ladder if row.placebo %} The placebo is an effect that has nothing to do with it,
+at the strength that suits it best: that much falls whatever is added.{% endfor %} The columns say what is still wrong,
+in physical units.</p>
+{% endif %}
+
+{% if steps %}
+<h2>What is missing</h2>
+{% for card in steps %}
+<section class="card">
+<h3>{{ loop.index }}. {{ card.title }}</h3>
+<p class="tag">{{ card.kind }} &middot; <b>{{ "%.1f" | format(card.step.significance) }} sigma</b> &middot; \
+<b>{{ card.step.material }}</b> &middot; misfit with it <b>{{ card.step.misfit | number }}</b></p>
+{% if card.about %}<p>{{ card.about }}</p>{% endif %}
+<div class="beside">
+{% if card.numbers %}
+<div class="wide"><table class="list">
+<thead><tr><th>parameter</th><th>value, 95 % interval</th></tr></thead>
+<tbody>
+{% for n in card.numbers %}
+<tr><td><b>{{ n.name }}</b>{% if n.about %}<br><span class="small">{{ n.about }}</span>{% endif %}</td>\
+<td class="figure"><b>{{ n.value }}</b>{% if n.interval %}<br><span class="small">{{ n.interval }}</span>{% endif %}\
+</td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+{% if card.step.alternatives %}
+<div class="wide"><table class="list">
+<thead><tr><th>tried in its place</th><th>misfit that it leaves</th></tr></thead>
+<tbody>
+<tr class="chosen"><td>{{ card.title }} (chosen)</td><td class="figure">{{ card.step.misfit | number }}</td></tr>
+{% for other in card.step.alternatives %}
+<tr><td>{{ name(other) }}\
+{% if about(other.effect) %}<br><span class="small">{{ about(other.effect) }}</span>{% endif %}</td>\
+<td class="figure">{{ other.misfit | number }}</td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+</div>
+</section>
+{% endfor %}
+{% endif %}
+
+{% if found.setup or found.nuisances %}
+<h2>The set-up</h2>
+{% if found.setup %}
+<div class="wide"><table class="list">
+<thead><tr><th>capture</th><th>what is not as stated</th><th>factor</th><th>95 % interval</th></tr></thead>
+<tbody>
+{% for entry in found.setup %}
+<tr><td>{{ entry.capture or "all" }}</td><td>{{ "or " if entry.confused }}{{ entry.quantity }}</td>\
+<td class="figure"><b>{{ "%.4f" | format(entry.factor.value) }}</b></td>\
+<td class="figure">{{ "%.4f" | format(entry.factor.low) }} to {{ "%.4f" | format(entry.factor.high) }}</td></tr>
+{% endfor %}
+</tbody></table></div>
+{% if found.setup | selectattr("confused") | list %}
+<p class="small">Those that begin with "or" cannot be told apart by this measurement: any of them is enough.</p>
+{% endif %}
+{% endif %}
+{% if found.nuisances %}
+<p class="small">How bright it was is known only so well, and so it is adjusted; the pull tells by how many of its own
+uncertainties. Beyond 3, what is stated should be doubted.</p>
+<div class="wide"><table class="list">
+<thead><tr><th>light of</th><th>factor on what is stated</th><th>95 % interval</th><th>pull</th></tr></thead>
+<tbody>
+{% for n in found.nuisances[:200] %}
+<tr><td>{{ n.capture or "all lit captures" }}</td><td class="figure">{{ "%.4f" | format(n.value) }}</td>\
+<td class="figure">{{ "%.4f" | format(n.low) }} to {{ "%.4f" | format(n.high) }}</td>\
+<td class="figure{{ ' fails' if n.pull | abs > 3 }}">{{ "%+.1f" | format(n.pull) }}</td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+{% endif %}
+
+{% if traces %}
+<h2>The clearest checks, before and after</h2>
+<p class="small">Dark dots or a dark line are measured, orange is the model as it was, blue the model as it is now; the
+light blue band holds 95 % of its own scatter. Below, or to the right: how far both models are from the data, in units
+of their own scatter. A ring marks where the first model failed most clearly.</p>
+{% for card in traces %}
+<section class="card">
+<h3>{{ card.title }}</h3>
+<p class="tag"><b>{{ card.trace.statistic }}</b> of <b>{{ card.trace.capture or "all captures" }}</b> &middot; mean \
+squared residual {{ card.before | number }} before, <b>{{ card.after | number }}</b> after</p>
+{% if card.picture %}
+<div class="pan"><img src="{{ card.picture.source }}" alt="{{ card.picture.alternative }}"></div>
+{% if card.picture.note %}<p class="small">{{ card.picture.note }}</p>{% endif %}
+{% endif %}
+</section>
+{% endfor %}
+{% endif %}
+
+{% if remains %}
+<h2>What remains</h2>
+<p>What it is like: {{ mechanism }}.</p>
+<div class="wide"><table class="list remains">
+<thead><tr><th>statistic</th><th>capture</th><th>significance</th><th>where it is clearest</th></tr></thead>
+<tbody>
+{% for entry in remains %}
+<tr><td><b>{{ entry.statistic }}</b>\
+{% if loop.changed(entry.statistic) %}<br><span class="small">{{ titles[entry.statistic] }}</span>{% endif %}</td>\
+<td>{{ entry.capture or "all" }}</td>\
+<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td><td>{{ entry.where }}</td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+
+{% if found.advice %}
+<h2>What to measure next</h2>
+{% for one in found.advice %}
+<section class="card">
+<h3>To tell {{ one.separates | join(" from ") }}: take {{ one.capture }}</h3>
+<p class="tag">They are <b>{{ "%.1f" | format(one.significance_now) }} sigma</b> apart now, and would be \
+<b>{{ "%.1f" | format(one.significance_then) }} sigma</b> apart with it.</p>
+</section>
+{% endfor %}
+{% endif %}
+
+{% if limits %}
+<h2>What is not there</h2>
+<p class="small">Had any of these been stronger than this, it would have been seen (95 % upper limits).</p>
+<div class="wide"><table class="list">
+<thead><tr><th>effect</th><th>parameter</th><th>at most</th></tr></thead>
+<tbody>
+{% for entry, limit, meaning in limits %}
+<tr><td><b>{{ entry.effect }}</b><br><span class="small">{{ about(entry.effect) }}</span></td>\
+<td>{{ entry.parameter }}{% if meaning %}<br><span class="small">{{ meaning }}</span>{% endif %}</td>\
+<td class="figure"><b>{{ limit }}</b></td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+
+{% if hidden %}
+<h2>What this measurement cannot show</h2>
+<dl class="words">
+{% for effect, meaning in hidden %}
+<dt>{{ effect }}</dt><dd>{{ meaning }}</dd>
+{% endfor %}
+</dl>
+{% endif %}
+
+<h2>Words</h2>
+<dl class="words">
+<dt>misfit</dt><dd>The mean, over all statistics of all captures, of the squared difference between data and model in
+units of the model's own scatter. 1 is what the model's own simulations have; 4 means that data and model are typically
+twice as far apart as chance makes them.</dd>
+<dt>noise floor</dt><dd>95 of 100 measurements of a right model have a misfit below this.</dd>
+<dt>mean rate, map, linearity, intervals, neighbours</dt><dd>What is still wrong in physical units: the rates of the
+captures; the rate of a typical pixel; the largest deviation of one light level from the others; the share of intervals
+between detections that stand elsewhere; the share of detections whose neighbours fire too often or too seldom.</dd>
+<dt>sigma</dt><dd>One standard deviation of what chance does. Of a step: how unlikely it is that chance alone makes its
+effect look so helpful, with all that was tried allowed for.</dd>
+<dt>95 % interval</dt><dd>The range of values that the data bear with.</dd>
+<dt>placebo</dt><dd>An effect that has nothing to do with it, added all the same: that much falls by itself.</dd>
+<dt>set-up</dt><dd>Light level, exposure, wavelength, a leak in a dark capture: what the measurement states of itself.
+Where it explains everything, the sensor is not to blame.</dd>
+</dl>
+{% endblock %}
+"""
