@@ -709,6 +709,7 @@ def diagnose(
         from . import pages
 
         pages.check_place(output, "diagnosis")
+        next_sensor.check_place(sensor, output / "sensor.yaml")
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
         with _writing(output):
@@ -762,6 +763,7 @@ def fit(
 
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    next_sensor.check_place(sensor, output)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
     with _writing(output):
         found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found)))

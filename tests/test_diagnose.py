@@ -96,7 +96,7 @@ def test_candidates_come_from_the_registry(tmp_path):
     for name in Effect.registry:
         if name not in {e.name for e in sensor.effects}:
             declared = Effect.registry.find(name).parameters.values()
-            can = [p for p in declared if p.off is not None and p.search is not None and p.per != "code"]
+            can = [p for p in declared if p.off is not None and p.search is not None]
             assert bool(can) == (f"add {name}" in names), name
 
 

@@ -9,6 +9,7 @@ uncertainty, is a check of its own.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import textwrap
@@ -20,6 +21,7 @@ import numpy as np
 from joblib import Parallel
 from scipy import stats
 
+from .. import units
 from ..measurement import Measurement
 from ..recording import Capture
 from ..sensor import Sensor
@@ -30,6 +32,8 @@ from .recordings import REPLICATES, CaptureNull, model_of, reduced, statistics_f
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
 _SHARES = {"light": 0.25, "rate": 0.25}  # of the false alarms that are allowed
 _REST = 0.5
+_MAP = "pixel_map"
+_ENOUGH = 20.0  # detections of a pixel from which on its ratio says something
 _LEAST_P = 1e-300  # a p-value is never 0
 
 
@@ -196,6 +200,7 @@ def compare(
                     judged.append((judgement, null))
     nuisances, common = light_of(levels, captures)
     checks += common
+    checks += _between_wavelengths(captures, checks, sensor.layout.columns)
     checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
     # of means alone there are no statistics: their totals stand in
     squares = [j.misfit for j, _ in judged] or [c.misfit for c in checks if c.statistic == "rate"]
@@ -213,6 +218,40 @@ def compare(
         replicates,
         tolerance,
     )
+
+
+def _between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], columns: int) -> list[Check]:
+    """Do the pixels keep their ratios from one wavelength to the next? Of each, the capture with most detections."""
+    best: dict[float, tuple[float, Check]] = {}
+    for capture in captures:
+        wave = capture.light.wavelength
+        found = next((c for c in checks if c.capture == capture.id and c.statistic == _MAP), None)
+        if wave is None or found is None or found.judgement is None:
+            continue
+        total = float(found.judgement.expected.sum())
+        if wave not in best or total > best[wave][0]:
+            best[wave] = total, found
+    out = []
+    waves = sorted(best)
+    for short, long in itertools.pairwise(waves):
+        one, other = best[short][1].judgement, best[long][1].judgement
+        if one is None or other is None or one.expected.size != other.expected.size or one.expected.min() < _ENOUGH:
+            continue
+        if other.expected.min() < _ENOUGH:
+            continue
+        widths = [j.spread / j.expected for j in (one, other)]
+        apart = other.residuals * widths[1] - one.residuals * widths[0]
+        z = apart / np.hypot(*widths)
+        worst = int(np.argmax(np.abs(z)))
+        square = float(np.mean(z**2))
+        p_sum = float(stats.chi2.sf(square * z.size, z.size))
+        p_cell = min(1.0, 2 * z.size * float(stats.norm.sf(abs(float(z[worst])))))
+        place = f"row {worst // columns}, column {worst % columns}"
+        names = " beside ".join(units.show(wave, "m") for wave in (long, short))
+        size = f"{float(apart[worst]):+.2%} in the worst pixel"
+        p = min(1.0, 2 * min(p_sum, p_cell))
+        out.append(Check("wavelength_ratio", None, square, p, f"{place}, {names}", size, float(apart[worst])))
+    return out
 
 
 @dataclass

@@ -596,14 +596,8 @@ def blocks(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> 
         if cell == RATES:
             out += [Block(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)]
             continue
-        null = state.nulls[cell]
-        square = float(np.mean(z**2))
-        mean, variance = max(float(null.own.mean()), 0.05), float(null.own.var(ddof=1))
-        shape = mean**2 / max(variance, 1e-12 * mean**2 + 1e-300)
-        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
-        worst = int(np.argmax(np.abs(z)))
-        p_cell = min(1.0, z.size * 2 * float(stats.norm.sf(abs(z[worst]) / null.tail)))
-        out.append(Block(cell, min(1.0, 2 * min(p_sum, p_cell)), worst, float(z[worst])))
+        p, worst = state.nulls[cell].chance(z)
+        out.append(Block(cell, p, worst, float(z[worst])))
     out += [Block(cell, 1e-12, 0, 40.0) for cell in state.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 

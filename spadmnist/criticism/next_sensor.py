@@ -12,10 +12,16 @@ import numpy as np
 
 from .. import config, disk, document, units
 from ..effects import Effect
-from ..errors import SpadError
+from ..errors import InputError, SpadError
 from .candidates import Key
 
 Notes = Mapping[Key, str]
+
+
+def check_place(source: Path, out: Path) -> None:
+    """Raise InputError where the next sensor file would take the place of the one that it is made from."""
+    if out.exists() and source.exists() and out.samefile(source):
+        raise InputError(f"{out} is the sensor file itself, which stays as it is; name another folder or file with -o")
 
 
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> Path:

@@ -79,6 +79,12 @@ class Null:
             worst = int(np.argmax(wrong))
             p = 1e-12 if wrong.any() else 1.0
             return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
+        p, worst = self.chance(z)
+        mean = max(float(self.own.mean()), 0.05)
+        return Judgement(p, float(np.mean(z**2)) / mean, z, expected, spread, worst)
+
+    def chance(self, z: np.ndarray) -> tuple[float, int]:
+        """(p-value of residuals, by their sum of squares or their largest; which is the largest)."""
         square = float(np.mean(z**2))
         mean, variance = max(float(self.own.mean()), 0.05), float(self.own.var(ddof=1))
         # a variance of so many recordings may be too small by about so much; then rare values would look too rare
@@ -88,8 +94,7 @@ class Null:
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
-        p = min(1.0, 2 * min(p_sum, p_cell))
-        return Judgement(p, square / mean, z, expected, spread, worst)
+        return min(1.0, 2 * min(p_sum, p_cell)), worst
 
     def spread_at(self, expected: np.ndarray) -> np.ndarray:
         if self.law == "poisson":

@@ -35,6 +35,7 @@ _MAP = "pixel_map"
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
+_SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
 _LINE = 4.5  # standard deviations of a line in a spectrum
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _LINES = 2  # frequencies that are
@@ -263,7 +264,13 @@ class Search:
             if change.strengths or change.fixed:
                 tries += [(change, tried) for tried in self.begun(state, change)]
         if not only_rates:
-            out = self._looked_at(state, tries, () if everywhere else self.telling(state))
+            some = () if everywhere else self.telling(state)
+            out = self._looked_at(state, tries, some)
+            # what leaves no trace yet may do so when it is stronger
+            silent = [(t.change, up) for t in out if self.size(state, t.moved) < _SILENT and (up := _stronger(t))]
+            found = self._looked_at(state, silent, some) if silent else []
+            raised = {(one.change.name, _shape(one)) for one in found}
+            out = [t for t in out if (t.change.name, _shape(t)) not in raised] + found
         else:
             out = []
             for change, tried in tries:
@@ -585,6 +592,20 @@ def _spread_chance(data: np.ndarray, usual: np.ndarray) -> float:
     wide = max(1.0, float(np.sqrt(mean)))
     p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
     return min(1.0, 2 * min(p_sum, p_cell))
+
+
+def _stronger(one: Tried) -> dict[Key, Any] | None:
+    """The values of a candidate at several times its strength, or nothing where it cannot be stronger."""
+    out = dict(one.values)
+    for dial in one.change.strengths:
+        if dial.key in out and one.change.kind == "add" and out[dial.key] != dial.off:
+            out[dial.key] = dial.scaled(float(out[dial.key]), _RAISED)
+    return out if out != one.values else None
+
+
+def _shape(one: Tried) -> tuple[Any, ...]:
+    """What tells a candidate's templates apart, but for their strength."""
+    return tuple(one.values.get(dial.key) for dial in one.change.shapes)
 
 
 def _lines_of(change: Change) -> list[Dial]:

@@ -79,6 +79,7 @@ def explanations(bench: Bench, state: State) -> list[Explanation]:
     clocks = sorted({captures[i].conditions.frame_time for i in ids if captures[i].modality != "tr"})
     for clock in clocks if len(clocks) > 1 else []:
         shared.append(Factor("exposure", tuple(i for i in ids if captures[i].conditions.frame_time == clock), True))
+    shared = [factor for factor in shared if len(factor.captures) > 1]
     tries: list[tuple[Factor, ...]] = [(one,) for one in [*shared, *single]]
     tries += [pair for pair in itertools.combinations([*shared, *single], 2) if not _overlap(pair)]
     if lit:  # whatever the light was in each of them
@@ -226,7 +227,7 @@ def stopped_early(bench: Bench) -> dict[str, tuple[float, float]]:
     for id, seen in bench.seen.items():
         if seen.last is None or seen.total < 2:
             continue
-        share = seen.last / seen.capture.conditions.exposure
+        share = seen.last * (1 + 1 / seen.total) / seen.capture.conditions.exposure
         if seen.total * (1 - share) / max(share, 1e-9) > _SILENT:
             out[id] = share, share / seen.total
     return out

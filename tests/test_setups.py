@@ -1,0 +1,200 @@
+"""Set-up against sensor: totals that the laboratory explains, and what the paper's own means say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spadmnist import config
+from spadmnist import measurement as measurements
+from spadmnist.criticism import compare, diagnose, next_sensor
+from spadmnist.errors import InputError
+from spadmnist.measurement import Measurement
+
+SENSOR = """sensor:
+  name: SPAD512
+  rules: paper
+  layout: {rows: 16, columns: 16, pixel_area: 276.923 um^2, fill_factor: 0.13}
+  effects:
+    detection: {pdp: {500 nm: 0.444, 700 nm: 0.207}}
+    dark_counts: {rate: 265 Hz}
+"""
+
+CAPTURE = (
+    "  - {{id: {id}, modality: qis, light: {light}, frames: 10000, frame_time: {t}, frame_period: {t}, mean: {mean}}}\n"
+)
+LIGHT = "{{kind: flat, wavelength: {wave}, irradiance: {level} nW/cm^2, relative_uncertainty: {error}}}"
+
+
+def measured(folder: Path, means: dict[str, tuple[str, float | None, str, float]], error: float = 0.015) -> Measurement:
+    """means: by id, (wavelength, nW/cm^2 or None in the dark, frame time, mean)."""
+    folder.mkdir(exist_ok=True)
+    text = "format: spadmnist-measurement/1\nname: means\nlayout: {rows: 16, columns: 16}\ncaptures:\n"
+    for id, (wave, level, t, mean) in means.items():
+        light = "{kind: dark}" if level is None else LIGHT.format(wave=wave, level=level, error=error)
+        text += CAPTURE.format(id=id, light=light, t=t, mean=mean)
+    (folder / "measurement.yaml").write_text(text)
+    (folder / "sensor.yaml").write_text(SENSOR)
+    return measurements.open(folder)
+
+
+# Levels at which this sensor has the means that the paper simulated (457, 60, 9740, 4184): the means that it measured
+# are 470, 62, 9715 and 4011. Suonsivu et al., captions of the SPAD512 figures.
+PAPER = {
+    "dark": ("", None, "1 us", 2.6),
+    "low-500": ("500 nm", 115.7, "1 us", 470),
+    "low-700": ("700 nm", 21.95, "1 us", 62),
+    "high-500": ("500 nm", 906.6, "10 us", 9715),
+    "high-700": ("700 nm", 205.4, "10 us", 4011),
+}
+
+
+def test_the_papers_means_are_a_matter_of_the_set_up(tmp_path):
+    data = measured(tmp_path, PAPER)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    assert compare.compare(sensor, data, jobs=1).verdict == "fails"
+    found = diagnose.diagnose(sensor, data, quick=True, jobs=1)
+    assert found.verdict == "setup" and not found.steps
+    # opposite signs at low and high light: light or exposure, which these captures cannot tell apart
+    assert {e["quantity"] for e in found.setup} == {"light", "exposure"} and all(e["confused"] for e in found.setup)
+    factors = {e["capture"]: e["factor"]["value"] for e in found.setup}
+    low = [f for id, f in factors.items() if id.startswith("low")] or [1.0]
+    high = [f for id, f in factors.items() if id.startswith("high")] or [1.0]
+    assert max(high) < min(low)
+    # the same light with the other frame time would tell
+    (wanted,) = found.advice
+    assert wanted["separates"] == ["light", "exposure"] and "frame time of" in wanted["capture"]
+    assert wanted["significance_then"] > 5 > wanted["significance_now"]
+
+
+def test_means_that_the_model_has_are_adequate(tmp_path):
+    means = {"low-500": 457, "low-700": 60, "high-500": 9740, "high-700": 4184, "dark": 2.65}
+    data = measured(tmp_path, {id: (*PAPER[id][:3], mean) for id, mean in means.items()})
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    assert compare.compare(sensor, data, jobs=1).verdict == "adequate"
+    assert diagnose.diagnose(sensor, data, quick=True, jobs=1).verdict == "adequate"
+
+
+@pytest.mark.parametrize("factor", [1.08, 0.92])
+def test_a_light_level_beyond_its_uncertainty_is_no_pdp(tmp_path, factor):
+    means = {id: (*PAPER[id][:3], mean) for id, mean in {"low-500": 457, "low-700": 60, "high-700": 4184}.items()}
+    scaled = {id: (wave, level / factor, t, mean) for id, (wave, level, t, mean) in means.items()}
+    data = measured(tmp_path, {"dark": PAPER["dark"], **scaled})
+    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    assert found.verdict in ("setup", "confused")  # a dark capture of 2.6 counts hardly tells a shorter gate
+    named = [e for e in found.setup if e["quantity"] == "light"]
+    assert len(named) == 3 and all(e["factor"]["value"] == pytest.approx(factor, rel=0.03) for e in named)
+    assert not any(s.change.effect == "detection" for s in found.steps)
+
+
+def test_a_capture_at_another_wavelength_is_named(tmp_path):
+    # 700 nm noted, 500 nm in truth: more detections by what the photons' energy and the PDP do
+    ratio = (500 / 700) * 0.444 / 0.207
+    means = {
+        "dark": PAPER["dark"],
+        "low-500": ("500 nm", 115.7, "1 us", 457),
+        "high-500": ("500 nm", 906.6, "10 us", 9740),
+    }
+    means["low-700"] = ("700 nm", 21.95 / ratio, "1 us", 60)
+    data = measured(tmp_path, means)
+    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    assert found.verdict == "setup"
+    (entry,) = found.setup
+    assert (entry["capture"], entry["quantity"], entry["confused"]) == ("low-700", "wavelength", False)
+    assert entry["factor"]["low"] < ratio < entry["factor"]["high"]
+
+
+TR = """sensor:
+  name: small
+  rules: device
+  layout: {rows: 8, columns: 8, pixel_area: 25 um^2, fill_factor: 1.0}
+  effects:
+    detection: {pdp: 0.42}
+    dark_counts: {rate: 100 Hz}
+    dead_time: {duration: 50 ns}
+    tdc: {resolution: 100 ps}
+"""
+
+LAB = """format: spadmnist-measurement/1
+name: lab
+layout: {rows: 8, columns: 8}
+captures:
+  - {id: dark, file: dark.h5, modality: tr, light: {kind: dark}, exposure: 1 s}
+  - {id: dim, file: dim.h5, modality: tr, exposure: 400 ms,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 0.8 nW/cm^2, relative_uncertainty: 0.02}}
+  - {id: flat, file: flat.h5, modality: tr, exposure: 20 ms,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 20 nW/cm^2, relative_uncertainty: 0.02}}
+"""
+
+
+def lab(folder: Path, extra: str = "", plan: str = LAB, seed: int = 0) -> Measurement:
+    """A measurement of the small sensor with an effect more, made from a plan without any file."""
+    from spadmnist import twin
+
+    folder.mkdir(exist_ok=True)
+    (folder / "plan.yaml").write_text(plan)
+    (folder / "sensor.yaml").write_text(TR)
+    (folder / "truth.yaml").write_text(TR + extra)
+    plan_ = measurements.open(folder / "plan.yaml", planned=True)
+    return measurements.open(twin.simulate(config.read_sensor(folder / "truth.yaml"), plan_, folder / "lab", seed))
+
+
+def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
+    data = lab(tmp_path, plan=LAB.replace("400 ms", "360 ms"))
+    text = (tmp_path / "lab" / "measurement.yaml").read_text()
+    assert "360 ms" in text
+    (tmp_path / "lab" / "measurement.yaml").write_text(text.replace("360 ms", "400 ms"))
+    data = measurements.open(tmp_path / "lab")
+    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    assert found.verdict == "setup"
+    (entry,) = found.setup
+    assert (entry["capture"], entry["quantity"]) == ("dim", "exposure")
+    assert entry["factor"]["low"] <= 0.9 <= entry["factor"]["high"]
+
+
+def test_what_swings_is_found_with_its_frequency_and_its_phases(tmp_path):
+    data = lab(tmp_path, "    flicker: {amplitude: 0.4, frequency: 120 Hz, phase: 1 rad}\n")
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    assert compare.compare(sensor, data, jobs=1, replicates=48).verdict == "fails"
+    found = diagnose.diagnose(sensor, data, quick=True, jobs=1)
+    assert [s.change.name for s in found.steps] == ["add flicker"] and found.verdict == "explained"
+    values = found.steps[0].values
+    assert values["amplitude"].value == pytest.approx(0.4, rel=0.15)
+    assert values["frequency"].low < 120 < values["frequency"].high
+
+
+def test_a_model_that_swings_is_not_wrong_for_its_phase(tmp_path):
+    """Nobody knows where a lamp's phase is when a capture begins."""
+    data = lab(tmp_path, "    flicker: {amplitude: 0.4, frequency: 120 Hz, phase: 2.5 rad}\n")
+    other = TR + "    flicker: {amplitude: 0.4, frequency: 120 Hz}\n"
+    (tmp_path / "other.yaml").write_text(other)
+    sensor = config.read_sensor(tmp_path / "other.yaml")
+    assert compare.compare(sensor, data, jobs=1, replicates=64).verdict == "adequate"
+
+
+def test_pixels_that_differ_at_one_wavelength_alone(tmp_path):
+    """The ratio of the maps tells, and only where there are two wavelengths."""
+    data = lab(tmp_path)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    known = compare.compare(sensor, data, jobs=1, replicates=32)
+    assert not [c for c in known.checks if c.statistic == "wavelength_ratio"]
+    (map_,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "flat"]
+    (dim,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "dim"]
+    captures = [c for c in data.captures if c.id != "dark"]
+    red = replace(captures[0], light=replace(captures[0].light, wavelength=700e-9))
+    (check,) = compare._between_wavelengths([red, captures[1]], [map_, dim], 8)
+    assert check.p_value > 1e-3
+    shifted = replace(dim.judgement, residuals=dim.judgement.residuals + np.where(np.arange(64) == 17, 8.0, 0.0))
+    (check,) = compare._between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
+    assert check.p_value < 1e-6 and "row 2, column 1" in check.where
+
+
+def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):
+    file = tmp_path / "sensor.yaml"
+    file.write_text(TR)
+    with pytest.raises(InputError, match="stays as it is"):
+        next_sensor.check_place(file, tmp_path / "." / "sensor.yaml")
+    next_sensor.check_place(file, tmp_path / "next" / "sensor.yaml")
