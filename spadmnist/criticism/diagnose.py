@@ -32,7 +32,8 @@ _LEAST_P = 1e-300
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _LEAST_GAIN = 12.0  # in chi square, of a step
-_TRACE = 0.004  # p-value of a trace that is followed where no check fails by itself
+_TRACE = 5e-4  # p-value of a trace that is followed where no check fails by itself
+_TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -56,6 +57,16 @@ class _Course:
     @property
     def misfit(self) -> float:
         return fit.misfit(self.state, self.judged or self.state.residuals)
+
+    def kept(self) -> tuple[Any, ...]:
+        """All that a step changes."""
+        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.settled, self.judged)
+        return (*own, list(self.search.accepted), dict(self.search.phases))
+
+    def back_to(self, kept: tuple[Any, ...]) -> None:
+        """As it was before a step."""
+        self.state, self.values, self.steps, self.ladder, self.settled, self.judged = kept[:6]
+        self.search.accepted, self.search.phases = kept[6:]
 
     def rung(self, name: str) -> None:
         errors = errors_of(self.bench, self.state, self.judged or self.state.residuals)
@@ -147,14 +158,17 @@ def _diagnosed(
         refined = [search.refine(course.state, one) for one in worth]
         best = refined[0] if is_pattern(refined[0]) else max(refined, key=lambda t: t.gain)
         significance, p = search.calibrated(course.state, tried, best)
-        if p > comparing.FALSE_ALARM or best.gain < _LEAST_GAIN:
+        if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (_LEAST_GAIN if failed else _TRACE_GAIN):
             break
-        before = course.state
+        before, earlier = course.state, course.kept()
         fell = course.misfit
         new = _accept(course, best, significance)
         new[0].alternatives = _alternatives(bench, before, best, refined, second)
         named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
         placebo = placebo or placebo_row(bench, before, tried, best, named)
+        if not failed and course.failed:
+            course.back_to(earlier)  # nothing was wrong before, now something is
+            break
         if failed and fell - course.misfit < 0.05 * (fell - 1):
             break
     if course.steps:

@@ -81,11 +81,15 @@ class State:
 
 @dataclass
 class Moved:
-    """What another model does: by how much each cell's expectation shifts, and the residuals that it leaves."""
+    """What another model does: by how much each cell's expectation shifts, and the residuals that it leaves.
+
+    nothing: it does nothing at all in these captures, whatever its strength.
+    """
 
     shifts: dict[Cell, np.ndarray]
     noise: dict[Cell, float]
     logs: dict[str, float]  # of the light that gives as many detections
+    nothing: bool = False
 
 
 @dataclass(frozen=True)
@@ -423,6 +427,7 @@ class Bench:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
+        nothing = True
         for id in state.rates.keys() - state.made.keys():
             logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
@@ -444,6 +449,7 @@ class Bench:
                 if values.shape[1] != len(state.residuals[cell]):
                     return f"{id}: its {name} has other cells than the measurement's"
                 null = state.nulls[cell]
+                nothing = nothing and np.array_equal(values, base.values[name][some])
                 new = values - np.stack([null.expected(t)[0] for t in other.totals])
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
@@ -451,7 +457,7 @@ class Bench:
                 shift = _beyond_noise(shift, spread, left + 3.0 / null.recordings, null.law)
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
-        return Moved(shifts, noise, logs)
+        return Moved(shifts, noise, logs, nothing)
 
     def residuals(self, state: State, moved: Moved, times: float = 1.0, noisy: bool = False) -> dict[Cell, np.ndarray]:
         """The data's residuals if the shifts were `times` as large. noisy: their scatter adds to that of the cells."""

@@ -267,7 +267,8 @@ class Search:
             some = () if everywhere else self.telling(state)
             out = self._looked_at(state, tries, some)
             # what leaves no trace yet may do so when it is stronger
-            silent = [(t.change, up) for t in out if self.size(state, t.moved) < _SILENT and (up := _stronger(t))]
+            faint = [t for t in out if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
+            silent = [(t.change, up) for t in faint if (up := _stronger(t))]
             found = self._looked_at(state, silent, some) if silent else []
             raised = {(one.change.name, _shape(one)) for one in found}
             out = [t for t in out if (t.change.name, _shape(t)) not in raised] + found

@@ -1,4 +1,4 @@
-"""A detection comes back: a reflection in the fibre."""
+"""What the camera of the tutorial hides. Read README.md first."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from spadmnist import Effect, parameter
 from spadmnist.events import Children
 
 
-class Echo(Effect, stage="correlated"):
+class Secret(Effect, stage="correlated"):
     """Some detections echo in their own pixel, always equally long after the dead time: a reflection.
 
     Source: this tutorial.

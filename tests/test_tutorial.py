@@ -1,0 +1,60 @@
+"""The loop of README.md, as a reader goes through it: fails, unexplained, an effect of one's own, explained."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def run(folder: Path, line: str, status: int = 0) -> str:
+    """A line of the README, in a folder."""
+    words = line.split("#")[0].split()
+    assert words[0] == "spadmnist"
+    done = subprocess.run(
+        [sys.executable, "-m", "spadmnist.cli", *words[1:]], cwd=folder, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == status, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_loop_of_the_readme(tmp_path):
+    text = (ROOT / "README.md").read_text()
+    text = text[text.index("### The loop") : text.index("## How fast")]
+    blocks = re.findall(r"```(\w*)\n(.*?)```", text, re.S)
+    commands = [line for kind, body in blocks if not kind for line in body.strip().splitlines()]
+    (effect,) = [body for kind, body in blocks if kind == "python"]
+    assert commands[0] == "cd configs/tutorial" and len(commands) == 6
+    folder = tmp_path / "tutorial"
+    shutil.copytree(ROOT / "configs" / "tutorial", folder)
+    simulate, compare, diagnose, again, check = commands[1:]
+
+    run(folder, simulate)
+    assert "fine_intervals" in run(folder, compare, status=1) and (folder / "report" / "report.html").exists()
+    run(folder, diagnose + " --json first.json")
+    first = json.loads((folder / "first.json").read_text())
+    assert first["verdict"] == "unexplained" and not first["steps"]
+    assert any(u["statistic"] == "fine_intervals" and "200 to 201 ns" in u["where"] for u in first["unexplained"])
+    assert any(u["capture"] == "dark" for u in first["unexplained"])
+
+    run(folder, "spadmnist effects --new echo")
+    (folder / "echo.py").write_text(effect)
+    run(folder, again + " --json second.json")
+    second = json.loads((folder / "second.json").read_text())
+    assert second["verdict"] == "explained" and [s["effect"] for s in second["steps"]] == ["echo"]
+    values = second["steps"][0]["values"]
+    assert values["share"]["low"] < 0.008 < values["share"]["high"]
+    assert values["delay"]["low"] < 150e-9 < values["delay"]["high"]
+    assert second["misfit"]["before"] > 3 and second["misfit"]["after"] < max(1.2, second["misfit_null_95"])
+    placebo = next(row for row in second["ladder"] if row["placebo"])
+    assert placebo["misfit"] > 0.8 * second["misfit"]["before"]  # adding just anything does not help
+    assert "The model is adequate" in run(folder, check)
+    assert "from bench" in (folder / "next" / "sensor.yaml").read_text()
