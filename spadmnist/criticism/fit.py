@@ -32,6 +32,7 @@ Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _LEAST_SPREAD = 0.03  # other models' totals must not lie outside
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
+_MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _BLIND = 0.05  # squared slope of a number that nothing tells
 FEW = 4  # recordings that tell the difference between two models
 
@@ -256,7 +257,9 @@ class Bench:
         usual, form = state.rates[id], self.closed_form(sensor, id)
         wanted = math.log(usual.expected(usual.level))
         x = 0.0
-        for _ in range(6):
+        # in the dark all rates are scaled, whatever makes them; light saturates, and is no other light for long
+        most = _MOST_DARK if self.seen[id].capture.light.dark else _MOST_LIGHT
+        for _ in range(6 + round(2 * most)):
             here = math.log(form(usual.level * math.exp(x)))
             if abs(wanted - here) < 1e-7:
                 break
@@ -264,7 +267,7 @@ class Bench:
             if slope < 0.02:
                 return 1.0
             x += max(-0.5, min(0.5, (wanted - here) / slope))
-        return math.exp(x) if abs(x) < 1.5 else 1.0
+        return math.exp(x) if abs(x) < most else 1.0
 
     def needed(self, state: State, sensor: Sensor, id: str) -> float:
         """Log of how much the light (dark: the rates) must differ for a sensor to give as many detections."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
 from .candidates import Change, Key, Values, with_values
@@ -22,8 +23,9 @@ from .fit import Bench, Sensors
 from .recordings import InTheDark
 
 _TAILS = 3.0  # degrees of freedom of the prior
-_TURNS = 12
-_MOST = 6.0  # of a logarithm
+_ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: then a capture is needed to settle it
+_TURNS = 16
+_MOST = 10.0  # of a logarithm
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
@@ -50,7 +52,7 @@ class Map:
     def values(self, draw: np.ndarray | None = None) -> np.ndarray:
         """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
         logs = self.estimate if draw is None else self.estimate + draw * self.error
-        return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST + 4)), self.low, self.high)
+        return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST)), self.low, self.high)
 
 
 def groups_of(sensor: Sensor, per: str) -> np.ndarray:
@@ -87,6 +89,16 @@ class _Line:
         return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)
 
 
+def _base_of(sensor: Sensor, change: Change) -> float:
+    """What a map's values are relative to: the array's own mean, or where the effect vanishes."""
+    assert change.carrier is not None
+    effect = sensor.effect(change.carrier[0])
+    if effect is not None:
+        return float(np.mean(np.asarray(getattr(effect, change.carrier[1]), float)))
+    off = Effect.registry.find(change.carrier[0]).parameters[change.carrier[1]].off
+    return float(off if off is not None else 1.0)
+
+
 def settle_maps(
     bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float], use: Sequence[str] = ()
 ) -> dict[Key, Map]:
@@ -105,15 +117,8 @@ def settle_maps(
     bases, groups, bounds = [], [], []
     for change in wanted:
         assert change.carrier is not None
-        effect = start.effect(change.carrier[0])
-        declared = None if effect is None else effect.parameters[change.carrier[1]]
-        if effect is None or declared is None:
-            from ..effects import Effect
-
-            declared = Effect.registry.find(change.carrier[0]).parameters[change.carrier[1]]
-            base = float(declared.off if declared.off is not None else 1.0)
-        else:
-            base = float(np.mean(np.asarray(getattr(effect, change.carrier[1]), float)))
+        declared = Effect.registry.find(change.carrier[0]).parameters[change.carrier[1]]
+        base = _base_of(start, change)
         low, high = declared.bounds
         bases.append(base if base > 0 else float((declared.search or (1e-3, 1))[0]))
         bounds.append((0.0 if low is None else low, math.inf if high is None else high))
@@ -128,7 +133,7 @@ def settle_maps(
     def model(deltas: Sequence[np.ndarray]) -> Sensor:
         given = dict(values)
         for change, base, d, (low, high) in zip(wanted, bases, deltas, bounds, strict=True):
-            map_ = np.clip(base * np.exp(np.clip(d, -_MOST, _MOST + 4)), low, high)
+            map_ = np.clip(base * np.exp(np.clip(d, -_MOST, _MOST)), low, high)
             given[change.carrier] = map_  # type: ignore[index]
         return with_values(bench.start, given)
 
@@ -201,8 +206,6 @@ def _middle(x: np.ndarray) -> float:
 
 def bench_light_only(sensor: Sensor, change: Change) -> bool:
     """Does the parameter act on the light alone? Then its mean is the light level's matter."""
-    from ..effects import Effect
-
     kind = Effect.registry.find(change.effect)
     return getattr(kind, "stage", "") in ("light", "detection")
 
@@ -255,28 +258,30 @@ def code_periods(cells: int) -> dict[int, slice]:
     return out
 
 
-def information(bench: Bench, values: Values, change: Change, levels: dict[str, float]) -> dict[str, float]:
-    """How much each capture tells of the map's mean: the sum of squared slopes over variances."""
+def information(bench: Bench, values: Values, change: Change, levels: dict[str, float]) -> dict[str, np.ndarray]:
+    """(pixels,) how much each capture tells of a map: squared slopes over variances."""
     if change.per == "code":
-        return {id: seen.total * (CODES in seen.summaries) for id, seen in bench.seen.items()}
-    start = with_values(bench.start, values)
-    effect = start.effect(change.carrier[0])  # type: ignore[index]
-    if effect is None:
-        return dict.fromkeys(bench.seen, 0.0)
+        return {id: np.array([seen.total * (CODES in seen.summaries)]) for id, seen in bench.seen.items()}
     assert change.carrier is not None
-    now: np.ndarray = np.asarray(getattr(effect, change.carrier[1]), np.float64)
-    if change.per == "pixel":
-        now = np.broadcast_to(now, (start.layout.pixels,))
+    effect = with_values(bench.start, values).effect(change.carrier[0])
+    pixels = bench.start.layout.pixels
+    if effect is None:
+        now = np.full(int(groups_of(bench.start, change.per).max()) + 1, _base_of(bench.start, change))
+    else:
+        now = np.asarray(getattr(effect, change.carrier[1]), np.float64)
+        if change.per == "pixel":
+            now = np.broadcast_to(now, (pixels,))
+    start = with_values(bench.start, {**values, change.carrier: now})
     other = with_values(bench.start, {**values, change.carrier: now * 1.02})
     out = {}
     for id, seen in bench.seen.items():
         if seen.counts is None:
-            out[id] = 0.0
+            out[id] = np.zeros(pixels)
             continue
         line = _Line(bench, id, levels[id])
         a, b = line.expected(start), line.expected(other)
         slope = (b - a) / 0.02
-        out[id] = float(np.sum(slope**2 / line.variance(np.maximum(a, 0.5), bench.dead)))
+        out[id] = slope**2 / line.variance(np.maximum(a, 0.5), bench.dead)
     return out
 
 
@@ -293,7 +298,7 @@ def sensors_with(
     needed = [information(bench, final, change, levels) for change in wanted]
     maps: dict[str, dict[Key, Map]] = {}
     for id, seen in bench.seen.items():
-        alone = any(told[id] > 0.6 * max(sum(told.values()), 1e-12) for told in needed)
+        alone = any(float(np.mean(told[id] / np.maximum(sum(told.values()), 1e-12))) > _ALONE for told in needed)
         if seen.counts is None or alone or not unseen or len(bench.seen) < 2:
             maps[id] = whole
         else:

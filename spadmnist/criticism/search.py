@@ -318,13 +318,14 @@ class Search:
         except (SpadError, np.linalg.LinAlgError):
             return 1.0
         name = mapping.CODES if change.per == "code" else _MAP
-        cells = [(id, name) for id in told if told[id] > 0 and (id, name) in state.residuals]
+        tells = {id: float(x.sum()) for id, x in told.items()}
+        cells = [(id, name) for id in tells if tells[id] > 0 and (id, name) in state.residuals]
         if cells:
             size = max(len(state.residuals[cell]) for cell in cells)
             cells = [cell for cell in cells if len(state.residuals[cell]) == size]
         if not cells:
             return 1.0
-        weight = np.sqrt([told[id] for id, _ in cells])
+        weight = np.sqrt([tells[id] for id, _ in cells])
         weight /= math.sqrt(float(weight @ weight))
         z = sum(w * state.residuals[cell] for w, cell in zip(weight, cells, strict=True))
         own = sum(w * state.own[cell] for w, cell in zip(weight, cells, strict=True))
