@@ -11,9 +11,9 @@ import pytest
 from simple_sensor import grid, live, many, one_of_each, reduced, sigmas, tr, tr_of
 
 from spadmnist.recording import Recording
-from spadmnist.statistics.intervals import EdgeIntervals, Intervals, Rescaled, RescaledLag
+from spadmnist.statistics.intervals import EdgeIntervals, FineIntervals, Intervals, Rescaled, RescaledLag
 
-ALL = (EdgeIntervals, Intervals, Rescaled, RescaledLag)
+ALL = (EdgeIntervals, Intervals, FineIntervals, Rescaled, RescaledLag)
 
 
 def ticks_of(recording: Recording) -> tuple[list[np.ndarray], float]:
@@ -41,6 +41,11 @@ def test_intervals_of_a_small_recording(kind: str) -> None:
     assert summary.values.tolist() == np.histogram(gaps, [*(edges - 0.5), np.inf])[0].tolist()
     assert summary.where(0).startswith("intervals of 70 to 88") and summary.where(46) == "intervals beyond 3 ms"
     assert summary.size(3, 12.0, 10.0)[1] == 2 / len(np.concatenate(rows))
+
+    fine = np.rint((70e-9 + 1e-9 * np.arange(981)) / tick)
+    summary = reduced(FineIntervals, recording)
+    assert summary.values.tolist() == np.histogram(gaps, fine - 0.5)[0].tolist() and summary.values.sum() > 0
+    assert summary.where(0) == "intervals of 70 to 71 ns" and summary.where(979).startswith("intervals of 1.049")
 
     # each pixel by its own rate
     counts, sums, products = np.zeros(20), np.zeros(6), np.zeros(6)
