@@ -24,6 +24,7 @@ from .recordings import InTheDark
 
 _TAILS = 3.0  # degrees of freedom of the prior
 _ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: then a capture is needed to settle it
+_TELLING, _LEAST_WIDTH = 0.2, 1e-3  # noise of a logarithm below which pixels tell how wide they lie; no narrower
 _TURNS = 16
 _MOST = 10.0  # of a logarithm
 CODES = "codes"
@@ -51,7 +52,8 @@ class Map:
 
     def values(self, draw: np.ndarray | None = None) -> np.ndarray:
         """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
-        logs = self.estimate if draw is None else self.estimate + draw * self.error
+        # a draw of the logarithm has the mean of the estimate in the value itself
+        logs = self.estimate if draw is None else self.estimate + draw * self.error - self.error**2 / 2
         return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST)), self.low, self.high)
 
 
@@ -188,6 +190,12 @@ def settle_maps(
             weight = (_TAILS + 1) / (_TAILS + delta[i] ** 2 / sigma[i] ** 2)
             square = float(np.mean(weight * (delta[i] - _middle(delta[i])) ** 2 + post[i]))
             sigma[i] = min(max(math.sqrt(square), 1e-4), 3.0)
+            own_raw, own_variance = raw[i]
+            noise = float(np.median(own_variance))
+            if noise < _TELLING**2:
+                # of the bulk, beyond its noise: what creeps towards none would take long to arrive
+                width = 1.4826 * _middle(np.abs(own_raw - _middle(own_raw)))
+                sigma[i] = math.sqrt(max(width**2 - noise, _LEAST_WIDTH**2))
             precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + delta[i] ** 2)
     out = codes
     for i, change in enumerate(wanted):
