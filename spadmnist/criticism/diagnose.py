@@ -34,6 +34,7 @@ _QUICK = 32  # recordings of each capture by which `quick` judges
 _LEAST_GAIN = 12.0  # in chi square, of a step
 _TRACE = 5e-4  # p-value of a trace that is followed where no check fails by itself
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
+_WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -303,7 +304,7 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
     state = bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
     course.settled = None
-    if dials and (settled is None or settled.dials != dials):
+    if settled is not None and settled.dials != dials:
         settled = None
     for step in course.steps:
         if step.phased:
@@ -317,21 +318,20 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
             sensors, maps = _model(course)
             state = bench.state(course.values, sensors)
     # from where it nearly is right: the scatter of the cells is that of the model with the effect
-    for _ in range(_AGAIN if dials else 0):
+    for turn in range(_AGAIN + 1 if dials else 0):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = fit.settle(bench, state, dials, here, state.sensors.changed, 3, 2 * fit.FEW)
+        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW)
         if isinstance(closer, str):
             break
         settled = closer
-        gained = search.square(state.residuals) - closer.square
-        if gained < 6:
+        if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
             break
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)
         state = bench.state(course.values, sensors)
     course.state = state
     if settled is not None and dials:
-        point, covariance = _polished(state, settled)
+        point, covariance = settled.point, settled.covariance
         course.settled = settled
         course.judged = _unseen(state, settled)
         place = {d.key: i for i, d in enumerate(settled.dials)}
@@ -386,15 +386,6 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
 def _material(one: Tried) -> str:
     logs = [x * one.times for x in one.moved.logs.values()]
     return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
-
-
-def _polished(state: State, settled: Settled) -> tuple[np.ndarray, np.ndarray]:
-    """One more step of the settled dials, on the residuals of a state that many recordings tell."""
-    _, z, slopes, own = _stacked(state, settled)
-    covariance = fit.covariance_of(slopes, own)
-    step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
-    error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
-    return settled.point + np.clip(step, -5 * error, 5 * error), covariance
 
 
 def _stacked(state: State, settled: Settled) -> tuple[list[Cell], np.ndarray, np.ndarray, np.ndarray]:

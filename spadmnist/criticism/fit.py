@@ -31,6 +31,7 @@ from .nulls import Null, _standardized, learn
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _LEAST_SPREAD = 0.03  # other models' totals must not lie outside
+_ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _BLIND = 0.05  # squared slope of a number that nothing tells
@@ -456,8 +457,9 @@ class Bench:
                 new = values - np.stack([null.expected(t)[0] for t in other.totals])
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
-                shift, left = _difference(new, old, spread)
-                shift = _beyond_noise(shift, spread, left + 3.0 / null.recordings, null.law)
+                shift, left, beta = _difference(new, old, spread)
+                # where the recordings have nothing in common, the null's own chance is in the shift, too
+                shift = _beyond_noise(shift, spread, left + 3.0 * (1 - beta) / null.recordings, null.law)
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -528,15 +530,18 @@ def _spread_of(null: Null, made: Made) -> np.ndarray:
     return np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
 
 
-def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float]:
-    """(mean of new less what chance made of it, as `old` tells; variance of that relative to a recording's)."""
+def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """(mean of new less what chance made of it, as `old` tells; variance of that relative to a recording's; beta).
+
+    beta: how much of what chance did to `old` it did to `new`, from 0 to 1.
+    """
     n = len(new)
     a, b = (new - new.mean(axis=0)) / spread, (old - old.mean(axis=0)) / spread
     square = float((b * b).sum())
     beta = float(np.clip((a * b).sum() / square, 0.0, 1.0)) if square > 0 and n > 1 else 0.0
     shift = new.mean(axis=0) - beta * old.mean(axis=0)
     left = float(((a - beta * b) ** 2).sum()) / max(1, (n - 1) * a.shape[1]) if n > 1 else 2.0
-    return shift, left / n
+    return shift, left / n, beta
 
 
 def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, law: str) -> np.ndarray:
@@ -743,6 +748,53 @@ def settle(
     square, u, z = best
     return Settled(
         dials, u, covariance_of(slopes, own), _split(z, state, keys), _split(slopes, state, keys), square, at(u)
+    )
+
+
+def follow(
+    bench: Bench,
+    state: State,
+    dials: Sequence[Dial],
+    values: Mapping[Key, Any],
+    sensors_of: Callable[[Mapping[Key, Any]], Sensors],
+    few: int = FEW,
+) -> Settled | str:
+    """One step of Gauss and Newton from a state that has these values: as many recordings tell it as the state has.
+
+    Only how the cells follow the numbers is found from a few recordings more.
+    """
+    dials = tuple(dials)
+    keys = list(state.residuals)
+    z, u = stacked(state.residuals, keys), point_of(dials, values)
+    own = np.concatenate([state.own[k] for k in keys], axis=1)
+    h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
+    points = []
+    for i, dial in enumerate(dials):
+        for side in (1, -1):
+            other = u.copy()
+            other[i] = dial.coordinate(dial.value(u[i] + side * h[i]))
+            points.append(other)
+    made = bench.moved(
+        state, [sensors_of({d.key: d.value(float(x)) for d, x in zip(dials, p, strict=True)}) for p in points], few
+    )
+    slopes = np.zeros((z.size, len(dials)))
+    for i in range(len(dials)):
+        up, down = made[2 * i], made[2 * i + 1]
+        if isinstance(up, str):
+            return up
+        if isinstance(down, str):
+            return down
+        ends = [stacked(bench.residuals(state, m), keys) for m in (up, down)]
+        slopes[:, i] = (ends[0] - ends[1]) / max(points[2 * i][i] - points[2 * i + 1][i], 1e-12)
+    covariance = covariance_of(slopes, own)
+    error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
+    step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
+    step = np.clip(step, -5 * error, 5 * error)
+    point = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u + step, strict=True)])
+    left = z + slopes @ (point - u)
+    new = {**values, **{d.key: d.value(float(x)) for d, x in zip(dials, point, strict=True)}}
+    return Settled(
+        dials, point, covariance, _split(left, state, keys), _split(slopes, state, keys), float(left @ left), new
     )
 
 

@@ -37,7 +37,6 @@ class Neighbours(Statistic):
 
     modalities = ("tr", "str", "qis", "counts")
     unit = "standard deviations"
-    costly = True
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Scores of pairs beyond chance."""
