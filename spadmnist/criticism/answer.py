@@ -115,6 +115,7 @@ class Diagnosis:
     values: dict[Key, Any] = field(default_factory=dict, repr=False)
     file: str | None = None
     simulations: int = 0
+    dark: list[str] = field(default_factory=list)  # captures without light
 
     def as_data(self) -> dict[str, Any]:
         """As `formats`: spadmnist-diagnosis/1."""
@@ -247,8 +248,7 @@ def sentence(found: Diagnosis) -> str:
         return f"{names}, or something that looks the same here."
     if found.verdict == "partly_explained":
         return f"{names} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
-    dark = [r["capture"] for r in found.unexplained if "dark" in str(r["capture"])]
-    return f"something is missing that no known effect explains: {mechanism(found.unexplained, dark)}."
+    return f"something is missing that no known effect explains: {mechanism(found.unexplained, found.dark)}."
 
 
 def notes(found: Diagnosis) -> dict[Key, str]:

@@ -221,6 +221,7 @@ def _diagnosed(
         course.values,
         None,
         bench.simulations,
+        bench.dark,
     )
 
 
@@ -649,6 +650,7 @@ def fitted(
             course.values,
             None,
             bench.simulations,
+            bench.dark,
         )
 
 

@@ -221,6 +221,11 @@ class Bench:
                 last = float(recording.events.times.max())
             self.seen[capture.id] = Seen(recording.capture, float(counts.sum()), counts, summaries, last)
 
+    @property
+    def dark(self) -> list[str]:
+        """Captures without light."""
+        return [id for id, seen in self.seen.items() if seen.capture.light.dark]
+
     # --- simulating ----------------------------------------------------------------------------------------------
 
     def simulate(

@@ -94,7 +94,6 @@ class _Card:
 def _words(found: Diagnosis) -> dict[str, Any]:
     word, look = _VERDICTS.get(found.verdict, (found.verdict, "open"))
     ladder = sorted(found.ladder, key=lambda row: bool(row["placebo"]))
-    dark = [str(r["capture"]) for r in found.unexplained if "dark" in str(r["capture"])]
     return {
         "found": found,
         "verdict": word,
@@ -109,7 +108,7 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "traces": [_checked(trace) for trace in found.traces],
         "remains": found.unexplained[:_MOST],
         "titles": {str(r["statistic"]): title_of(str(r["statistic"])) for r in found.unexplained},
-        "mechanism": answer.mechanism(found.unexplained, dark) if found.unexplained else "",
+        "mechanism": answer.mechanism(found.unexplained, found.dark) if found.unexplained else "",
         "limits": [(e, *_limit(e)) for e in found.excluded[:_MOST]],
         "hidden": [(e["effect"], _about(e["effect"])) for e in found.invisible[:_MOST]],
         "name": _name,
