@@ -38,7 +38,7 @@ def test_the_loop_of_the_readme(tmp_path):
     simulate, compare, diagnose, again, check = commands[1:]
 
     run(folder, simulate)
-    assert "fine_intervals" in run(folder, compare, status=1) and (folder / "report" / "report.html").exists()
+    assert "fine_intervals" in run(folder, compare, status=1) and (folder / "report" / "index.html").exists()
     run(folder, diagnose + " --json first.json")
     first = json.loads((folder / "first.json").read_text())
     assert first["verdict"] == "unexplained" and not first["steps"]

@@ -152,6 +152,7 @@ def settle_maps(
             assert counts is not None
             expected = line.expected(now)
             scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
+            line.level *= min(max(scale, 0.5), 2.0)  # until it is the light of these maps, and no factor is needed
             slopes = np.stack([(line.expected(o) - expected) / step for o in other], axis=1) * scale
             expected = expected * scale
             variance = line.variance(np.maximum(expected, 0.5), bench.dead)
