@@ -125,6 +125,7 @@ def answer_of(**options: Any) -> Diagnosis:
             {"effect": "slow_recovery", "parameter": "time_constant", "upper_limit_95": 2.2e-9},
         ],
         "invisible": [{"effect": "count_saturation"}],
+        "dark": ["dark"],
         "traces": [
             trace_of(),
             trace_of("normal", "neighbours"),
