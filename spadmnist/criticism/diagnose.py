@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -327,9 +327,15 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
         settled = closer
         if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
             break
+        before = course.values, sensors, maps, state
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)
         state = bench.state(course.values, sensors)
+        if search.square(state.residuals) > search.square(before[3].residuals):
+            # a line or an edge: slopes do not lead further
+            course.values, sensors, maps, state = before
+            settled = replace(settled, point=fit.point_of(dials, here))
+            break
     course.state = state
     if settled is not None and dials:
         point, covariance = settled.point, settled.covariance
