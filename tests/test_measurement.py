@@ -757,6 +757,7 @@ def alone(script: str) -> subprocess.CompletedProcess[str]:
     head = """
 import os, resource, signal, sys
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background processes ignore it
 sys.path.insert(0, "tests")
 from test_measurement import Noise, measurement, SpadError
 def write(root, frames=4000, at=lambda start: None):
