@@ -48,7 +48,6 @@ class _Course:
     values: dict[Key, Any]
     steps: list[Step]
     ladder: list[dict[str, Any]]
-    settled: Settled | None = None
     judged: dict[Cell, np.ndarray] | None = None  # residuals of each capture by parameters settled without it
 
     @property
@@ -61,13 +60,13 @@ class _Course:
 
     def kept(self) -> tuple[Any, ...]:
         """All that a step changes."""
-        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.settled, self.judged)
+        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.judged)
         return (*own, list(self.search.accepted), dict(self.search.phases))
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """As it was before a step."""
-        self.state, self.values, self.steps, self.ladder, self.settled, self.judged = kept[:6]
-        self.search.accepted, self.search.phases = kept[6:]
+        self.state, self.values, self.steps, self.ladder, self.judged = kept[:5]
+        self.search.accepted, self.search.phases = kept[5:]
 
     def rung(self, name: str) -> None:
         errors = errors_of(self.bench, self.state, self.judged or self.state.residuals)
@@ -304,7 +303,6 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
     sensors, maps = _model(course)
     state = bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
-    course.settled = None
     if settled is not None and settled.dials != dials:
         settled = None
     for step in course.steps:
@@ -339,7 +337,6 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
     course.state = state
     if settled is not None and dials:
         point, covariance = settled.point, settled.covariance
-        course.settled = settled
         course.judged = _unseen(state, settled)
         place = {d.key: i for i, d in enumerate(settled.dials)}
         for step in course.steps:
@@ -395,10 +392,9 @@ def _material(one: Tried) -> str:
     return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
 
 
-def _stacked(state: State, settled: Settled) -> tuple[list[Cell], np.ndarray, np.ndarray, np.ndarray]:
+def _stacked(state: State, settled: Settled) -> tuple[list[Cell], np.ndarray, np.ndarray]:
     keys = [k for k in settled.slopes if k in state.residuals and len(state.residuals[k]) == len(settled.slopes[k])]
-    own = np.concatenate([state.own[k] for k in keys], axis=1)
-    return keys, stacked(state.residuals, keys), np.concatenate([settled.slopes[k] for k in keys]), own
+    return keys, stacked(state.residuals, keys), np.concatenate([settled.slopes[k] for k in keys])
 
 
 def _unseen(state: State, settled: Settled) -> dict[Cell, np.ndarray]:
@@ -406,7 +402,7 @@ def _unseen(state: State, settled: Settled) -> dict[Cell, np.ndarray]:
 
     Where one capture alone tells a number, each of its cells is judged by what the others of them say.
     """
-    keys, z, slopes, _ = _stacked(state, settled)
+    keys, z, slopes = _stacked(state, settled)
     normal = slopes.T @ slopes
     out = dict(state.residuals)
     ridge = 1e-9 * np.trace(normal) * np.eye(len(normal))

@@ -686,26 +686,6 @@ def settle(
         times = stronger[0] ** -stronger[1]
         return [m if isinstance(m, str) else stacked(bench.residuals(state, m, times), keys) for m in found]
 
-    def aside(u: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
-        # to both sides: what chance does to the point itself must not be in the slope
-        out = []
-        for i, dial in enumerate(dials):
-            for h in (steps[i], -steps[i]):
-                other = u.copy()
-                other[i] = dial.coordinate(dial.value(u[i] + h))
-                out.append(other)
-        return out
-
-    def slopes_of(found: Sequence[np.ndarray | str], u: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        places = aside(u, steps)
-        out = np.zeros((sum(len(state.residuals[k]) for k in keys), len(dials)))
-        for i in range(len(dials)):
-            up, down = found[2 * i], found[2 * i + 1]
-            apart = places[2 * i][i] - places[2 * i + 1][i]
-            if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
-                out[:, i] = (up - down) / apart
-        return out
-
     def boosted(values: dict[Key, Any]) -> dict[Key, Any]:
         if stronger[0] == 1:
             return values
@@ -722,7 +702,7 @@ def settle(
     for turn in range(2 * rounds):
         # slopes hold for a while: they are found anew where the point has moved on, or did not gain what they promised
         anew = turn == 0 or bool(np.any(np.abs(u - there) > reach))
-        found = evaluate([u, *(aside(u, steps) if anew else [])])
+        found = evaluate([u, *(_aside(dials, u, steps) if anew else [])])
         if isinstance(found[0], str):
             return found[0]
         z = found[0]
@@ -730,10 +710,10 @@ def settle(
         if best is not None and not anew and best[0] - square < 0.3 * promised:
             if promised < 4:
                 break
-            found = [z, *evaluate(aside(u, steps))]
+            found = [z, *evaluate(_aside(dials, u, steps))]
             anew = True
         if anew:
-            slopes, there = slopes_of(found[1:], u, steps), u
+            slopes, there = _slopes(found[1:], _aside(dials, u, steps), len(z)), u
         if best is None or square < best[0]:
             best, damping = (square, u, z), damping / 3
         else:
@@ -756,6 +736,28 @@ def settle(
     )
 
 
+def _aside(dials: Sequence[Dial], u: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
+    """Points to both sides of one, dial by dial: what chance does to the point itself must not be in the slope."""
+    out = []
+    for i, dial in enumerate(dials):
+        for h in (steps[i], -steps[i]):
+            other = u.copy()
+            other[i] = dial.coordinate(dial.value(u[i] + h))
+            out.append(other)
+    return out
+
+
+def _slopes(found: Sequence[np.ndarray | str], places: Sequence[np.ndarray], cells: int) -> np.ndarray:
+    """(cells, dials) how residuals follow the dials, from those at points `_aside`; 0 where one could not be made."""
+    out = np.zeros((cells, len(places) // 2))
+    for i in range(out.shape[1]):
+        up, down = found[2 * i], found[2 * i + 1]
+        apart = places[2 * i][i] - places[2 * i + 1][i]
+        if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
+            out[:, i] = (up - down) / apart
+    return out
+
+
 def follow(
     bench: Bench,
     state: State,
@@ -773,24 +775,14 @@ def follow(
     z, u = stacked(state.residuals, keys), point_of(dials, values)
     own = np.concatenate([state.own[k] for k in keys], axis=1)
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
-    points = []
-    for i, dial in enumerate(dials):
-        for side in (1, -1):
-            other = u.copy()
-            other[i] = dial.coordinate(dial.value(u[i] + side * h[i]))
-            points.append(other)
-    made = bench.moved(
-        state, [sensors_of({d.key: d.value(float(x)) for d, x in zip(dials, p, strict=True)}) for p in points], few
-    )
-    slopes = np.zeros((z.size, len(dials)))
-    for i in range(len(dials)):
-        up, down = made[2 * i], made[2 * i + 1]
-        if isinstance(up, str):
-            return up
-        if isinstance(down, str):
-            return down
-        ends = [stacked(bench.residuals(state, m), keys) for m in (up, down)]
-        slopes[:, i] = (ends[0] - ends[1]) / max(points[2 * i][i] - points[2 * i + 1][i], 1e-12)
+    points = _aside(dials, u, h)
+    values_there = [{d.key: d.value(float(x)) for d, x in zip(dials, p, strict=True)} for p in points]
+    made = bench.moved(state, [sensors_of(v) for v in values_there], few)
+    wrong = [m for m in made if isinstance(m, str)]
+    if wrong:
+        return wrong[0]
+    ends = [m if isinstance(m, str) else stacked(bench.residuals(state, m), keys) for m in made]
+    slopes = _slopes(ends, points, z.size)
     covariance = covariance_of(slopes, own)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)

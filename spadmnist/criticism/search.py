@@ -291,22 +291,8 @@ class Search:
 
     def chance(self, state: State, tried: Sequence[Tried], values: dict[Key, Any]) -> float:
         """p-value of what resembles the trace of any candidate most, maps among them, if the model is right."""
-        keys = list(state.residuals)
-        z = stacked(state.residuals, keys)
-        own = np.concatenate([state.own[k] for k in keys], axis=1)
-        largest, seen = np.zeros(len(own)), 0.0
-        for one in tried:
-            t = stacked(self.bench.template(state, one.moved), keys)
-            if not t.any():
-                continue
-            along = own @ t
-            spread = max(float(along.std()), 0.5 * math.sqrt(float(t @ t)))
-            largest = np.maximum(largest, np.abs(along) / spread)
-            seen = max(seen, abs(float(z @ t)) / spread)
-        p = 1.0
-        if seen > 0:
-            location, scale = stats.gumbel_r.fit(largest)
-            p = float(stats.gumbel_r.sf(seen, location, max(scale, 0.25)))
+        marks, largest = self._marks(state, tried)
+        p = _gumbel_tail(largest, float(marks.max())) if marks.any() else 1.0
         levels = mapping.levels_of(self.bench, state)
         maps = [self.map_chance(state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
         return min(1.0, 2 * min([p, *(q * len(maps) for q in maps)]))
@@ -565,24 +551,39 @@ class Search:
         """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
         if best.chance is not None:
             return float(stats.norm.isf(max(best.chance, _LEAST_P) / 2)), best.chance
+        marks, largest = self._marks(state, [best, *tried])
+        # what is far outside is no matter of the linear law: the gain itself, in the same measure
+        keys = list(state.residuals)
+        t = stacked(self.bench.template(state, best.moved), keys)
+        along = np.concatenate([state.own[k] for k in keys], axis=1) @ t
+        typical = float(np.mean(along**2) / max(float(t @ t), 1e-12))
+        score = max(float(marks[0]), math.sqrt(max(best.gain, 0.0) / max(typical, 0.5))) if t.any() else 0.0
+        return score, max(_gumbel_tail(largest, score), _LEAST_P)
+
+    def _marks(self, state: State, tried: Sequence[Tried]) -> tuple[np.ndarray, np.ndarray]:
+        """((candidates,) how much the data resemble the trace of each, (recordings,) the most that the model's own do).
+
+        In standard deviations of the latter; 0 of a candidate without a trace.
+        """
         keys = list(state.residuals)
         z = stacked(state.residuals, keys)
         own = np.concatenate([state.own[k] for k in keys], axis=1)
-        largest = np.zeros(len(own))
-        scores = 0.0
-        for one in [best, *tried]:
+        marks, largest = np.zeros(len(tried)), np.zeros(len(own))
+        for n, one in enumerate(tried):
             t = stacked(self.bench.template(state, one.moved), keys)
             if not t.any():
                 continue
             along = own @ t
             spread = max(float(along.std()), 0.5 * math.sqrt(float(t @ t)))
             largest = np.maximum(largest, np.abs(along) / spread)
-            if one is best:
-                # what is far outside is no matter of the linear law: the gain itself, in the same measure
-                typical = float(np.mean(along**2) / max(float(t @ t), 1e-12))
-                scores = max(abs(float(z @ t)) / spread, math.sqrt(max(best.gain, 0.0) / max(typical, 0.5)))
-        location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
-        return scores, max(float(stats.gumbel_r.sf(scores, location, max(scale, 0.25))), _LEAST_P)
+            marks[n] = abs(float(z @ t)) / spread
+        return marks, largest
+
+
+def _gumbel_tail(largest: np.ndarray, mark: float) -> float:
+    """p-value of a mark as the largest of many; largest: (recordings,) those of the model itself."""
+    location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
+    return float(stats.gumbel_r.sf(mark, location, max(scale, 0.25)))
 
 
 def _spread_chance(data: np.ndarray, usual: np.ndarray) -> float:
