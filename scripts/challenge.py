@@ -2,12 +2,13 @@
 
     python scripts/challenge.py list
     python scripts/challenge.py make all -o out --seed 1        # cases in out/cases, the truth in out/sealed
-    python scripts/challenge.py run out                         # spadmnist compare and diagnose, over all cases
+    python scripts/challenge.py run out --minutes 90            # spadmnist compare and diagnose; again: what is missing
     python scripts/challenge.py score out                       # opens the truth; writes out/score.md
 
 CASES are `all`, a class (null, single, double, outside, setup) or a pattern of names (`tr-crosstalk-*`). Case folders
-have numbers for names. Beside them stands the sha256 of each sealed truth, with its salt, and each truth holds the
-sha256 of its case's files: neither can be changed between `make` and `score`.
+have numbers for names, drawn at random: the first so many are a fair sample. Beside them stands the sha256 of each
+sealed truth, with its salt, and each truth holds the sha256 of its case's files: neither can be changed between `make`
+and `score`. out/unseen holds captures of the same sensors that `diagnose` never gets: they judge the sensor it found.
 """
 
 from __future__ import annotations
@@ -23,10 +24,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,8 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).parent))
 from challenge_cases import LIGHT_UNCERTAINTY, NANOWATT, Case, Lab, all_cases, built, chosen, own_seed
-from challenge_generator import record
+from challenge_generator import Capture, record
+from challenge_score import judged, report
 
 # ---- make -------------------------------------------------------------------------------------------------
 
@@ -52,6 +52,13 @@ def written(case: Case, seed: int, folder: Path, number: str, quick: bool) -> tu
     sensor = {"name": f"lab {case.family}", "rules": "device", "layout": lab.layout, "effects": effects}
     (place / "sensor.yaml").write_text(yaml.safe_dump({"sensor": sensor}, sort_keys=False))
     (place / "measurement.yaml").write_text(yaml.safe_dump(described(lab, number), sort_keys=False))
+    # the same chip and the same lamp on another day; of every case, lest their being there says something
+    apart = folder / "unseen" / number
+    apart.mkdir(parents=True)
+    later = np.random.default_rng(own_seed(seed, case.name, "unseen"))
+    for capture in lab.lit_really(lab.unseen):
+        record(lab.world, capture, apart / f"{capture.name}.h5", later)
+    (apart / "measurement.yaml").write_text(yaml.safe_dump(described(lab, number, lab.unseen), sort_keys=False))
 
     truth = {
         "name": case.name,
@@ -68,7 +75,8 @@ def written(case: Case, seed: int, folder: Path, number: str, quick: bool) -> tu
         "hidden": {name: {"strength": x, **h.settings} for name, x, h in hidden},
         "irradiance_scale": lab.scale,
         "seed": seed,
-        "files": {path.name: digest(path) for path in sorted(place.iterdir())},
+        "files": digests(place),
+        "unseen": digests(apart),
     }
     text = json.dumps(truth, indent=1, default=float)
     salt = secrets.token_hex(32)
@@ -79,10 +87,10 @@ def written(case: Case, seed: int, folder: Path, number: str, quick: bool) -> tu
     return case.name, time.perf_counter() - began, detections
 
 
-def described(lab: Lab, name: str) -> dict[str, Any]:
+def described(lab: Lab, name: str, stated: list[Capture] | None = None) -> dict[str, Any]:
     """measurement.yaml: what the lab noted down."""
     captures = []
-    for c in lab.stated:
+    for c in lab.stated if stated is None else stated:
         entry: dict[str, Any] = {
             "id": c.name,
             "file": f"{c.name}.h5",
@@ -114,6 +122,10 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: digest(path) for path in sorted(folder.iterdir())}
+
+
 def make(args: argparse.Namespace) -> int:
     folder = Path(args.output)
     if folder.exists() and any(folder.iterdir()):
@@ -123,7 +135,7 @@ def make(args: argparse.Namespace) -> int:
     cases = chosen(args.cases, args.quick, args.nulls)
     order = np.random.default_rng(seed).permutation(len(cases))
     unfinished = folder.with_name(folder.name + ".unfinished")
-    for part in ("cases", "sealed"):
+    for part in ("cases", "unseen", "sealed"):
         shutil.rmtree(unfinished / part, ignore_errors=True)
         (unfinished / part).mkdir(parents=True)
     began, seconds = time.perf_counter(), []
@@ -148,26 +160,68 @@ def make(args: argparse.Namespace) -> int:
 
 # ---- run --------------------------------------------------------------------------------------------------
 
+QUESTIONS = ("compare", "diagnose", "unseen-start", "unseen-found")
+
 
 def run(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
-    answers = folder / "answers"
-    answers.mkdir(exist_ok=True)
-    verbs = [] if args.no_compare else ["compare"]
-    if has_verb("diagnose"):
-        verbs.append("diagnose")
-    else:
+    (folder / "answers").mkdir(exist_ok=True)
+    args.able = {verb: has_verb(verb) for verb in ("compare", "diagnose")}
+    args.one_job = {verb: able and has_verb(verb, "--jobs") for verb, able in args.able.items()}
+    args.until = time.monotonic() + 60 * args.minutes
+    if not args.able["diagnose"]:
         print("challenge: this spadmnist has no verb diagnose; its answers will be missing", file=sys.stderr)
-    cases = sorted(path.name for path in (folder / "cases").iterdir() if path.is_dir())
-    args.one_job = {verb: has_verb(verb, "--jobs") for verb in verbs}
-    tasks = [(verb, case) for case in cases for verb in verbs if not answered(answers / f"{case}.{verb}.json")]
-    failures = 0
+    cases = [path.name for path in (folder / "cases").iterdir() if path.is_dir()]
+    # what has failed before comes last, lest it takes the time of what has not been asked
+    cases.sort(key=lambda case: (failed_before(folder, case), case))
+    asked = failures = 0
     with ThreadPoolExecutor(args.jobs) as pool:
-        for line, good in pool.map(lambda task: ask(folder, task[0], task[1], args), tasks):
-            failures += not good
-            print(line, file=sys.stderr)
-    print(f"{len(cases)} cases, {len(tasks)} questions asked now, {failures} without an answer; next: score {folder}")
-    return 1 if failures or "diagnose" not in verbs else 0
+        for answers in pool.map(lambda case: list(ask_all(folder, case, args)), cases):
+            asked += len(answers)
+            failures += answers.count(False)
+    left = sum(not answer_file(folder, case, "diagnose").exists() for case in cases)
+    print(
+        f"{len(cases)} cases, {asked} questions asked now, {failures} without an answer"
+        + (f", {left} cases not yet asked: run again" if left and args.able["diagnose"] else "")
+        + f"; next: score {folder}"
+    )
+    return 1 if failures or not args.able["diagnose"] else 0
+
+
+def ask_all(folder: Path, case: str, args: argparse.Namespace) -> Iterator[bool]:
+    """Ask what is missing of a case, as long as there is time; whether there was an answer."""
+    for question in QUESTIONS:
+        verb = "diagnose" if question == "diagnose" else "compare"
+        if not args.able[verb] or (args.no_compare and verb == "compare"):
+            continue
+        if answer_of(folder, case, question)["answer"] is not None:
+            continue
+        if question == "unseen-found" and not (found_sensor(folder, case).exists() and steps_of(folder, case)):
+            continue
+        if time.monotonic() > args.until:
+            return
+        line, good = ask(folder, question, case, args)
+        print(line, file=sys.stderr, flush=True)
+        yield good
+
+
+def found_sensor(folder: Path, case: str) -> Path:
+    return folder / "answers" / f"{case}.found" / "sensor.yaml"
+
+
+def steps_of(folder: Path, case: str) -> list[Any]:
+    return (answer_of(folder, case, "diagnose")["answer"] or {}).get("steps") or []
+
+
+def failed_before(folder: Path, case: str) -> bool:
+    asked = [answer_of(folder, case, name) for name in QUESTIONS if answer_file(folder, case, name).exists()]
+    return any(told["answer"] is None for told in asked)
+
+
+def package() -> str:
+    """sha256 of the program that answers: blind is who does not change it with the truth in view."""
+    sources = sorted((Path(__file__).parents[1] / "spadmnist").rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
 def program() -> list[str]:
@@ -179,42 +233,59 @@ def has_verb(verb: str, option: str = "") -> bool:
     return told.returncode == 0 and option in told.stdout
 
 
-def answered(path: Path) -> bool:
-    return path.exists() and json.loads(path.read_text())["answer"] is not None
+def answer_file(folder: Path, case: str, question: str) -> Path:
+    return folder / "answers" / f"{case}.{question}.json"
 
 
-def ask(folder: Path, verb: str, case: str, args: argparse.Namespace) -> tuple[str, bool]:
+def answer_of(folder: Path, case: str, question: str) -> dict[str, Any]:
+    path = answer_file(folder, case, question)
+    return json.loads(path.read_text()) if path.exists() else {"answer": None, "seconds": None, "after_opening": False}
+
+
+def ask(folder: Path, question: str, case: str, args: argparse.Namespace) -> tuple[str, bool]:
     """One question about one case; its answer, or why there is none, goes to a file of its own."""
-    place, target = folder / "cases" / case, folder / "answers" / f"{case}.{verb}.json"
-    told = folder / "answers" / f"{case}.{verb}.partial"
+    place, target = folder / "cases" / case, answer_file(folder, case, question)
+    sensor, found = place / "sensor.yaml", found_sensor(folder, case).parent
+    if question.startswith("unseen"):
+        place = folder / "unseen" / case
+        sensor = found_sensor(folder, case) if question == "unseen-found" else sensor
+    told = target.with_suffix(".partial")
     told.unlink(missing_ok=True)
-    command = [*program(), verb, str(place / "sensor.yaml"), str(place), "--json", str(told), "--seed", "0"]
+    verb = "diagnose" if question == "diagnose" else "compare"
+    options = ["--json", str(told), "--seed", "0"]
     if args.one_job[verb]:
-        command += ["--jobs", "1"]
-    if args.quick and verb == "diagnose":
-        command.append("--quick")
+        options += ["--jobs", "1"]
+    if verb == "diagnose":
+        shutil.rmtree(found, ignore_errors=True)
+        answer_file(folder, case, "unseen-found").unlink(missing_ok=True)
+        options += ["--output", str(found), *(["--quick"] if args.quick else [])]
+    command = [verb, str(sensor), str(place), *options]
     began, status, error = time.perf_counter(), None, ""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=args.timeout)
+        done = subprocess.run([*program(), *command], capture_output=True, text=True, timeout=args.timeout)
         status, error = done.returncode, done.stderr[-2000:]
     except subprocess.TimeoutExpired:
         error = f"no answer in {args.timeout:g} s"
+    seconds = time.perf_counter() - began
     answer = None
     if status in (0, 1) and told.exists():
         answer, error = json.loads(told.read_text()), ""
     told.unlink(missing_ok=True)
-    seconds = time.perf_counter() - began
-    found = {
-        "command": [verb, *command[len(program()) + 1 :]],
+    if verb == "diagnose":
+        for page in found.glob("*.html"):
+            page.unlink()
+    kept = {
+        "command": command,
         "seconds": round(seconds, 1),
         "status": status,
         "error": error,
         "after_opening": (folder / "sealed" / "opened").exists(),
+        "package": package(),
         "answer": answer,
     }
-    target.write_text(json.dumps(found, indent=1))
+    target.write_text(json.dumps(kept, indent=1))
     said = answer["verdict"] if answer else f"no answer ({error.strip().splitlines()[-1] if error.strip() else status})"
-    return f"{case} {verb}: {said}, {seconds:.0f} s", answer is not None
+    return f"{case} {question}: {said}, {seconds:.0f} s", answer is not None
 
 
 # ---- score ------------------------------------------------------------------------------------------------
@@ -222,7 +293,9 @@ def ask(folder: Path, verb: str, case: str, args: argparse.Namespace) -> tuple[s
 
 def opened(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """The truths, and what is wrong with their seals."""
-    cases = {path.name for path in (folder / "cases").iterdir() if path.is_dir()}
+    cases = {
+        path.name for path in (folder / "cases").iterdir() if path.is_dir() and (folder / "unseen" / path.name).is_dir()
+    }
     seals = {path.stem for path in (folder / "cases").glob("*.sha256")}
     truths = {path.stem for path in (folder / "sealed").glob("*.json")}
     faults = [
@@ -238,209 +311,11 @@ def opened(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
             faults.append(f"{name}: the truth is not the one that was sealed")
             continue
         truth = json.loads(text)
-        files = {path.name: digest(path) for path in sorted((folder / "cases" / name).iterdir())}
-        if files != truth["files"]:
-            faults.append(f"{name}: the data are not those that were sealed")
+        for part, sealed in (("cases", truth["files"]), ("unseen", truth["unseen"])):
+            if digests(folder / part / name) != sealed:
+                faults.append(f"{name}: the data in {part} are not those that were sealed")
         found.append(truth)
     return found, faults
-
-
-def label(step: dict[str, Any]) -> str:
-    if step["change"] == "add":
-        return str(step["effect"])
-    if step["change"] == "unknown":
-        return "(outside)"
-    return f"{step['change']} {step['effect']}.{step['parameter']}"
-
-
-def true_label(truth: dict[str, Any]) -> str:
-    if truth["class"] in ("null", "outside", "setup"):
-        return f"({truth['class']})"
-    return " + ".join(sorted(label(step) for step in truth["truth"]))
-
-
-@dataclass
-class Judged:
-    """One case, its answer beside its truth. Without an answer nothing is right."""
-
-    truth: dict[str, Any]
-    answer: dict[str, Any] | None
-    seconds: float | None
-    compared: str | None  # compare's verdict
-    verdict: str = "no answer"
-    given: str = "no answer"  # label of the first finding
-    first_right: bool = False
-    class_right: bool = False
-    both: bool = False
-    exact: bool = False
-    flagged: bool = False  # says that something remains unexplained
-    setup_right: bool = False
-    confident_wrong: bool = False
-    intervals: list[tuple[str, bool, bool]] = field(default_factory=list)  # parameter, covers, by the catalogue's law
-
-    @property
-    def z(self) -> float:
-        return min(self.truth["z"], default=0.0)
-
-    @property
-    def detected(self) -> bool:
-        return self.verdict not in ("adequate", "no answer")
-
-
-def judged(truth: dict[str, Any], answer: dict[str, Any] | None, seconds: float | None, compared: str | None) -> Judged:
-    case = Judged(truth, answer, seconds, compared)
-    if answer is None:
-        return case
-    case.verdict = answer["verdict"]
-    steps = answer.get("steps") or []
-    entries = answer.get("setup") or []
-    said, right = [label(step) for step in steps], [label(step) for step in truth["truth"]]
-    if said and case.verdict != "setup":
-        case.given = said[0]
-    else:
-        case.given = f"({case.verdict})"
-    case.first_right = bool(said) and case.verdict != "setup" and said[0] in right
-    if said:
-        others = [label(other) for other in steps[0].get("alternatives") or []]
-        rivals = {said[0], *others} if case.verdict == "confused" else {said[0]}
-        case.class_right = case.first_right or (len(rivals) <= 3 and bool(rivals & set(right)))
-    case.both = bool(right) and set(right) <= set(said)
-    case.exact = set(right) == set(said) and case.verdict != "setup"
-    case.flagged = case.verdict in ("unexplained", "partly_explained") and bool(answer.get("unexplained"))
-    expected = truth["setup"]
-    if expected and case.verdict in ("setup", "confused"):  # confused: a short gate could do the same
-        case.setup_right = any(
-            entry["quantity"] in expected["quantities"]
-            and (entry.get("capture") is None or entry["capture"] in expected["captures"])
-            for entry in entries
-        )
-    if case.verdict == "setup":
-        case.confident_wrong = not case.setup_right
-    elif case.verdict == "explained":
-        case.confident_wrong = not (case.first_right or case.setup_right)
-    for exact, named in ((True, truth["parameters"]), (False, truth["near"])):
-        for name, value in named.items():
-            effect, parameter = name.split(".")
-            for step in steps:
-                found = (step.get("values") or {}).get(parameter)
-                if step["effect"] == effect and label(step) in right and found and found.get("low") is not None:
-                    case.intervals.append((name, found["low"] <= value <= found["high"], exact))
-    return case
-
-
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """95 % interval of a share (Wilson)."""
-    if trials == 0:
-        return 0.0, 1.0
-    share = successes / trials
-    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    half = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
-def report(cases: list[Judged]) -> str:
-    """The table of the benchmark in Markdown, with everything that went wrong by name."""
-
-    def line(what: str, members: list[Judged], good: Callable[[Judged], bool], must: str, bad: bool = False) -> str:
-        told = [c for c in members if c.answer is not None]
-        # silence is no success: it stays among the cases unless the line counts failures
-        return row(what, sum(map(good, told)), len(told if bad else members), must, len(members) - len(told))
-
-    def row(what: str, successes: int, trials: int, must: str, silent: int = 0) -> str:
-        low, high = wilson(successes, trials)
-        share = f"{100 * successes / trials:.0f} %" if trials else "-"
-        interval = f"{100 * low:.0f}-{100 * high:.0f} %" if trials else "-"
-        return f"| {what} | {successes} of {trials} | {share} | {interval} | {must} | {silent} |"
-
-    def of(kind: str, low: float = -1.0, high: float = math.inf) -> list[Judged]:
-        return [c for c in cases if c.truth["class"] == kind and low <= c.z < high]
-
-    nulls, singles, strong = of("null"), of("single"), of("single", 10)
-    doubles, outside, setups = of("double"), of("outside"), of("setup")
-    out = [
-        "# Hidden-effect challenge",
-        "",
-        f"{len(cases)} cases. Z: the weakest hidden effect's expected significance for an oracle. "
-        "Intervals: Wilson, 95 %. A case without an answer is no success, and none of the failures that a line counts.",
-        "",
-        "| what | cases | share | 95 % | must | no answer |",
-        "| --- | --- | --- | --- | --- | --- |",
-        line("nulls: false alarm (any verdict but adequate)", nulls, lambda c: c.detected, "<= 2.7 %", True),
-    ]
-    compared = [c for c in nulls if c.compared]
-    alarms = sum(c.compared == "fails" for c in compared)
-    out.append(row("nulls: false alarm of `compare`", alarms, len(compared), "1 %", len(nulls) - len(compared)))
-    out.append(line("single, Z >= 10: detected", strong, lambda c: c.detected, ">= 98 %"))
-    out.append(line("single, Z >= 10: right effect first", strong, lambda c: c.first_right, ">= 90 %"))
-    out.append(line("single, Z >= 10: right, or among at most 3 confused", strong, lambda c: c.class_right, ">= 98 %"))
-    bands = [("20 or more", 20, math.inf, ">= 90 %"), ("10-20", 10, 20, ">= 90 %"), ("6-10", 6, 10, ">= 80 %")]
-    bands += [("4-6", 4, 6, ">= 55 %"), ("3-4", 3, 4, ""), ("below 3", -1, 3, "")]
-    for name, low, high, must in bands:
-        out.append(
-            line(f"single, Z {name}: right effect first", of("single", low, high), lambda c: c.first_right, must)
-        )
-    for name, low, high, _ in bands[2:]:
-        out.append(
-            line(
-                f"single, Z {name}: detected",
-                of("single", low, high),
-                lambda c: c.detected,
-                "<= 20 %" if low < 0 else "",
-                bad=low < 0,
-            )
-        )
-    out.append(line("single: exact set of findings", singles, lambda c: c.exact, ""))
-    out.append(line("double: both found", doubles, lambda c: c.both, ">= 80 %"))
-    out.append(line("double: exact set", doubles, lambda c: c.exact, ">= 65 %"))
-    out.append(line("outside the catalogue: flagged as unexplained", outside, lambda c: c.flagged, ">= 80 %"))
-    out.append(line("outside the catalogue: confidently wrong", outside, lambda c: c.confident_wrong, "<= 5 %", True))
-    out.append(line("set-up: said so, and where", setups, lambda c: c.setup_right, ">= 85 %"))
-    everything = [interval for c in cases for interval in c.intervals]
-    for exact, what, must in ((True, "by the catalogue's law", "90-98 %"), (False, "another law", "")):
-        covers = [covered for _, covered, same in everything if same is exact]
-        out.append(row(f"95 % intervals that cover the truth, {what}", sum(covers), len(covers), must))
-    compares = [c for c in cases if c.truth["class"] != "null" and c.z >= 10 and c.compared]
-    out.append(row("`compare` fails, Z >= 10", sum(c.compared == "fails" for c in compares), len(compares), ""))
-    times = [c.seconds for c in cases if c.seconds is not None and c.verdict != "no answer"]
-    if times:
-        out += ["", f"Time of `diagnose`: median {np.median(times):.0f} s, longest {max(times):.0f} s (must: 300 s)."]
-
-    out += ["", "## Truth (rows) and first finding (columns)", ""]
-    table = Counter((true_label(c.truth), c.given) for c in cases)
-    across = sorted({given for _, given in table})
-    out += ["| | " + " | ".join(across) + " |", "| --- |" + " --- |" * len(across)]
-    for name in sorted({name for name, _ in table}):
-        out.append(f"| {name} | " + " | ".join(str(table[name, given] or "") for given in across) + " |")
-
-    def names(title: str, members: list[Judged]) -> None:
-        out.extend(["", f"## {title}: {len(members)}", ""])
-        for c in members:
-            which = f"{c.truth['case']} {c.truth['name']} (Z {c.z:.1f})"
-            out.append(f"- {which}: {c.verdict}, {c.given}; true: {true_label(c.truth)}")
-            out.append(f"  sha256 of measurement.yaml {c.truth['files'].get('measurement.yaml', '?')[:16]}")
-
-    names("Confident wrong answers", [c for c in cases if c.confident_wrong])
-    names("False alarms", [c for c in nulls if c.detected])
-    wrong = [c for c in singles + doubles if c.detected and not c.first_right and not c.confident_wrong]
-    names("Other wrong first findings", wrong)
-    names(
-        "Set-up faults that were missed",
-        [c for c in setups if not c.setup_right and not c.confident_wrong and c.answer],
-    )
-    names(
-        "Outside the catalogue, not flagged",
-        [c for c in outside if not c.flagged and not c.confident_wrong and c.answer],
-    )
-    names("Not seen, Z 4 or more", [c for c in singles + doubles if c.verdict == "adequate" and c.z >= 4])
-    names("No answer", [c for c in cases if c.answer is None])
-    misses = [f"{c.truth['case']} {name}" for c in cases for name, covered, _ in c.intervals if not covered]
-    out += ["", f"## Intervals that miss the truth: {len(misses)}", "", *(f"- {miss}" for miss in misses)]
-    return "\n".join(out) + "\n"
-
-
-def answer_of(folder: Path, case: str, verb: str) -> dict[str, Any]:
-    path = folder / "answers" / f"{case}.{verb}.json"
-    return json.loads(path.read_text()) if path.exists() else {"answer": None, "seconds": None, "after_opening": False}
 
 
 def score(args: argparse.Namespace) -> int:
@@ -451,17 +326,21 @@ def score(args: argparse.Namespace) -> int:
             print(f"challenge: {fault}", file=sys.stderr)
         print("challenge: nothing is scored with a broken seal", file=sys.stderr)
         return 1
-    cases, late = [], 0
+    cases, answers = [], []
     for truth in truths:
-        told = answer_of(folder, truth["case"], "diagnose")
-        compared = answer_of(folder, truth["case"], "compare")
-        late += bool(told["after_opening"] or compared["after_opening"])
-        verdict = compared["answer"]["verdict"] if compared["answer"] else None
-        cases.append(judged(truth, told["answer"], told["seconds"], verdict))
+        if not answer_file(folder, truth["case"], "diagnose").exists():
+            continue  # not yet asked
+        told = {question: answer_of(folder, truth["case"], question) for question in QUESTIONS}
+        answers += list(told.values())
+        cases.append(judged(truth, {name: one["answer"] for name, one in told.items()}, told["diagnose"]["seconds"]))
     (folder / "sealed" / "opened").touch()
-    text = report(cases)
+    text = report(cases, len(truths))
+    blind = {one["package"] for one in answers if one["answer"] and not one["after_opening"]}
+    late = sum(bool(one["after_opening"]) and one["package"] not in blind for one in answers)
     if late:
-        text += f"\n{late} cases were answered after the truth had been opened: this set is no longer blind.\n"
+        text += (
+            f"\n{late} answers are of a program that was changed after the truth had been opened: they are not blind.\n"
+        )
     (folder / "score.md").write_text(text)
     print(text, end="")
     return 0
@@ -490,6 +369,7 @@ def main(arguments: list[str] | None = None) -> int:
     running.add_argument("--jobs", type=int, default=2, help="cases at a time [2]")
     running.add_argument("--quick", action="store_true", help="diagnose --quick")
     running.add_argument("--no-compare", action="store_true", help="leave out spadmnist compare")
+    running.add_argument("--minutes", type=float, default=math.inf, help="ask no new question after so long [no end]")
     running.add_argument("--timeout", type=float, default=1800.0, help="seconds for one answer [1800]")
     scoring = verbs.add_parser("score", help="open the truth, check the seals, write score.md")
     scoring.add_argument("folder", metavar="FOLDER")

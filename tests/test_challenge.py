@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import itertools
 import json
 import math
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ def loaded(name: str) -> Any:
 
 generator = loaded("challenge_generator")
 hidden = loaded("challenge_cases")
+scores = loaded("challenge_score")
 challenge = loaded("challenge")
 World, Capture, Traps = generator.World, generator.Capture, generator.Traps
 
@@ -203,7 +206,7 @@ def test_lamp_and_blinking_keep_their_means() -> None:
 
 
 def test_the_generator_shares_no_code_with_the_package() -> None:
-    for name in ("challenge_generator", "challenge_cases", "challenge"):
+    for name in ("challenge_generator", "challenge_cases", "challenge_score", "challenge"):
         tree = ast.parse((SCRIPTS / f"{name}.py").read_text())
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
@@ -250,7 +253,8 @@ def small() -> Any:
     """Laboratories with little data."""
     kept = {family: dict(kind) for family, kind in hidden.FAMILIES.items()}
     for kind in hidden.FAMILIES.values():
-        kind["captures"] = [(name, w, rate, length / 100) for name, w, rate, length in kind["captures"]]
+        for part in ("captures", "unseen"):
+            kind[part] = [(name, w, rate, length / 100) for name, w, rate, length in kind[part]]
     yield
     hidden.FAMILIES.update(kept)
 
@@ -303,8 +307,15 @@ def test_seals_detect_every_change(made: Path, capsys: pytest.CaptureFixture[str
     sheet = made / "cases" / "case-002" / "sensor.yaml"
     sheet.write_text(sheet.read_text() + "# changed\n")
     assert challenge.main(["score", str(made)]) == 1
-    assert "case-002: the data are not those" in capsys.readouterr().err
+    assert "case-002: the data in cases are not those" in capsys.readouterr().err
     sheet.write_text(sheet.read_text().replace("# changed\n", ""))
+
+    later = made / "unseen" / "case-004" / "dark.h5"
+    data = later.read_bytes()
+    later.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    assert challenge.main(["score", str(made)]) == 1
+    assert "case-004: the data in unseen are not those" in capsys.readouterr().err
+    later.write_bytes(data)
 
     truth.unlink()
     assert challenge.main(["score", str(made)]) == 1
@@ -314,8 +325,8 @@ def test_seals_detect_every_change(made: Path, capsys: pytest.CaptureFixture[str
     assert not (made / "score.md").exists()
     assert challenge.main(["score", str(made)]) == 0
     table = (made / "score.md").read_text()
-    assert "## No answer: 8" in table
-    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - | <= 2.7 % | 4 |" in table
+    assert "0 of 8 cases, those asked so far" in table and "## No answer: 0" in table
+    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - | <= 2.7 % | 0 |" in table
 
 
 def truth_of(kind: str, name: str = "x", **more: Any) -> dict[str, Any]:
@@ -333,8 +344,28 @@ SPREAD = {"change": "per_pixel", "effect": "detection", "parameter": "pdp"}
 ADD, MAP = ("add", "crosstalk", None), ("per_pixel", "detection", "pdp")
 
 
-def judge(truth: dict[str, Any], told: dict[str, Any] | None, compared: str | None = None) -> Any:
-    return challenge.judged(truth, told, 10.0, compared)
+def judge(
+    truth: dict[str, Any],
+    told: dict[str, Any] | None,
+    compared: str | None = None,
+    before: float | None = None,
+    after: float | None = None,
+    checks: Sequence[dict[str, Any]] = (),
+) -> Any:
+    """before, after: misfits on the unseen captures."""
+    answers: dict[str, Any] = {"diagnose": told}
+    if compared:
+        answers["compare"] = {"verdict": compared, "checks": list(checks)}
+    for name, misfit in (("unseen-start", before), ("unseen-found", after)):
+        if misfit is not None:
+            wrong = check("neighbours", "flat", 1e-12 if misfit > 2 else 1e-4, misfit, passes=misfit < 1.3)
+            rest = [check("rows", "flat", 0.5, 0.3, passes=True), check("rows", "dark", 0.5, 1.4, passes=True)]
+            answers[name] = {"verdict": "fails", "misfit": misfit, "checks": [wrong, *rest]}
+    return scores.judged(truth, answers, 10.0)
+
+
+def check(statistic: str, capture: str | None, p: float, misfit: float = 10.0, passes: bool = False) -> dict[str, Any]:
+    return {"statistic": statistic, "capture": capture, "p_value": p, "misfit": misfit, "passes": passes}
 
 
 def test_singles_are_judged() -> None:
@@ -343,7 +374,11 @@ def test_singles_are_judged() -> None:
     told["steps"][0]["values"] = {"probability": {"value": 0.005, "low": 0.004, "high": 0.0049}}
     right = judge(truth, told)
     assert right.first_right and right.class_right and right.exact and not right.confident_wrong
-    assert right.intervals == [("crosstalk.probability", False, True)]
+    (found,) = right.found
+    assert (found.name, found.covers, found.exact) == ("crosstalk.probability", False, True)
+    told["steps"][0]["values"]["probability"] |= {"low": 0.0048, "high": 0.0058, "value": 0.0053}
+    (found,) = judge(truth, told).found
+    assert found.covers and abs(found.pull - 0.0003 / (0.001 / 3.92)) < 0.01
     more = judge(truth, answer("explained", ADD, MAP))
     assert more.first_right and not more.exact and not more.confident_wrong
     wrong = judge(truth, answer("explained", MAP))
@@ -399,7 +434,7 @@ def test_the_table_counts_everything() -> None:
         judge({**single, "name": "single-d", "z": [5.0]}, None),
         judge(truth_of("outside", "out", truth=hidden.UNKNOWN), answer("explained", ADD)),
     ]
-    text = challenge.report(cases)
+    text = scores.report(cases)
     for line in (
         "25 cases.",
         "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % | <= 2.7 % | 0 |",
@@ -419,37 +454,239 @@ def test_the_table_counts_everything() -> None:
 
 def test_wilson() -> None:
     """The textbook's 10 of 100: 5.5 to 17.4 %."""
-    low, high = challenge.wilson(10, 100)
+    low, high = scores.wilson(10, 100)
     assert (round(low, 4), round(high, 4)) == (0.0552, 0.1744)
-    assert challenge.wilson(0, 0) == (0.0, 1.0)
+    assert scores.wilson(0, 0) == (0.0, 1.0)
 
 
-def test_answers_are_kept_and_asked_for_once(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a program in the place of spadmnist that finds crosstalk in everything but fails once."""
-    stub = made / "stub.py"
-    stub.write_text(
-        "import json, sys\n"
-        "if '--help' in sys.argv: sys.exit(0)\n"
-        "if 'case-002' in sys.argv[2] and sys.argv[1] == 'diagnose': sys.exit('no memory')\n"
-        f"told = {answer('explained', ADD)!r} if sys.argv[1] == 'diagnose' else dict(verdict='fails')\n"
-        "json.dump(told, open(sys.argv[sys.argv.index('--json') + 1], 'w'))\n"
+def test_upper_limits_of_faint_effects() -> None:
+    faint = truth_of("single", truth=[CROSSTALK], z=[2.0], parameters={"crosstalk.probability": 0.001})
+    cases = []
+    for limit in (0.0012, 0.0008):
+        told = answer("adequate")
+        told["excluded"] = [
+            {"effect": "crosstalk", "parameter": "probability", "upper_limit_95": limit},
+            {"effect": "flicker", "parameter": "amplitude", "upper_limit_95": 1e-9},  # not what is hidden
+        ]
+        cases.append(judge(faint, told))
+    assert [case.limits for case in cases] == [[("crosstalk.probability", True)], [("crosstalk.probability", False)]]
+    assert "| single, Z below 3: upper limit above the truth | 1 of 2 | 50 % |" in scores.report(cases)
+
+
+def test_parameters_have_a_table() -> None:
+    truth = truth_of("single", truth=[CROSSTALK], parameters={"crosstalk.probability": 0.005})
+    cases = []
+    for deviations in (-1.0, 0.5, 3.0):
+        value = 0.005 + deviations * 0.0001
+        told = answer("explained", ADD)
+        told["steps"][0]["values"] = {
+            "probability": {"value": value, "low": value - 1.96e-4, "high": value + 1.96e-4, "unit": ""}
+        }
+        cases.append(judge(truth, told))
+    text = scores.report(cases)
+    assert "| crosstalk.probability | the catalogue's | 2 of 3 | +0.50 |  | 1.00 |" in text
+    assert "| (all) | the catalogue's | 2 of 3 | +0.50 | within 0.3 | 1.00 |" in text
+    assert "## Intervals that miss the truth: 1\n\n- x crosstalk.probability (+3.0)" in text
+
+
+def test_the_rule_sheet_reads_the_clearest_failure() -> None:
+    spectrum = check("spectrum", "flat", 1e-9)
+    assert scores.by_the_rules({"checks": [spectrum, check("neighbours", "flat", 1e-12)]}) == "crosstalk"
+    assert scores.by_the_rules({"checks": [spectrum, check("pixel_map", "dark", 1e-9, 20.0)]}) == (
+        "per_pixel dark_counts.rate"
     )
-    monkeypatch.setattr(challenge, "program", lambda: [sys.executable, str(stub)])
-    assert challenge.main(["run", str(made)]) == 1
+    assert scores.by_the_rules({"checks": [check("pixel_map", "flat", 1e-3)]}) == "per_pixel detection.pdp"
+    assert scores.by_the_rules({"checks": [check("pixel_map", "flat", 1e-3, passes=True)]}) == "(adequate)"
+    assert scores.by_the_rules({"checks": [check("gaps", "flat", 1e-3)]}) == "(unexplained)"
+    known = {row.split()[0] for row in _listed("statistics")[1:] if row[:1].isalpha()}
+    assert {name for name in scores.RULES if name not in ("rate", "light")} <= known
+    effects = {row.split()[0] for row in _listed("effects")[1:] if row[:1].isalpha()}
+    for said in {*scores.RULES.values(), *scores.RULES_IN_THE_DARK.values()} - {"(setup)"}:
+        assert said.split()[-1].split(".")[0] in effects, said
+
+    single = truth_of("single", truth=[CROSSTALK])
+    cases = [judge(single, answer("explained", ADD), "fails", checks=[spectrum])]
+    cases += [judge(single, answer("explained", MAP), "fails", checks=[check("neighbours", "dark", 1e-9)])]
+    text = scores.report(cases)
+    assert "| baseline, a rule sheet on `compare`: single, Z >= 10: right effect | 1 of 2 | 50 % |" in text
+
+
+def _listed(what: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-m", "spadmnist.cli", what], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def test_the_error_that_findings_remove() -> None:
+    """Nulls leave 1.1 on average, scattering by 0.1: from 11.1 to 2.1 a finding removes 9 of 10."""
+    nulls = [judge(truth_of("null", z=[]), answer("adequate"), before=value) for value in (1.0, 1.1, 1.2)]
+    single = truth_of("single", "single-a", truth=[CROSSTALK])
+
+    def told(*more: Any) -> str:
+        return scores.report([*nulls, *more])
+
+    def row(text: str, kind: str, what: str) -> str:
+        (found,) = [line for line in text.splitlines() if f"| {kind}, Z >= 10: share" in line and what in line]
+        return found.split(" | ", 1)[1]
+
+    good = judge(single, answer("explained", ADD), before=11.1, after=2.1)
+    text = told(good)
+    assert "| nulls: misfit of the right model | 1.100, sd 0.082 | 1 | 3 of 3 |" in text
+    assert row(text, "single", "median") == "0.900 | >= 0.90 | 1 of 1 |"
+    assert "Error that stayed: less than 0.75 removed: 0" in text
+    assert "| crosstalk | 1 | 1 | 1 | 1 | 1 | 0 | 0.90 |" in text
+    # nothing found, or no answer: nothing removed
+    for silent in (judge(single, answer("adequate"), before=11.1), judge(single, None, before=11.1)):
+        text = told(good, silent)
+        assert row(text, "single", "median") == "0.450 | >= 0.90 | 2 of 2 |"
+        assert row(text, "single", "10th") == "0.090 | >= 0.75 | 2 of 2 |"
+        assert "Error that stayed: less than 0.75 removed: 1" in text
+    # an error that does not show clearly, or a found sensor that nobody has judged yet, says nothing
+    hardly = judge(single, answer("explained", ADD), before=1.5, after=1.0)
+    unasked = judge(single, answer("explained", ADD), before=11.1)
+    faint = judge({**single, "z": [8.0]}, answer("explained", ADD), before=11.1, after=9.0)
+    assert row(told(good, hardly, unasked, faint), "single", "median") == "0.900 | >= 0.90 | 1 of 3 |"
+    double = truth_of("double", truth=[CROSSTALK, SPREAD])
+    text = told(judge(double, answer("partly_explained", ADD), before=5.1, after=3.1))
+    assert row(text, "double", "median") == "0.500 | >= 0.90 | 1 of 1 |" and row(text, "single", "10th")[0] == "-"
+    assert "No null has been asked" in scores.report([good])
+
+    # what the found sensor breaks counts as well
+    start = {"misfit": 2.0, "checks": [check("rows", "a", 1e-12, 9.0), check("trend", "a", 0.5, 1.0, passes=True)]}
+    found = {"misfit": 2.0, "checks": [check("rows", "a", 0.5, 1.0, passes=True), check("trend", "a", 1e-9, 5.0)]}
+    assert scores.errors(start, found) == (5.0, 3.0)
+    assert scores.errors(start, None) == (9.0, None)
+    assert scores.errors(found, start) == (3.0, 5.0)
+
+
+STUB = """
+import json, sys
+from pathlib import Path
+if '--help' in sys.argv: sys.exit(0)
+verb, sensor, place = sys.argv[1:4]
+given = dict(zip(sys.argv[4::2], sys.argv[5::2]))
+log = Path(__file__).with_suffix('.log')
+log.write_text((log.read_text() if log.exists() else '') + f'{verb} {sensor} {place}\\n')
+if 'case-002' in place and verb == 'diagnose': sys.exit('no memory')
+if verb == 'diagnose':
+    told = ANSWER if 'case-001' not in place else dict(ANSWER, verdict='adequate', steps=[])
+    found = Path(given['--output'])
+    found.mkdir()
+    (found / 'sensor.yaml').write_text('sensor: {}')
+    (found / 'report.html').write_text('large')
+else:
+    told = dict(verdict='fails', misfit=1.0 if '.found' in sensor else 2.0, checks=[])
+json.dump(told, open(given['--json'], 'w'))
+"""
+
+
+@pytest.fixture
+def stub(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program in the place of spadmnist that finds crosstalk in everything but the first case; the second fails."""
+    path = made / "stub.py"
+    path.write_text(STUB.replace("ANSWER", repr(answer("explained", ADD))))
+    monkeypatch.setattr(challenge, "program", lambda: [sys.executable, str(path)])
+    return path
+
+
+def test_answers_are_kept_and_asked_for_once(made: Path, stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert challenge.main(["run", str(made), "--jobs", "1"]) == 1
     failed = json.loads((made / "answers" / "case-002.diagnose.json").read_text())
     assert failed["answer"] is None and "no memory" in failed["error"]
     first = (made / "answers" / "case-001.diagnose.json").read_text()
+    # the unseen captures are asked about apart: of the data sheet's sensor always, of another one where there is one
+    asked = stub.with_suffix(".log").read_text().splitlines()
+    unseen = [line for line in asked if str(made / "unseen") in line]
+    assert all(line.startswith("compare ") for line in unseen) and len(unseen) == 8 + 6
+    assert [line.split()[1] for line in unseen if "/case-003" in line.split()[2]] == [
+        str(made / "cases" / "case-003" / "sensor.yaml"),
+        str(made / "answers" / "case-003.found" / "sensor.yaml"),
+    ]
+    assert not [line for line in asked if "sealed" in line]
+    assert not list((made / "answers").rglob("*.html")) and len(list((made / "answers").rglob("sensor.yaml"))) == 7
 
     stub.write_text(stub.read_text().replace("sys.exit('no memory')", "pass"))
     assert challenge.main(["score", str(made)]) == 0
     assert "## No answer: 1" in (made / "score.md").read_text()
-    assert "no longer blind" not in (made / "score.md").read_text()
-    assert challenge.main(["run", str(made)]) == 0  # only what is missing
+    assert "not blind" not in (made / "score.md").read_text()
+    before = len(asked)
+    assert challenge.main(["run", str(made), "--jobs", "1"]) == 0  # only what is missing
+    again = stub.with_suffix(".log").read_text().splitlines()[before:]
+    assert [line.split()[0] for line in again] == ["diagnose", "compare"] and all("case-002" in line for line in again)
     assert (made / "answers" / "case-001.diagnose.json").read_text() == first
     assert challenge.main(["score", str(made)]) == 0
     table = (made / "score.md").read_text()
-    assert "1 cases were answered after the truth had been opened" in table
+    assert "not blind" not in table  # the same program
     assert "| nulls: false alarm of `compare` | 4 of 4 |" in table
+
+    monkeypatch.setattr(challenge, "package", lambda: "changed")
+    (made / "answers" / "case-002.diagnose.json").unlink()
+    assert challenge.main(["run", str(made), "--jobs", "1"]) == 0
+    assert challenge.main(["score", str(made)]) == 0
+    assert "2 answers are of a program that was changed after" in (made / "score.md").read_text()
+
+
+def test_a_part_of_the_cases_is_scored(
+    made: Path, stub: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert challenge.main(["run", str(made), "--jobs", "1", "--minutes", "0"]) == 0
+    assert not stub.with_suffix(".log").exists()
+    assert "8 cases not yet asked: run again" in capsys.readouterr().out
+    # each question takes a minute
+    clock = itertools.count(0.0, 60.0)
+    monkeypatch.setattr(challenge.time, "monotonic", lambda: next(clock))
+    assert challenge.main(["run", str(made), "--jobs", "1", "--minutes", "9"]) == 1
+    monkeypatch.undo()
+    asked = {path.name.split(".")[0] for path in (made / "answers").glob("*.diagnose.json")}
+    assert asked == {"case-001", "case-002", "case-003"}
+    (made / "answers" / "case-004.compare.json").write_text((made / "answers" / "case-001.compare.json").read_text())
+    assert challenge.main(["score", str(made)]) == 0
+    table = (made / "score.md").read_text()
+    assert "3 of 8 cases, those asked so far" in table
+    assert "## No answer: 1\n\n- case-002 " in table  # the one that failed
+
+
+def test_what_has_failed_is_asked_last(made: Path, stub: Path) -> None:
+    assert challenge.main(["run", str(made), "--jobs", "1", "--no-compare"]) == 1
+    for path in (made / "answers").glob("case-00[5-8].diagnose.json"):
+        path.unlink()
+    stub.with_suffix(".log").unlink()
+    assert challenge.main(["run", str(made), "--jobs", "1", "--no-compare"]) == 1
+    asked = [Path(line.split()[2]).name for line in stub.with_suffix(".log").read_text().splitlines()]
+    assert asked == ["case-005", "case-006", "case-007", "case-008", "case-002"]
+
+
+# ---- unseen captures --------------------------------------------------------------------------------------
+
+
+def test_unseen_captures_are_others(made: Path) -> None:
+    for place in sorted((made / "unseen").iterdir()):
+        shown, later = measurement.open(made / "cases" / place.name), measurement.open(place)
+        truth = json.loads((made / "sealed" / f"{place.name}.json").read_text())
+        assert set(truth["unseen"]) == {path.name for path in place.iterdir()}
+        levels = [{c.light.level for c in m.captures if not c.light.dark} for m in (shown, later)]
+        assert len(later.captures) == 3 and len(levels[1]) == 2 and not levels[0] & levels[1]
+        length = [sum(c.conditions.exposure for c in m.captures) for m in (shown, later)]
+        assert 0.2 < length[1] / length[0] < 0.6
+
+
+def test_the_right_sensor_removes_the_error_of_unseen_captures(small: Any, tmp_path: Path) -> None:
+    """spadmnist itself, on the unseen captures of a sensor with crosstalk: without and with it."""
+    folder = tmp_path / "out"
+    assert challenge.main(["make", "tr-crosstalk-obvious", "-o", str(folder), "--seed", "3", "--jobs", "1"]) == 0
+    side = json.loads((folder / "sealed" / "case-001.json").read_text())["parameters"]["crosstalk.probability"]
+    sheet = yaml.safe_load((folder / "cases" / "case-001" / "sensor.yaml").read_text())
+    sheet["sensor"]["effects"]["crosstalk"] = {"probability": side, "diagonal_ratio": 0.16, "delay": "1 ns"}
+    place = folder / "answers" / "case-001.found" / "sensor.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(yaml.safe_dump(sheet))
+    step = answer("explained", ADD)
+    for name in ("compare", "diagnose"):
+        told = {"answer": step, "seconds": 1.0, "after_opening": False, "package": "x"}
+        (folder / "answers" / f"case-001.{name}.json").write_text(json.dumps(told))
+    assert challenge.main(["run", str(folder), "--jobs", "1"]) == 0
+    start, found = (challenge.answer_of(folder, "case-001", f"unseen-{name}")["answer"] for name in ("start", "found"))
+    before, after = scores.errors(start, found)
+    assert before > 3 and after < 1 + 0.1 * (before - 1), (before, after)
 
 
 @pytest.mark.slow
