@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from joblib import Parallel
 
 from spadmnist import config
 from spadmnist import measurement as measurements
+from spadmnist.cli import cli
 from spadmnist.criticism import candidates, diagnose, fit, mapping
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
@@ -91,3 +95,98 @@ def test_what_cannot_be_settled_is_told(tmp_path, made):
         diagnose.fitted(sensor, data, free=["dead_time"])
     with pytest.raises(InputError, match="nothing is to be settled"):
         diagnose.fitted(sensor, data)
+
+
+class _Law:
+    """A bench whose models are numbers (a, b), and whose residuals are a function of them."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def moved(self, state, models, few):
+        return models
+
+    def residuals(self, state, model):
+        return {("one", "cells"): self.function(*model.values())}
+
+
+def profile_of(function, slopes, own, dials, point):
+    cell = ("one", "cells")
+    state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(len(slopes))}, {}, [])
+    covariance = fit.covariance_of(slopes, own)
+    z = {cell: function(*point)}
+    settled = fit.Settled(dials, np.array(point), covariance, z, {cell: slopes}, 0.0, {})
+    return settled, fit.profiled(_Law(function), state, settled, lambda values: values)
+
+
+def test_a_profile_is_the_covariance_where_all_is_linear():
+    """Also where cells are not independent, and where two numbers do nearly the same."""
+    rng = np.random.default_rng(5)
+    slopes = np.stack([np.ones(40), np.linspace(0.5, 1.5, 40)], axis=1)
+    own = rng.standard_normal((96, 40)) + 0.6 * rng.standard_normal((96, 1))
+    data = rng.standard_normal(40)
+    data -= slopes @ np.linalg.lstsq(slopes, data, rcond=None)[0]
+    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    settled, ends = profile_of(lambda a, b: data + slopes @ [a, b], slopes, own, dials, [0.0, 0.0])
+    for i, dial in enumerate(dials):
+        assert ends[dial.key] == pytest.approx(settled.interval(i)[1:], rel=1e-3)
+
+
+def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
+    rng = np.random.default_rng(6)
+    own = rng.standard_normal((960, 30))
+    dial = candidates.Dial("any", "a", "", -0.3, 5.0, 0.0)
+    law = lambda a: np.full(30, np.expm1(a))  # noqa: E731
+    settled, ends = profile_of(law, np.ones((30, 1)), own, (dial,), [0.0])
+    wide = 1.96 * float(np.sqrt(settled.covariance[0, 0]))
+    low, high = ends[dial.key]
+    assert low == -0.3, "at -0.3 the squares have risen by less"
+    assert high == pytest.approx(np.log1p(wide), rel=0.03)
+    assert high < 0.9 * wide
+
+
+PLAN = """format: spadmnist-measurement/1
+name: lab
+layout: {rows: 8, columns: 8}
+captures:
+  - {id: dark, modality: tr, light: {kind: dark}, exposure: 1000 ms, file: dark.h5}
+  - {id: flat, modality: tr, exposure: 50 ms, file: flat.h5,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 40 nW/cm^2, relative_uncertainty: 0.02}}
+  - {id: bright, modality: tr, exposure: 2 ms, file: bright.h5,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 4000 nW/cm^2, relative_uncertainty: 0.02}}
+"""
+
+
+def answer_of(tmp_path, sensor, name):
+    """(values by parameter, what was printed) of `fit` on the command line."""
+    (tmp_path / f"{name}.yaml").write_text(sensor)
+    free = ["--free", "dead_time.duration", "--free", "afterpulsing.probability"]
+    out = ["-o", str(tmp_path / f"{name}-next.yaml"), "--json", str(tmp_path / f"{name}.json"), "--jobs", "1"]
+    done = CliRunner().invoke(cli, ["fit", str(tmp_path / f"{name}.yaml"), str(tmp_path / "data"), *free, *out])
+    assert done.exit_code == 0, done.output
+    steps = json.loads((tmp_path / f"{name}.json").read_text())["steps"]
+    return {key: value for step in steps for key, value in step["values"].items()}, done.output
+
+
+@pytest.mark.slow
+def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
+    """The same numbers of the same data; simulated only where the sensor has what the likelihood does not know."""
+    start = SENSOR.replace("tdc:", "afterpulsing: {probability: 0.7 %, lifetime: 25 ns}\n    tdc:")
+    (tmp_path / "true.yaml").write_text(start.replace("0.7 %", "3 %").replace("50 ns", "60 ns"))
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "plan" / "measurement.yaml").write_text(PLAN)
+    where = [str(tmp_path / name) for name in ("true.yaml", "plan", "data")]
+    done = CliRunner().invoke(cli, ["simulate", *where[:2], "-o", where[2], "--seed", "7"])
+    assert done.exit_code == 0, done.output
+    exact, said = answer_of(tmp_path, start, "exact")
+    assert "by likelihood" in said
+    other, said = answer_of(
+        tmp_path, start.replace("tdc:", "crosstalk: {probability: 0.000001}\n    tdc:"), "simulated"
+    )
+    assert "there is no likelihood of crosstalk" in said
+    for name, truth in (("duration", 60e-9), ("probability", 0.03)):
+        one, two = exact[name], other[name]
+        assert (one["method"], two["method"]) == ("likelihood", "simulation")
+        assert one["low"] < truth < one["high"]
+        assert one["low"] < two["high"] and two["low"] < one["high"]
+        assert one["high"] - one["low"] < 1.1 * (two["high"] - two["low"])

@@ -31,18 +31,19 @@ def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class Value:
-    """A settled value with its 95 % interval, SI."""
+    """A settled value with its 95 % interval, SI. method: how it was settled, where that was a choice."""
 
     value: float
     low: float | None
     high: float | None
     unit: str = ""
+    method: str = ""
 
     def as_data(self) -> dict[str, Any]:
         out: dict[str, Any] = {"value": plain(self.value)}
         if self.low is not None and self.high is not None:
             out |= {"low": plain(self.low), "high": plain(self.high)}
-        return out | {"unit": self.unit}
+        return out | {"unit": self.unit} | ({"method": self.method} if self.method else {})
 
 
 @dataclass
@@ -180,6 +181,7 @@ def table(found: Diagnosis) -> str:
     for number, step in enumerate(found.steps, 1):
         parts = [f"{name} {shown(v)}" for name, v in step.values.items()]
         text = f"{number}. {title(step.change)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
+        text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
         lines += textwrap.wrap(text, 100, subsequent_indent="   ")
     for entry in found.setup:
         f = entry["factor"]

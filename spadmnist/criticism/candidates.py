@@ -23,13 +23,15 @@ Values = Mapping[Key, Any]
 
 _SHAPES = 4  # values of a shape that are tried between the ends of where it is looked for
 _MOST = 6  # templates of one candidate
+_LEAST = 1e-6  # of where a number is looked for, that it may lack
 
 
 @dataclass(frozen=True)
 class Dial:
     """A number that may be turned: where it is looked for, and whether on a scale of ratios.
 
-    off: where the effect vanishes, None for a shape. whole: there are whole numbers of it only.
+    off: where the effect vanishes, None for a shape; if that is the upper end, the scale is that of what lacks.
+    whole: there are whole numbers of it only.
     """
 
     effect: str
@@ -48,13 +50,32 @@ class Dial:
     def log(self) -> bool:
         return self.low > 0
 
+    @property
+    def lacks(self) -> bool:
+        """Is what lacks at the upper end what counts?"""
+        return self.log and self.off == self.high
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Where its coordinate lies."""
+        low, high = sorted((self.coordinate(self.low), self.coordinate(self.high)))
+        return low, high
+
     def coordinate(self, value: float) -> float:
+        if self.lacks:
+            return math.log(max(self.high - value, _LEAST * (self.high - self.low)))
         return math.log(max(value, 1e-300)) if self.log else value
 
     def value(self, coordinate: float) -> float:
         value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
+        value = self.high - value if self.lacks else value
         value = float(round(value)) if self.whole else value
         return min(max(value, self.low), self.high)
+
+    def interval(self, low: float, high: float) -> tuple[float, float]:
+        """(low, high) of the values between two coordinates."""
+        ends = self.value(low), self.value(high)
+        return min(ends), max(ends)
 
     def scaled(self, value: float, factor: float) -> float:
         """The value whose distance from `off` is so many times that of `value`."""
@@ -197,7 +218,7 @@ def _maps(effect: Effect) -> Iterator[Change]:
             continue  # it carries the map of another one
         carrier = multipliers[0] if declared.by_wavelength and multipliers else name
         at = getattr(effect, carrier)
-        if isinstance(at, (ByWavelength, bool)) or isinstance(value, np.ndarray):
+        if isinstance(at, (ByWavelength, bool, np.ndarray)) or isinstance(value, np.ndarray):
             continue
         yield Change("per_pixel", effect.name, name, (), per="pixel", carrier=(effect.name, carrier), relative=True)
 
@@ -221,15 +242,21 @@ def templates(change: Change) -> list[dict[Key, float]]:
     for shape in shapes:
         about = {d.key: x for d, x in zip(change.shapes, shape, strict=True)}
         for dial in change.strengths:
-            out.append({**dict(change.fixed), **about, dial.key: first_strength(dial)})
+            out += [{**dict(change.fixed), **about, dial.key: x} for x in first_strengths(dial)]
     return out or [dict(change.fixed)]
 
 
-def first_strength(dial: Dial) -> float:
-    """A strength that should show and not saturate."""
-    off = dial.off or 0.0
-    if dial.low < 0 or off == dial.high:
-        return off + (0.1 if off < dial.high else -0.1) * (dial.high - dial.low)
+def first_strengths(dial: Dial) -> list[float]:
+    """Strengths that should show and not saturate: one, or two where little is seen by other signs than much."""
+    off, whole = dial.off or 0.0, dial.high - dial.low
+    if dial.lacks:
+        return [off - x * whole for x in (0.2, 2e-3, 2e-4)]
+    if off == dial.high:
+        return [off - 0.1 * whole]
+    if dial.low < 0:
+        return [off + 0.1 * whole]
     if dial.low <= off <= dial.high and off > 0:
-        return min(off * 1.1, dial.high)
-    return math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * (dial.high - dial.low)
+        # an edge that has moved is not found by a longer move
+        moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if dial.unit == "s" else (0.1,)
+        return [min(max(off * (1 + x), dial.low), dial.high) for x in moves]
+    return [math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * whole]

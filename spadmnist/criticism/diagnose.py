@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import compare as comparing
-from . import fit, mapping, outlook, recordings, setups
+from . import fit, likelihood, mapping, outlook, recordings, setups
 from .answer import Diagnosis, Step, Trace, Value, plain, title
 from .candidates import Change, Key, changes
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
@@ -35,6 +35,7 @@ _LEAST_GAIN = 12.0  # in chi square, of a step
 _TRACE = 5e-4  # p-value of a trace that is followed where no check fails by itself
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 _WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
+_LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -133,7 +134,7 @@ def _diagnosed(
         if not failed:
             # no check fails by itself: does any candidate's whole trace stand out?
             bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
-            tried = search.scan(course.state, everywhere=True)
+            tried = search.scan(course.state, everywhere=True, known=tried)
             if search.chance(course.state, tried, course.values) > _TRACE:
                 break
         if failed and all(b.cell[0] == "" for b in failed):
@@ -149,6 +150,8 @@ def _diagnosed(
             first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
             bench.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
             tried = search.scan(course.state)
+        held = {d.key for s in course.steps for d in s.dials}  # settled anew with every step: no finding of their own
+        tried = [t for t in tried if t.change.kind != "set" or not held & {d.key for d in t.change.dials}]
         bench.say(f"step {number}: the best of them on all captures")
         second = search.structured(course.state, search.again(course.state, course.values, tried))
         if not second:
@@ -170,6 +173,8 @@ def _diagnosed(
             course.back_to(earlier)  # nothing was wrong before, now something is
             break
         if failed and fell - course.misfit < 0.05 * (fell - 1):
+            if course.misfit > fell:
+                course.back_to(earlier)
             break
     if course.steps:
         _drop_needless(course)
@@ -303,6 +308,7 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
     sensors, maps = _model(course)
     state = bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
+    errors = _errors(course, settled)
     if settled is not None and settled.dials != dials:
         settled = None
     for step in course.steps:
@@ -319,7 +325,7 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
     # from where it nearly is right: the scatter of the cells is that of the model with the effect
     for turn in range(_AGAIN + 1 if dials else 0):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW)
+        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors)
         if isinstance(closer, str):
             break
         settled = closer
@@ -343,9 +349,7 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
             for dial in step.dials:
                 i = place[dial.key]
                 half, u = 1.96 * math.sqrt(max(float(covariance[i, i]), 0.0)), float(point[i])
-                step.values[dial.parameter] = Value(
-                    dial.value(u), dial.value(u - half), dial.value(u + half), dial.unit
-                )
+                step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
     else:
         course.judged = None
@@ -358,6 +362,19 @@ def _settle_all(course: _Course, settled: Settled | None = None) -> None:
         for (_, name), value in step.change.fixed:
             if name not in step.values and isinstance(value, (bool, int, float)):
                 step.values[name] = Value(float(value), None, None)
+
+
+def _errors(course: _Course, settled: Settled | None) -> dict[Key, float]:
+    """Standard deviations of the coordinates of what is settled already."""
+    out = {}
+    for step in course.steps:
+        for dial in step.dials:
+            v = step.values.get(dial.parameter)
+            if v is not None and v.low is not None and v.high is not None:
+                out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * 1.96)
+    if settled is not None:
+        out |= {d.key: math.sqrt(max(float(settled.covariance[i, i]), 0.0)) for i, d in enumerate(settled.dials)}
+    return out
 
 
 def _model(course: _Course) -> tuple[Sensors, dict[Key, mapping.Map]]:
@@ -437,7 +454,7 @@ def _drop_needless(course: _Course) -> None:
         if isinstance(moved, str):
             continue
         others = tuple(d for s in course.steps if s is not step for d in s.dials)
-        z = bench.residuals(course.state, moved, noisy=True)
+        z = bench.residuals(course.state, moved)
         loss = course.search.square(z) - course.search.square(course.state.residuals)
         if loss > 30 and not others:
             continue
@@ -466,7 +483,10 @@ def _drop_mimics(course: _Course, start: State) -> None:
     The cells that a step speaks of must be in order with it; and of totals alone, whatever remains may be the cause.
     """
     while course.steps and course.failed:
-        kept = [s for s in course.steps if _own_cells_clean(s, course.state)]
+        # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
+        left = {id(s): _left_of_own(s, course.state) for s in course.steps}
+        worst = max(course.steps, key=lambda s: left[id(s)])
+        kept = [s for s in course.steps if s is not worst or left[id(s)] < 1]
         if fit.misfit(course.state, course.state.residuals) > fit.misfit(start, start.residuals):
             kept = []
         if len(kept) == len(course.steps):
@@ -480,9 +500,9 @@ def _drop_mimics(course: _Course, start: State) -> None:
             course.rung("without what only looks alike")
 
 
-def _own_cells_clean(step: Step, state: State) -> bool:
-    """Are the cells that a step speaks of in order? Otherwise it only happens to look like what is there."""
-    weight, after, before, shape = 0.0, 0.0, 0.0, 0.0
+def _left_of_own(step: Step, state: State) -> float:
+    """What is left of the cells that a step speaks of; from 1 on it only happens to look like what is there."""
+    weight, after, before, shape, shapes = 0.0, 0.0, 0.0, 0.0, 0.0
     for cell, t in step.template.items():
         z, old = state.residuals.get(cell), step.before.get(cell)
         if z is None or old is None or len(z) != len(t) or len(old) != len(t):
@@ -490,10 +510,11 @@ def _own_cells_clean(step: Step, state: State) -> bool:
         w = t**2
         weight, after, before = weight + float(w.sum()), after + float(w @ z**2), before + float(w @ old**2)
         if cell != RATES:
-            shape += float(old @ old - z @ z)
-    if weight <= 0 or shape < _LEAST_GAIN:
-        return False
-    return after / weight < max(4.0, 0.05 * before / weight)
+            shape, shapes = shape + float(old @ old - z @ z), shapes + float(w.sum())
+    # of totals alone, whatever remains may be the cause
+    if weight <= 0 or shape < _LEAST_GAIN or shapes < 0.5 * weight:
+        return math.inf
+    return after / weight / max(4.0, _LEFT * before / weight)
 
 
 def _alternatives(
@@ -610,6 +631,7 @@ def fitted(
 ) -> Diagnosis:
     """Settle what the caller names: whole effects (`add`), "effect.parameter" (`free`), and maps (`per_pixel`).
 
+    By the exact likelihood where all that is asked for and all that the sensor has is in it, otherwise by simulation.
     Raises InputError where there is no such effect or parameter.
     """
     say = progress or (lambda what: None)
@@ -625,13 +647,14 @@ def fitted(
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = _begun(bench)
         start, before = course.state, course.misfit
-        for change in sorted(wanted, key=lambda c: bool(c.carrier)):
-            say(f"settling {title(change)}")
-            if change.carrier:
-                best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={})
-            else:
-                best = course.search.refine(course.state, _started(course, change), 5)
-            _accept(course, best, math.sqrt(max(best.gain, 0.0)))
+        say("settling " + ", ".join(title(change) for change in wanted))
+        data = [measurement.recording(c.id, bench.start) for c in measurement.captures if c.mean is None]
+        exact = likelihood.settled(bench.start, data, wanted) if len(data) == len(bench.seen) else "a mean alone"
+        if isinstance(exact, str):
+            say(f"by simulation, for there is no likelihood of {exact}")
+            _by_simulation(course, wanted)
+        else:
+            _by_likelihood(course, wanted, exact)
         left = course.failed
         return Diagnosis(
             bench.start.name,
@@ -654,6 +677,53 @@ def fitted(
             bench.simulations,
             bench.dark,
         )
+
+
+def _by_likelihood(course: _Course, wanted: Sequence[Change], exact: likelihood.Exact) -> None:
+    """Steps with these numbers; their misfit is found as that of all others."""
+    bench, before = course.bench, course.state
+    for change, gain in zip(wanted, exact.gains, strict=True):
+        intervals = {d.key: exact.intervals[d.key] for d in change.dials}
+        own = {**dict(change.fixed), **{key: exact.values[key] for key in intervals}}
+        moved = bench.told(before, before.sensors.changed(own))
+        material = _material(Tried(change, own, moved, gain, 1.0))
+        step = Step(change, {}, 0.0, math.sqrt(max(gain, 0.0)), material, intervals=intervals)
+        step.template, step.before = bench.template(before, moved), dict(before.residuals)
+        course.steps.append(step)
+    course.search.accepted += wanted
+    course.values = {**course.values, **exact.values}
+    _settle_all(course)
+    for step in course.steps:
+        step.misfit = course.misfit
+        step.values = {name: replace(v, method="likelihood") for name, v in step.values.items()}
+    course.rung("+ " + " + ".join(title(change) for change in wanted))
+
+
+def _by_simulation(course: _Course, wanted: Sequence[Change]) -> None:
+    """A step for each, maps last; then the intervals of all numbers by profile."""
+    bench = course.bench
+    for change in sorted(wanted, key=lambda c: bool(c.carrier)):
+        if change.carrier:
+            best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={})
+        else:
+            best = course.search.refine(course.state, _started(course, change), 5)
+        _accept(course, best, math.sqrt(max(best.gain, 0.0)))
+    ends: dict[Key, tuple[float, float]] = {}
+    dials = tuple(d for step in course.steps for d in step.dials)
+    if dials:
+        bench.say("intervals")
+        # the state's own numbers, from which the settled ones are one step away
+        here = {d.key: course.state.values.get(d.key, course.values[d.key]) for d in dials}
+        sensors, few = course.state.sensors.changed, 2 * fit.FEW
+        settled = fit.follow(bench, course.state, dials, here, sensors, few, _errors(course, None))
+        if isinstance(settled, Settled):
+            settled = replace(settled, point=fit.point_of(dials, course.values))
+            ends = fit.profiled(bench, course.state, settled, sensors, few)
+    for step in course.steps:
+        for name, value in step.values.items():
+            low, high = ends.get((step.change.effect, name), (value.low, value.high))
+            how = "counts" if step.change.carrier else "simulation"
+            step.values[name] = replace(value, low=low, high=high, method=how)
 
 
 def _started(course: _Course, change: Change) -> Tried:

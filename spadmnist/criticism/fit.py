@@ -32,6 +32,7 @@ Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _LEAST_SPREAD = 0.03  # other models' totals must not lie outside
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
+_CLOSE = 0.02  # and no nearer
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _BLIND = 0.05  # squared slope of a number that nothing tells
@@ -651,7 +652,7 @@ class Settled:
         """(value, low, high) of 95 %."""
         dial, half = self.dials[i], 1.96 * math.sqrt(max(float(self.covariance[i, i]), 0.0))
         u = float(self.point[i])
-        return dial.value(u), dial.value(u - half), dial.value(u + half)
+        return dial.value(u), *dial.interval(u - half, u + half)
 
 
 def point_of(dials: Sequence[Dial], values: Mapping[Key, Any]) -> np.ndarray:
@@ -765,16 +766,20 @@ def follow(
     values: Mapping[Key, Any],
     sensors_of: Callable[[Mapping[Key, Any]], Sensors],
     few: int = FEW,
+    errors: Mapping[Key, float] | None = None,
 ) -> Settled | str:
     """One step of Gauss and Newton from a state that has these values: as many recordings tell it as the state has.
 
-    Only how the cells follow the numbers is found from a few recordings more.
+    Only how the cells follow the numbers is found from a few recordings more. errors: standard deviations of
+    coordinates, as far as they are known: about an edge a slope holds no further than it is known.
     """
     dials = tuple(dials)
     keys = list(state.residuals)
     z, u = stacked(state.residuals, keys), point_of(dials, values)
     own = np.concatenate([state.own[k] for k in keys], axis=1)
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
+    known = np.array([(errors or {}).get(d.key, math.inf) for d in dials])
+    h = np.minimum(h, np.maximum(8 * known, _CLOSE))
     points = _aside(dials, u, h)
     values_there = [{d.key: d.value(float(x)) for d, x in zip(dials, p, strict=True)} for p in points]
     made = bench.moved(state, [sensors_of(v) for v in values_there], few)
@@ -793,6 +798,49 @@ def follow(
     return Settled(
         dials, point, covariance, _split(left, state, keys), _split(slopes, state, keys), float(left @ left), new
     )
+
+
+def profiled(
+    bench: Bench,
+    state: State,
+    settled: Settled,
+    sensors_of: Callable[[Mapping[Key, Any]], Sensors],
+    few: int = FEW,
+) -> dict[Key, tuple[float, float]]:
+    """Intervals of 95 % by profile: each number is moved until the squares have risen, the others following it.
+
+    Squares of cells that are not independent rise by more than those of independent ones: by as much as the variance
+    of the estimate is larger than theirs. Simulated twice for each end, at where it should be and at where it seems.
+    """
+    slopes = np.concatenate([settled.slopes[k] for k in state.residuals])
+    naive, n = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10), len(settled.dials)
+    told = [i for i in range(n) if np.isfinite(settled.covariance[i, i]) and naive[i, i] > 0]
+    ends = [(i, side) for i in told for side in (-1, 1)]
+    goal = np.array([3.84 * settled.covariance[i, i] / naive[i, i] for i, _ in ends])
+
+    def at(i: int, u: float) -> Sensors:
+        point = settled.point + naive[:, i] / naive[i, i] * (u - settled.point[i])
+        return sensors_of({d.key: d.value(float(x)) for d, x in zip(settled.dials, point, strict=True)})
+
+    def within(i: int, u: float) -> float:
+        return settled.dials[i].coordinate(settled.dials[i].value(u))
+
+    def squares(models: Sequence[Sensors]) -> np.ndarray:
+        keys, found = list(state.residuals), bench.moved(state, models, few)
+        z = [np.full(1, math.nan) if isinstance(m, str) else stacked(bench.residuals(state, m), keys) for m in found]
+        return np.array([float(one @ one) for one in z])
+
+    reach = np.array([math.sqrt(3.84 * settled.covariance[i, i]) for i, _ in ends])
+    usual = squares([sensors_of({d.key: d.value(float(x)) for d, x in zip(settled.dials, settled.point, strict=True)})])
+    for _ in range(2):
+        u = [within(i, settled.point[i] + side * h) for (i, side), h in zip(ends, reach, strict=True)]
+        rise = squares([at(i, x) for (i, _), x in zip(ends, u, strict=True)]) - usual
+        # what rises less at a bound would have gone on
+        reach = np.abs(np.array(u) - [settled.point[i] for i, _ in ends])
+        more = np.sqrt(goal / np.maximum(np.nan_to_num(rise, nan=1.0), goal / 4))
+        reach = reach * np.clip(np.where(np.isnan(rise), 1.0, more), 0.5, 2.0)
+    out = [settled.point[i] + side * h for (i, side), h in zip(ends, reach, strict=True)]
+    return {settled.dials[i].key: settled.dials[i].interval(out[2 * k], out[2 * k + 1]) for k, i in enumerate(told)}
 
 
 def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:

@@ -2,13 +2,14 @@
 
 The closed forms of the effects say how a pixel's rate follows a parameter, in every capture. Maps of several parameters
 are settled together, pixel by pixel, by Newton's method on the logarithms of their values relative to the array's; a
-prior as wide as the pixels turn out to differ keeps noise out, and one with long tails lets odd pixels be odd.
+prior as wide as the pixels turn out to differ keeps noise out, and one with long tails lets odd pixels be odd. Its
+middle is what most pixels have: the listed value may be the mean of a few hot ones.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from ..errors import SpadError
 from ..sensor import Sensor
 from .candidates import Change, Key, Values, with_values
 from .fit import Bench, Sensors
-from .recordings import InTheDark
+from .recordings import InTheDark, in_frames
 
 _TAILS = 3.0  # degrees of freedom of the prior
 _ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: then a capture is needed to settle it
@@ -78,12 +79,14 @@ class _Line:
     def expected(self, sensor: Sensor) -> np.ndarray:
         if self.seen.capture.light.dark:
             sensor = InTheDark.of(sensor)
-        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), self.level), self.conditions)
+        light = np.full((1, sensor.layout.pixels), self.level)
         if not self.frames or (self.conditions.counting == "counter" and self.seen.capture.modality == "counts"):
-            return np.maximum(recorded[0], 1e-9)
-        live = self.conditions.frame_time / self.conditions.frame_period
-        share = -np.expm1(-candidates[0] * live / self.conditions.frames)
-        return np.maximum(self.conditions.frames * share, 1e-9)
+            return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
+        return np.maximum(self.conditions.frames * in_frames(sensor, light, self.conditions)[0], 1e-9)
+
+    def saturated(self, counts: np.ndarray) -> bool:
+        """Have half of the pixels hardly a frame left?"""
+        return self.frames and float(np.median(counts)) > 0.9 * self.conditions.frames
 
     def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
         if self.frames:
@@ -127,6 +130,7 @@ def settle_maps(
         groups.append(groups_of(start, change.per))
     sizes = [int(g.max()) + 1 for g in groups]
     delta = [np.zeros(n) for n in sizes]
+    middle = [0.0 for _ in wanted]
     sigma = [0.3 for _ in wanted]
     precision = [np.full(n, 1e-6) for n in sizes]
     post: list[np.ndarray] = [np.ones(n) for n in sizes]
@@ -140,6 +144,7 @@ def settle_maps(
         return with_values(bench.start, given)
 
     step = 0.02
+    delta = _begun(lines, model, groups, delta, step)
     for turn in range(_TURNS):
         now = model(delta)
         other = [model([d + (step if j == i else 0) for j, d in enumerate(delta)]) for i in range(len(wanted))]
@@ -162,7 +167,7 @@ def settle_maps(
         if all(c.per == "pixel" for c in wanted):
             prior = np.stack(precision, axis=1)
             whole = normal + np.eye(k) * prior[:, None, :]
-            pull = score - prior * np.stack(delta, axis=1)
+            pull = score - prior * (np.stack(delta, axis=1) - np.array(middle))
             solved = np.linalg.solve(whole, pull[:, :, None])[:, :, 0]
             inverse = np.linalg.inv(whole)
             bare = normal + 1e-9 * np.eye(k)
@@ -177,7 +182,7 @@ def settle_maps(
             for i, group in enumerate(groups):
                 information = np.bincount(group, normal[:, i, i], sizes[i])
                 gradient = np.bincount(group, score[:, i], sizes[i])
-                move = (gradient - precision[i] * delta[i]) / (information + precision[i])
+                move = (gradient - precision[i] * (delta[i] - middle[i])) / (information + precision[i])
                 delta[i] = np.clip(delta[i] + np.clip(move, -0.7, 0.7), -_MOST, _MOST)
                 post[i] = 1 / (information + precision[i])
                 own = np.maximum(information, 1e-12)
@@ -185,10 +190,16 @@ def settle_maps(
         for i in range(k):
             if turn < 2:
                 continue
+            # as wide as the pixels differ beyond their noise; robustly, for a few may be quite other
+            weight = (_TAILS + 1) / (_TAILS + (delta[i] - middle[i]) ** 2 / sigma[i] ** 2)
             if bench_light_only(start, wanted[i]):
                 delta[i] = delta[i] - math.log(float(np.mean(np.exp(delta[i]))))
-            # as wide as the pixels differ beyond their noise; robustly, for a few may be quite other
-            weight = (_TAILS + 1) / (_TAILS + delta[i] ** 2 / sigma[i] ** 2)
+            else:  # all together, which no pixel by itself may tell
+                own = weight * np.bincount(groups[i], normal[:, i, i], sizes[i])
+                left = weight * np.bincount(groups[i], score[:, i], sizes[i])
+                shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -0.5, 0.5))
+                delta[i] = delta[i] + shift
+                middle[i] = float(np.average(delta[i], weights=weight))
             square = float(np.mean(weight * (delta[i] - _middle(delta[i])) ** 2 + post[i]))
             sigma[i] = min(max(math.sqrt(square), 1e-4), 3.0)
             own_raw, own_variance = raw[i]
@@ -197,7 +208,7 @@ def settle_maps(
                 # of the bulk, beyond its noise: what creeps towards none would take long to arrive
                 width = 1.4826 * _middle(np.abs(own_raw - _middle(own_raw)))
                 sigma[i] = math.sqrt(max(width**2 - noise, _LEAST_WIDTH**2))
-            precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + delta[i] ** 2)
+            precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + (delta[i] - middle[i]) ** 2)
     out = codes
     for i, change in enumerate(wanted):
         assert change.carrier is not None
@@ -206,6 +217,33 @@ def settle_maps(
         out[change.carrier] = Map(
             change.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i]
         )
+    return out
+
+
+def _begun(
+    lines: Sequence[_Line],
+    model: Callable[[Sequence[np.ndarray]], Sensor],
+    groups: Sequence[np.ndarray],
+    none: Sequence[np.ndarray],
+    step: float,
+) -> list[np.ndarray]:
+    """Where to begin: each map by the capture that tells most of it. An odd pixel is not found from the middle."""
+    now, out = model(none), []
+    for i, group in enumerate(groups):
+        other = model([d + (step if j == i else 0) for j, d in enumerate(none)])
+        most, best = 0.0, np.zeros(none[i].size)
+        for line in lines:
+            counts, expected = line.seen.counts, line.expected(now)
+            assert counts is not None
+            slope = (line.expected(other) - expected) / step
+            told = float((slope**2 / line.variance(np.maximum(expected, 0.5), 0.0)).sum())
+            if told > most and not line.saturated(counts):
+                scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
+                measured = np.bincount(group, counts, none[i].size) + 0.5
+                usual = np.bincount(group, expected * scale, none[i].size) + 0.5
+                elasticity = max(float(slope.sum() / expected.sum()), 0.3)
+                most, best = told, np.clip(np.log(measured / usual) / elasticity, -_MOST / 2, _MOST / 2)
+        out.append(best)
     return out
 
 

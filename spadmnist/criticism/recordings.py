@@ -10,7 +10,7 @@ import functools
 import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -298,14 +298,20 @@ def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
 
     @functools.lru_cache(maxsize=4096)
     def detections(level: float) -> float:
-        candidates, recorded = sensor.expected(np.full((1, sensor.layout.pixels), level), conditions)
+        light = np.full((1, sensor.layout.pixels), level)
         if capture.modality == "tr" or (capture.modality == "counts" and conditions.counting == "counter"):
-            return max(float(recorded.sum()), 1e-9)
-        live = conditions.frame_time / conditions.frame_period
-        share = -np.expm1(-candidates * live / conditions.frames)
-        return max(float((conditions.frames * share).sum()), 1e-9)
+            return max(float(sensor.expected(light, conditions)[1].sum()), 1e-9)
+        return max(float(conditions.frames * in_frames(sensor, light, conditions).sum()), 1e-9)
 
     return detections
+
+
+def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """(images, pixels) share of frames with a detection; light: photons/s, of that shape."""
+    # as if there were no gaps between frames: nothing is recorded in them
+    live = replace(conditions, frame_period=conditions.frame_time, exposure=conditions.frames * conditions.frame_time)
+    candidates, _ = sensor.expected(light, live)
+    return np.asarray(-np.expm1(-candidates / conditions.frames))
 
 
 def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:

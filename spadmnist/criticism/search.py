@@ -20,6 +20,7 @@ from ..errors import SpadError
 from . import fit, mapping
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
+from .lines import Line, lines
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
 
@@ -35,10 +36,12 @@ _MAP = "pixel_map"
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
+_FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
+_PROPORTIONAL = 0.85  # power with which a trace grows at least, that may be simulated at another strength
 _SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
-_LINE = 4.5  # standard deviations of a line in a spectrum
+_INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
-_LINES = 2  # frequencies that are
+_SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 _LEAST_P = 1e-300
 EACH = 9.0  # in chi square: what a further number must be worth
@@ -101,6 +104,7 @@ class Search:
         self.bench, self.say = bench, say
         self.accepted: list[Change] = []
         self.phases: dict[tuple[str, Key], float] = {}
+        self._lines: tuple[State, list[Line]] | None = None
 
     # --- looking -------------------------------------------------------------------------------------------------
 
@@ -176,40 +180,32 @@ class Search:
             out.append({pair: ((around or {}).get(pair, 0.0) + shift) % (2 * math.pi) for pair in pairs})
         return out
 
-    def lines(self, state: State) -> list[tuple[float, float]]:
-        """(frequency, standard deviation), Hz, of what stands out of the data's spectra, the clearest first."""
-        found: list[tuple[float, float, float]] = []  # with how clearly
-        for (id, name), z in state.residuals.items():
-            if (id, name) == RATES or state.nulls[id, name].law != "exponential":
-                continue
-            summary = self.bench.seen[id].summaries[name]
-            if summary.axis is None or len(z) < 3:
-                continue
-            step = float(summary.axis[1] - summary.axis[0])
-            power = np.asarray(summary.values, float)
-            for cell in np.argsort(z)[:-3:-1]:
-                if z[cell] < _LINE:
-                    break
-                f, error = _between_bins(power, int(cell), step, float(summary.axis[cell]))
-                near = next((k for k, (g, e, _) in enumerate(found) if abs(g - f) < 2 * step + 3 * e), None)
-                if near is None:
-                    found.append((f, error, float(z[cell])))
-                else:
-                    g, e, weight = found[near]
-                    best = (f, error) if error < e else (g, e)
-                    found[near] = (*best, weight + float(z[cell]))
-        return [(f, error) for f, error, _ in sorted(found, key=lambda x: -x[2])[:_LINES]]
+    def lines(self, state: State) -> list[Line]:
+        """What stands out of the data's spectra, the clearest first."""
+        if self._lines is None or self._lines[0] is not state:
+            self._lines = state, lines(self.bench, state)
+        return self._lines[1]
 
     def begun(self, state: State, change: Change) -> list[dict[Key, Any]]:
         """The values at which a candidate is tried first."""
-        tries = templates(change)
+        tries = self._told_apart(change, templates(change))
         narrow = _lines_of(change)
         if len(narrow) != 1:
-            return list(tries)
+            return tries
         dial = narrow[0]
-        inside = [f for f, _ in self.lines(state) if dial.low <= f <= dial.high]
+        inside = [line.frequency for line in self.lines(state) if dial.low <= line.frequency <= dial.high]
         usual = float(Effect.registry.find(change.effect).parameters[dial.parameter].default)
-        return [{**tries[0], dial.key: f} for f in inside or [usual]]
+        strengths = [{**tries[0], **{d.key: d.scaled(tries[0][d.key], x) for d in change.strengths}} for x in _SWINGS]
+        return [{**tried, dial.key: f} for f in inside or [usual] for tried in strengths]
+
+    def _told_apart(self, change: Change, tries: Sequence[Mapping[Key, Any]]) -> list[dict[Key, Any]]:
+        """Of templates that differ in times far below a frame, one: without stamps nothing tells them apart."""
+        captures = [seen.capture for seen in self.bench.seen.values()]
+        frames = [c.conditions.frame_time if c.modality == "qis" else 0.0 for c in captures]
+        least = _INSTANT * min(frames, default=0.0)
+        times = [d.key for d in change.shapes if d.unit == "s"]
+        kept = {tuple(max(t[k], least) if k in times else x for k, x in t.items()): dict(t) for t in tries}
+        return list(kept.values())
 
     def looked_at(
         self, state: State, change: Change, tries: Sequence[Mapping[Key, Any]], only: Sequence[str] = ()
@@ -242,20 +238,24 @@ class Search:
                 continue
             turns = self.turns(change.phases)
             models = [state.sensors.changed(tried, t) for t in turns]
-            turned = self.bench.moved(state, models, _SCAN, hasty=True)
+            turned = self.bench.moved(state, models, fit.FEW, hasty=True)
             if any(isinstance(m, str) for m in turned):
                 continue
             gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
             one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases)
             for dial in _lines_of(change):
                 f = float(tried[dial.key])
-                error = next((e for g, e in self.lines(state) if g == f), dial.high)
+                error = next((line.error for line in self.lines(state) if line.frequency == f), dial.high)
                 one.intervals[dial.key] = max(f - 1.96 * error, dial.low), min(f + 1.96 * error, dial.high)
             out.append(one)
         return out
 
-    def scan(self, state: State, everywhere: bool = False) -> list[Tried]:
-        """Every candidate at its templates, the best first. everywhere: in all captures, not the telling ones alone."""
+    def scan(self, state: State, everywhere: bool = False, known: Sequence[Tried] = ()) -> list[Tried]:
+        """Every candidate at its templates, the best first. everywhere: in all captures, not the telling ones alone.
+
+        known: what they did to an earlier model. That is taken for what they do to this one, but where the data
+        resemble it.
+        """
         only_rates = self.only_rates(state)
         tries: list[tuple[Change, dict[Key, Any]]] = []
         for change in changes(state.sensors.one):
@@ -265,13 +265,16 @@ class Search:
                 tries += [(change, tried) for tried in self.begun(state, change)]
         if not only_rates:
             some = () if everywhere else self.telling(state)
+            old = self._still(state, tries, known)
+            tries = [t for t in tries if not any(_same(one, *t) for one in old)]
             out = self._looked_at(state, tries, some)
             # what leaves no trace yet may do so when it is stronger
             faint = [t for t in out if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
             silent = [(t.change, up) for t in faint if (up := _stronger(t))]
             found = self._looked_at(state, silent, some) if silent else []
             raised = {(one.change.name, _shape(one)) for one in found}
-            out = [t for t in out if (t.change.name, _shape(t)) not in raised] + found
+            again = [t for t in faint if (t.change.name, _shape(t)) in raised]
+            out = old + [t for t in out if not any(t is one for one in again)] + found
         else:
             out = []
             for change, tried in tries:
@@ -284,6 +287,20 @@ class Search:
                 out.append(one)
         return sorted(out, key=lambda t: -t.gain)
 
+    def _still(
+        self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]], known: Sequence[Tried]
+    ) -> list[Tried]:
+        """Those of `known` that may be tried still and that the data do not resemble, at the strength that suits."""
+        out = []
+        for one in known:
+            if one.change.phases or not any(_same(one, *t) for t in tries):
+                continue
+            now = replace(one)
+            now.gain, now.times = self.line_search(state, one.moved, one.signed)
+            if now.gain < _PROMISING / 4:
+                out.append(now)
+        return out
+
     def only_rates(self, state: State) -> bool:
         """Is nothing wrong but the totals?"""
         failed = fit.failing(fit.blocks(self.bench, state, state.residuals))
@@ -295,7 +312,8 @@ class Search:
         p = _gumbel_tail(largest, float(marks.max())) if marks.any() else 1.0
         levels = mapping.levels_of(self.bench, state)
         maps = [self.map_chance(state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
-        return min(1.0, 2 * min([p, *(q * len(maps) for q in maps)]))
+        swings = [line.p for line in self.lines(state)]
+        return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
 
     def map_chance(self, state: State, change: Change, values: dict[Key, Any], levels: dict[str, float]) -> float:
         """p-value of a map: pixels (rows, columns) that differ alike in all captures that could show it."""
@@ -478,7 +496,7 @@ class Search:
         if one.change.phases:
             given = self.tuned(state, one, given)
         size = self.size(state, one.moved) * abs(one.times)
-        boost = max(1.0, (_STRONG / max(size, 1e-3)) ** (1 / one.power))
+        boost = self._boost(state, one, given, size)
         found = fit.settle(
             self.bench,
             state,
@@ -490,7 +508,7 @@ class Search:
         )
         if isinstance(found, str):
             return one
-        if not one.faint and boost == 1 and fit.failing(fit.blocks(self.bench, state, found.residuals)):
+        if boost == 1 and fit.failing(fit.blocks(self.bench, state, found.residuals)):
             found = self._probed(state, one, found)
         one.faint = boost > 1
         one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
@@ -500,28 +518,53 @@ class Search:
             one.gain = max(one.gain, self.beside(state, one.sensors))
         return one
 
+    def _boost(self, state: State, one: Tried, given: Mapping[Key, Any], size: float) -> float:
+        """How much stronger a faint effect is simulated; 1 where its trace does not grow in proportion: an edge."""
+        boost = max(1.0, (_STRONG / max(size, 1e-3)) ** (1 / one.power))
+        if boost == 1 or not any(_is_edge(d) for d in one.change.strengths):
+            return boost
+        up = {d.key: d.scaled(float(given[d.key]), boost) for d in one.change.strengths if d.key in given}
+        (far,) = self.bench.moved(state, [state.sensors.changed({**given, **up}, one.phases, one.chips)], fit.FEW)
+        grown = 0.0 if isinstance(far, str) else self.size(state, far)
+        return boost if grown > boost**_PROPORTIONAL * size else 1.0
+
     def _probed(self, state: State, one: Tried, found: Settled) -> Settled:
         """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge."""
-        for dial in one.change.shapes:
+        for dial in one.change.dials:
             if dial not in found.dials or not dial.log:
                 continue
-            at = float(found.values[dial.key])
-            steps = [s * x for x in _PROBES for s in (-1, 1)]
-            tries = [{**found.values, dial.key: dial.value(dial.coordinate(at) + x)} for x in steps]
-            models = [state.sensors.changed(t, one.phases, one.chips) for t in tries]
-            best = found.square - 6
-            for tried, x, moved in zip(tries, steps, self.bench.moved(state, models, fit.FEW), strict=True):
-                if isinstance(moved, str):
-                    continue
-                residuals = self.bench.residuals(state, moved)
-                if self.square(residuals) < best:
-                    best = self.square(residuals)
-                    point = np.array([d.coordinate(float(tried[d.key])) for d in found.dials])
-                    found = replace(found, point=point, residuals=residuals, square=best, values=tried)
-                    i = found.dials.index(dial)
-                    # no slope told it, so that its neighbours must
-                    found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
+            if dial in one.change.shapes:
+                found, _ = self._nearest(state, one, found, dial, _PROBES)
+            elif _is_edge(dial):
+                for _ in range(_MOVES):  # a wall is not seen from afar: step by step, first long ones
+                    found, moved = self._nearest(state, one, found, dial, _FAR)
+                    if not moved:
+                        break
+                found, _ = self._nearest(state, one, found, dial, _PROBES)
         return found
+
+    def _nearest(
+        self, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float]
+    ) -> tuple[Settled, bool]:
+        """(the best of the probes to both sides of a number, or what was settled; is it one of the probes?)."""
+        at, before = float(found.values[dial.key]), found
+        steps = [s * x for x in probes for s in (-1, 1)]
+        tries = [{**found.values, dial.key: dial.value(dial.coordinate(at) + x)} for x in steps]
+        models = [state.sensors.changed(t, one.phases, one.chips) for t in tries]
+        best = found.square - 6
+        for tried, x, moved in zip(tries, steps, self.bench.moved(state, models, fit.FEW), strict=True):
+            if isinstance(moved, str):
+                continue
+            residuals = self.bench.residuals(state, moved)
+            if self.square(residuals) < best:
+                best = self.square(residuals)
+                found = replace(
+                    found, point=fit.point_of(found.dials, tried), residuals=residuals, square=best, values=tried
+                )
+                i = found.dials.index(dial)
+                # no slope told it, so that its neighbours must
+                found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
+        return found, found is not before
 
     def beside(self, state: State, sensors: Sensors) -> float:
         """By how much the data lie nearer to another model, each judged by its own scatter."""
@@ -601,9 +644,14 @@ def _stronger(one: Tried) -> dict[Key, Any] | None:
     """The values of a candidate at several times its strength, or nothing where it cannot be stronger."""
     out = dict(one.values)
     for dial in one.change.strengths:
-        if dial.key in out and one.change.kind == "add" and out[dial.key] != dial.off:
+        if dial.key in out and one.change.kind == "add" and out[dial.key] != dial.off and not dial.lacks:
             out[dial.key] = dial.scaled(float(out[dial.key]), _RAISED)
     return out if out != one.values else None
+
+
+def _same(one: Tried, change: Change, tried: Mapping[Key, Any]) -> bool:
+    """Is it this change, at these shapes?"""
+    return one.change.name == change.name and all(one.values.get(d.key) == tried.get(d.key) for d in change.shapes)
 
 
 def _shape(one: Tried) -> tuple[Any, ...]:
@@ -611,22 +659,14 @@ def _shape(one: Tried) -> tuple[Any, ...]:
     return tuple(one.values.get(dial.key) for dial in one.change.shapes)
 
 
+def _is_edge(dial: Dial) -> bool:
+    """A strength that is a time, or what lacks of one: nothing grows with it in proportion, an edge moves."""
+    return dial.lacks or (dial.unit == "s" and dial.off is not None)
+
+
 def _lines_of(change: Change) -> list[Dial]:
     """Frequencies of what swings: known to a fraction of one over the exposure, or not at all."""
     return [d for d in change.shapes if d.unit == "Hz"] if change.phases else []
-
-
-def _between_bins(power: np.ndarray, cell: int, step: float, at: float) -> tuple[float, float]:
-    """(frequency of a line, its standard deviation): between the strongest bin and the stronger of its neighbours.
-
-    A line's amplitude falls off as 1 / distance to both sides (Rife, Vincent, Bell Syst. Tech. J. 49 (1970) 197).
-    """
-    sides = [power[cell - 1] if cell else 0.0, power[cell + 1] if cell + 1 < len(power) else 0.0]
-    other = math.sqrt(max(sides))
-    share = other / (math.sqrt(power[cell]) + other)
-    f = at + (share if sides[1] > sides[0] else -share) * step
-    # twice what no estimate can be better than
-    return f, 2 * step * math.sqrt(3 / (2 * max(float(power[cell]), 1.0))) / math.pi
 
 
 def is_pattern(one: Tried) -> bool:

@@ -174,7 +174,7 @@ def _fits(search: Search, state: State, one: Tried, moved: Moved | str) -> bool:
     """Do the other statistics bear with what explains the totals?"""
     if isinstance(moved, str):
         return False
-    residuals = search.bench.residuals(state, moved, noisy=True)
+    residuals = search.bench.residuals(state, moved)
     others = {c: z for c, z in residuals.items() if c != RATES}
     before = {c: z for c, z in state.residuals.items() if c != RATES}
     return search.square(others) - search.square(before) < EACH + ALIKE
@@ -190,7 +190,7 @@ def _settled(search: Search, state: State, one: Tried) -> Tried:
         return moved, bench.residuals(state, moved)[RATES]
 
     u = dial.coordinate(float(given[dial.key]))
-    ends = sorted((dial.coordinate(dial.low) if dial.log else dial.low, dial.coordinate(dial.high)))
+    ends = dial.ends
     span = 0.05 if dial.log else 0.01 * (dial.high - dial.low)
     covariance = 1.0
     for _ in range(8):
@@ -217,7 +217,7 @@ def _settled(search: Search, state: State, one: Tried) -> Tried:
         1.0,
         state.sensors.changed(given),
         residuals=residuals,
-        intervals={dial.key: (dial.value(u - half), dial.value(u + half))},
+        intervals={dial.key: dial.interval(u - half, u + half)},
     )
 
 

@@ -53,11 +53,53 @@ class FirstArrivals(Statistic):
         return Summary(counts.ravel().astype(np.float64), "poisson", where, size, axis=axis, label="time in frame (s)")
 
 
+class FrameEnds(Statistic):
+    """First detections near the beginning and the end of a frame, by how many ticks are between: 1, 2, 4, 8, ...
+
+    Up to a fortieth of a frame. Pooled over the pixels. Counts: Poisson. Here show the first and the last nanoseconds
+    of a frame during which pixels are not live yet, or no longer.
+    """
+
+    modalities = ("str",)
+    unit = "detections"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts from the beginning on, and then from the end back."""
+        none = int(recording.none)
+        octaves = int(np.log2(max(none / _BINS, 1.0))) + 1
+        counts = np.zeros((2, octaves), np.int64)
+        for _, (_, stamps, _) in first_stamps(recording):
+            _near_ends(stamps, none, counts)
+        seconds = np.concatenate([[0.0], 2.0 ** np.arange(octaves)]) * (recording.tick or 1.0)
+
+        def where(cell: int) -> str:
+            end, k = divmod(cell, octaves)
+            return f"{span(seconds[k], seconds[k + 1])} {('after the start', 'before the end')[end]} of the frame"
+
+        size = of_detections(float(recording.totals.sum()))
+        return Summary(counts.ravel().astype(np.float64), "poisson", where, size)
+
+
 def _edges(none: int) -> np.ndarray:
     """(cells + 1,) ticks."""
     coarse = np.rint(np.linspace(0, none, _BINS + 1))
     fine = np.rint(np.linspace(0, coarse[1], _FINE + 1))
     return np.unique(np.concatenate([fine, coarse])).astype(np.int64)
+
+
+@jit
+def _near_ends(stamps, none, counts):
+    """Add to `counts` (2, octaves) the ticks to the beginning and to the end of the frame."""
+    octaves = counts.shape[1]
+    for stamp in stamps:
+        at = np.int64(stamp)
+        for end, away in enumerate((at, none - 1 - at)):
+            k = 0
+            while away > 0 and k < octaves:
+                away >>= 1
+                k += 1
+            if k < octaves:
+                counts[end, k] += 1
 
 
 @jit

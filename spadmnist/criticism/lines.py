@@ -1,0 +1,120 @@
+"""Lines: frequencies that stand out of the power spectra, of one capture or of all that have light together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from .fit import RATES, Bench, State
+
+_CLEAR = 1e-3  # p-value of a line, all frequencies that were looked at taken into account
+_MOST = 2  # lines
+_APART = 2.5  # bins of the shortest capture between two lines
+_SIGN = 2.0  # standard deviations of a bin that tells where the line is
+
+
+@dataclass(frozen=True)
+class Line:
+    """A frequency that stands out. error: standard deviation of it, Hz; p: of anything as clear at any frequency."""
+
+    frequency: float
+    error: float
+    p: float
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Of one capture. step: Hz from bin to bin, the first being at `step`; surprise: -log p of each bin."""
+
+    power: np.ndarray
+    z: np.ndarray
+    surprise: np.ndarray
+    step: float
+    dark: bool
+
+    def bins(self, frequency: np.ndarray) -> np.ndarray:
+        """The bin of each frequency, -1 where there is none."""
+        k = np.rint(frequency / self.step).astype(np.int64) - 1
+        return np.where((k >= 0) & (k < self.z.size), k, -1)
+
+
+def lines(bench: Bench, state: State) -> list[Line]:
+    """The clearest lines of the data under a model, the clearest first.
+
+    The bins at a frequency are taken together by the product of their p-values (Fisher's method): a lamp that swings
+    does so in every capture.
+    """
+    spectra = []
+    for (id, name), z in state.residuals.items():
+        if (id, name) == RATES or state.nulls[id, name].law != "exponential":
+            continue
+        summary = bench.seen[id].summaries[name]
+        if summary.axis is None or len(z) < 3:
+            continue
+        step = float(summary.axis[1] - summary.axis[0])
+        surprise = -stats.norm.logsf(z)
+        dark = bench.seen[id].capture.light.dark
+        spectra.append(_Spectrum(np.asarray(summary.values, float), z, surprise, step, dark))
+    groups = [[s] for s in spectra]
+    lit = [s for s in spectra if not s.dark]
+    if len(lit) > 1:
+        groups.insert(0, lit)
+    found: list[Line] = []
+    for group in groups:
+        found += _in(group, len(groups))
+    kept: list[Line] = []
+    for line in sorted(found, key=lambda one: one.p):
+        apart = _APART * max(s.step for s in spectra)
+        if all(abs(line.frequency - other.frequency) > apart for other in kept):
+            kept.append(line)
+    return kept[:_MOST]
+
+
+def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
+    """Lines of some spectra together; groups: how many such are looked at."""
+    step = min(s.step for s in group)
+    grid = step * np.arange(1, max(round(s.z.size * s.step / step) for s in group) + 1)
+    total, number = np.zeros(grid.size), np.zeros(grid.size)
+    for s in group:
+        bins = s.bins(grid)
+        total += np.where(bins >= 0, s.surprise[bins], 0.0)
+        number += bins >= 0
+    p = stats.gamma.sf(total, np.maximum(number, 1.0)) * grid.size * groups
+    out: list[Line] = []
+    for k in np.argsort(p)[: 2 * _MOST]:
+        if p[k] > _CLEAR:
+            break
+        out.append(_line(group, float(grid[k]), float(p[k])))
+    return out
+
+
+def _line(group: Sequence[_Spectrum], about: float, p: float) -> Line:
+    """Where exactly: the mean over the spectra that show it."""
+    weight = mean = 0.0
+    for s in group:
+        cell = int(s.bins(np.array([about]))[0])
+        if cell < 0 or s.z[cell] < _SIGN:
+            continue
+        f, error = _between_bins(s.power, cell, s.step)
+        if abs(f - about) < 1.5 * s.step:
+            mean, weight = mean + f / error**2, weight + error**-2
+    if weight == 0:
+        return Line(about, min(s.step for s in group), p)
+    return Line(mean / weight, weight**-0.5, p)
+
+
+def _between_bins(power: np.ndarray, cell: int, step: float) -> tuple[float, float]:
+    """(frequency of a line, its standard deviation): between the strongest bin and the stronger of its neighbours.
+
+    A line's amplitude falls off as 1 / distance to both sides (Rife, Vincent, Bell Syst. Tech. J. 49 (1970) 197).
+    """
+    sides = [power[cell - 1] if cell else 0.0, power[cell + 1] if cell + 1 < len(power) else 0.0]
+    other = math.sqrt(max(sides))
+    share = other / (math.sqrt(power[cell]) + other)
+    f = (cell + 1 + (share if sides[1] > sides[0] else -share)) * step
+    # twice what no estimate can be better than
+    return f, 2 * step * math.sqrt(3 / (2 * max(float(power[cell]), 1.0))) / math.pi

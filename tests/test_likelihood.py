@@ -1,0 +1,216 @@
+"""Likelihood: numbers and intervals against truth, over many data sets; what it does not know; the laws themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from spadmnist import config
+from spadmnist.criticism import candidates, likelihood
+from spadmnist.effects import Conditions
+from spadmnist.light import photons_from_irradiance
+from spadmnist.recording import Capture, Light, Recording
+from spadmnist.sensor import Sensor
+from spadmnist.streams import Streams
+from spadmnist.twin import model_recordings
+
+SENSOR = """sensor:
+  name: small
+  rules: device
+  layout: {rows: 4, columns: 4, pixel_area: 25 um^2, fill_factor: 1.0}
+  effects:
+    detection: {pdp: 0.42}
+    dark_counts: {rate: 100 Hz}
+    dead_time: {duration: 50 ns}
+    afterpulsing: {probability: 0.5 %, lifetime: 25 ns}
+    tdc: {resolution: 500 ps}
+"""
+DEAD, CHANCE, LIFETIME = ("dead_time", "duration"), ("afterpulsing", "probability"), ("afterpulsing", "lifetime")
+RATE = ("dark_counts", "rate")
+TRUTH = {DEAD: 60e-9, CHANCE: 0.02}
+SETS = 100
+# an interval of 95 % misses 5 of 100; more than 11, or fewer than 0, is chance once in 230 times
+MOST = int(stats.binom.isf(0.005, SETS, 0.05))
+
+
+@pytest.fixture
+def sensor(tmp_path: Path) -> Sensor:
+    file = tmp_path / "sensor.yaml"
+    file.write_text(SENSOR)
+    return config.read_sensor(file).settled()
+
+
+def lit(sensor: Sensor, modality: str, photons: float, conditions: Conditions, uncertainty: float = 0.0) -> Capture:
+    """A capture that states so many photons/s on a pixel; 0: dark."""
+    if not photons:
+        return Capture("dark", modality, Light(), conditions)
+    level = photons / photons_from_irradiance(1.0, sensor.layout.active_area, 500e-9)
+    return Capture("lit", modality, Light(500e-9, level, "irradiance", uncertainty), conditions)
+
+
+def stamps(sensor: Sensor, exposure: float, photons: float, sets: int) -> list[Recording]:
+    wave = 500e-9 if photons else None
+    capture = lit(sensor, "tr", photons, Conditions(exposure, 1, exposure, exposure, wave))
+    images = np.arange(sets, dtype=np.uint64)
+    return model_recordings(sensor, capture, np.full(sets, photons), Streams(11, "likelihood", "data", images), images)
+
+
+def bits(sensor: Sensor, frames: int, photons: Sequence[float], stated: float) -> list[Recording]:
+    """Data sets under light that is not quite as stated."""
+    wave = 500e-9 if stated else None
+    capture = lit(sensor, "qis", stated, Conditions(frames * 1e-5, frames, 1e-5, 1e-5, wave), 0.02)
+    images = np.arange(len(photons), dtype=np.uint64)
+    streams = Streams(12, f"likelihood/{stated}", "data", images)
+    return model_recordings(sensor, capture, np.array(photons), streams, images)
+
+
+def named(sensor: Sensor, *names: str) -> list[candidates.Change]:
+    return [next(c for c in candidates.changes(sensor) if c.name == name) for name in names]
+
+
+def found(sensor: Sensor, data: Sequence[Recording], *names: str) -> likelihood.Exact:
+    exact = likelihood.settled(sensor, data, named(sensor, *names))
+    assert isinstance(exact, likelihood.Exact), exact
+    return exact
+
+
+def check(answers: Sequence[likelihood.Exact], key: candidates.Key, truth: float, coverage: bool = True) -> None:
+    """Values scatter about the truth as their intervals say, and the intervals miss it as often as they should."""
+    values = np.array([a.values[key] for a in answers])
+    ends = np.array([a.intervals[key] for a in answers])
+    assert np.all((ends[:, 0] <= values) & (values <= ends[:, 1]))
+    error = np.diff(ends, axis=1).mean() / 3.92
+    assert abs(values.mean() - truth) < 3.5 * error / math.sqrt(len(values))
+    assert values.std() < 1.35 * error
+    missed = int(np.sum((truth < ends[:, 0]) | (truth > ends[:, 1])))
+    assert missed <= MOST, f"{missed} of {len(values)} intervals miss the {key}"
+
+
+def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
+    hidden = candidates.with_values(sensor, TRUTH)
+    # no two pixels need be alike: each has a rate of its own
+    map_ = {("detection", "relative"): np.linspace(0.6, 1.4, 16)}
+    data = stamps(candidates.with_values(hidden, map_), 3e-4, 2e6, SETS)
+    assert 3000 < np.mean([r.totals.sum() for r in data]) < 5000
+    answers = [found(sensor, [one], "set dead_time.duration", "set afterpulsing.probability") for one in data]
+    for key, truth in TRUTH.items():
+        check(answers, key, truth)
+
+
+def test_a_rate_is_covered_with_its_light(sensor: Sensor) -> None:
+    truth = 3000.0
+    hidden = candidates.with_values(sensor, {RATE: truth, CHANCE: 0.0})
+    model = candidates.with_values(sensor, {CHANCE: 0.0})
+    light = 2e4 * np.exp(0.02 * np.random.default_rng(3).standard_normal(SETS))
+    pairs = zip(bits(hidden, 300, np.zeros(SETS), 0.0), bits(hidden, 300, light, 2e4), strict=True)
+    answers = [found(model, pair, "set dark_counts.rate") for pair in pairs]
+    check(answers, RATE, truth)
+    # bright light tells of dark counts only if it is known how bright it is
+    width = np.mean([math.log(a.intervals[RATE][1] / a.intervals[RATE][0]) for a in answers]) / 3.92
+    seen = 16 * 300 * -math.expm1(-truth * 1e-5)
+    assert width == pytest.approx(1 / math.sqrt(seen), rel=0.15)
+
+
+def test_an_effect_that_is_missing_is_added(sensor: Sensor) -> None:
+    """With its lifetime."""
+    rest = [e for e in sensor.effects if e.name not in CHANCE]
+    without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
+    hidden = candidates.with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9})
+    exact = found(without, stamps(hidden, 5e-3, 1e6, 1), "add afterpulsing")
+    for key, truth in ((CHANCE, 0.05), (LIFETIME, 60e-9)):
+        low, high = exact.intervals[key]
+        assert low < truth < high < 1.5 * low
+    assert exact.gains[0] > 100
+
+
+def test_traps_that_outlive_the_next_detection(sensor: Sensor) -> None:
+    rest = [e for e in sensor.effects if e.name not in CHANCE]
+    without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
+    keys = ("slow_afterpulsing", "probability"), ("slow_afterpulsing", "lifetime")
+    hidden = candidates.with_values(without, {keys[0]: 0.1, keys[1]: 3e-6})
+    exact = found(without, stamps(hidden, 1e-2, 4e5, 1), "add slow_afterpulsing")
+    for key, truth in zip(keys, (0.1, 3e-6), strict=True):
+        low, high = exact.intervals[key]
+        assert low < truth < high < 1.7 * low
+
+
+def test_an_edge_that_jitter_blurs(sensor: Sensor) -> None:
+    jitter = ("jitter", "sigma")
+    hidden = candidates.with_values(sensor, {jitter: 400e-12, DEAD: 52e-9})
+    model = candidates.with_values(sensor, {jitter: 300e-12})
+    exact = found(model, stamps(hidden, 4e-3, 4e6, 1), "set dead_time.duration", "set jitter.sigma")
+    for key, truth in ((DEAD, 52e-9), (jitter, 400e-12)):
+        low, high = exact.intervals[key]
+        assert low < truth < high
+        assert high - low < 400e-12
+
+
+def test_nothing_is_told_where_nothing_happened(sensor: Sensor) -> None:
+    """An interval ends where the number is no longer looked for."""
+    (empty,) = stamps(sensor, 1e-6, 0.0, 1)
+    exact = found(sensor, [empty], "set afterpulsing.probability")
+    assert exact.intervals[CHANCE] == pytest.approx((1e-4, 0.2))
+
+
+@pytest.mark.parametrize("history", [[1e-6], [1e-6, 1.07e-6], [1e-6, 1.07e-6, 1.6e-6]])
+def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
+    """The next detection comes at some time, or not before the end."""
+    dead, chance, lifetime, rate = np.array([50e-9]), np.array([[0.3]]), np.array([80e-9]), np.array([3e5])
+
+    def density(end: float, *later: float) -> float:
+        times = np.array([*history, *later])
+        offsets, hazard = np.array([0, len(times)]), np.zeros(len(times))
+        base, awake = likelihood._followed(times, offsets, end, dead, chance, lifetime, rate, 500e-12, 0.0, hazard)
+        return math.exp(float(base[0] + likelihood._of_rates(hazard, offsets, awake, rate)[0][0]))
+
+    last, end = history[-1], history[-1] + 3e-6
+    grid = last + np.concatenate([np.linspace(49e-9, 51e-9, 801), np.geomspace(51.01e-9, 3e-6, 3001)])
+    whole = integrate.trapezoid([density(x, x) for x in grid], grid) + density(end)
+    assert whole == pytest.approx(density(last), rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "modality", "word"),
+    [
+        ({}, "tr", ""),
+        ({("crosstalk", "probability"): 0.01}, "tr", "crosstalk"),
+        ({("crosstalk", "probability"): 0.0}, "tr", ""),
+        ({("slow_recovery", "time_constant"): 5e-9}, "tr", "slow_recovery"),
+        ({("dead_time", "paralyzable"): True}, "tr", "dead_time"),
+        ({("flicker", "amplitude"): 0.1}, "tr", "flicker"),
+        ({("flicker", "amplitude"): 0.1}, "qis", "flicker"),
+        ({("short_gate", "fraction"): 0.9}, "tr", "short_gate"),
+        ({("readout_loss", "service_time"): 1e-7}, "tr", "readout_loss"),
+        ({("jitter", "sigma"): 1e-9}, "tr", ""),
+        ({("jitter", "sigma"): 1e-10, ("jitter", "tail_weight"): 0.1, ("jitter", "tail"): 1e-9}, "tr", "the stamps"),
+        ({("tdc", "resolution"): 1e-8}, "tr", "afterpulsing"),
+        ({}, "qis", "afterpulsing"),
+        ({CHANCE: 0.0}, "qis", ""),
+        ({CHANCE: 0.0, ("short_gate", "fraction"): 0.9}, "qis", ""),
+        ({CHANCE: 0.0, ("frame_carry_over", "share"): 1.0}, "qis", "frame_carry_over"),
+        ({}, "str", "str of lit"),
+    ],
+)
+def test_what_it_does_not_know(sensor: Sensor, values: dict[candidates.Key, float], modality: str, word: str) -> None:
+    capture = lit(sensor, modality, 1e5, Conditions(1e-3, 100, 1e-5, 1e-5, 500e-9))
+    assert likelihood.unknown(candidates.with_values(sensor, values), capture) == word
+
+
+def test_neither_the_traps_of_the_papers_rules_nor_a_mean(sensor: Sensor) -> None:
+    capture = lit(sensor, "tr", 1e5, Conditions(1e-3, 100, 1e-5, 1e-5, 500e-9))
+    paper = Sensor(sensor.layout, sensor.effects, "paper", sensor.chip_seed, sensor.name)
+    assert likelihood.unknown(paper.settled(), capture) == "afterpulsing"
+    assert likelihood.unknown(sensor, replace(capture, mean=3.0)) == "the mean of lit"
+
+
+def test_maps_and_switches_have_none(sensor: Sensor) -> None:
+    (data,) = stamps(sensor, 1e-4, 1e5, 1)
+    for name in ("per_pixel detection.pdp", "set dead_time.paralyzable"):
+        assert isinstance(likelihood.settled(sensor, [data], named(sensor, name)), str)
+    assert likelihood.settled(sensor, [data], named(sensor, "add crosstalk")) == "crosstalk"

@@ -1,0 +1,267 @@
+"""Outlook: which capture would tell, what would have been seen; and what becomes of steps that are none."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from joblib import Parallel
+
+from spadmnist import config, twin
+from spadmnist import measurement as measurements
+from spadmnist.criticism import candidates, compare, diagnose, fit, outlook, search
+from spadmnist.criticism.answer import canonical
+from spadmnist.criticism.candidates import Change, Key
+from spadmnist.criticism.fit import Bench, Moved
+from spadmnist.criticism.search import Search, Tried
+from spadmnist.measurement import Measurement
+from spadmnist.sensor import Sensor
+
+SENSOR = """sensor:
+  name: tiny
+  rules: device
+  layout: {rows: 2, columns: 2, pixel_area: 100 um^2, fill_factor: 1.0}
+  effects:
+    detection: {pdp: 0.42}
+    dark_counts: {rate: 100 Hz}
+    dead_time: {duration: DEAD ns}
+    tdc: {resolution: 100 ps}
+"""
+CAPTURES = """format: spadmnist-measurement/1
+name: lab
+layout: {rows: 2, columns: 2}
+captures:
+  - {id: dark, file: dark.h5, modality: tr, light: {kind: dark}, exposure: 1 s}
+  - {id: flat, file: flat.h5, modality: tr, exposure: 20 ms,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 100 nW/cm^2, relative_uncertainty: 0.02}}
+"""
+PROBABILITY, LIFETIME = ("afterpulsing", "probability"), ("afterpulsing", "lifetime")
+DURATION, CROSSTALK = ("dead_time", "duration"), ("crosstalk", "probability")
+
+Lab = Callable[..., tuple[Sensor, Measurement]]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Lab:
+    """(effects that the data have more, their dead time in ns, seed) -> (the sensor as stated, the data)."""
+
+    def made(extra: str = "", dead: int = 50, seed: int = 0) -> tuple[Sensor, Measurement]:
+        folder = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        folder.mkdir()
+        (folder / "plan.yaml").write_text(CAPTURES)
+        (folder / "sensor.yaml").write_text(SENSOR.replace("DEAD", "50"))
+        (folder / "truth.yaml").write_text(SENSOR.replace("DEAD", str(dead)) + extra)
+        plan = measurements.open(folder / "plan.yaml", planned=True)
+        out = twin.simulate(config.read_sensor(folder / "truth.yaml"), plan, folder / "lab", seed)
+        return config.read_sensor(folder / "sensor.yaml"), measurements.open(out)
+
+    return made
+
+
+def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Bench:
+    return Bench(*made, 0, Parallel(n_jobs=1), replicates)
+
+
+def quiet(bench: Bench) -> Search:
+    return Search(bench, lambda what: None)
+
+
+def change_of(bench: Bench, name: str) -> Change:
+    return next(c for c in candidates.changes(bench.start) if c.name == name)
+
+
+def given(course: diagnose._Course, name: str, values: dict[Key, Any], settle: bool) -> Tried:
+    """A candidate at some values, or settled from there."""
+    bench, state = course.bench, course.state
+    change = next(c for c in candidates.changes(state.sensors.one) if c.name == name)
+    (moved,) = bench.moved(state, [state.sensors.changed(values)])
+    assert isinstance(moved, Moved)
+    one = Tried(change, values, moved, 0.0, 1.0)
+    return course.search.refine(state, one) if settle else one
+
+
+def taken(course: diagnose._Course, name: str, values: dict[Key, Any], settle: bool = True) -> None:
+    diagnose._accept(course, given(course, name, values, settle), 1.0)
+
+
+def names(course: diagnose._Course) -> list[str]:
+    return [step.change.name for step in course.steps]
+
+
+# --- which capture would tell ------------------------------------------------------------------------------------
+
+
+def advised(bench: Bench, found: str, values: dict[Key, Any]) -> tuple[dict[str, Any], float]:
+    """(the advice on the sensor as it is against one with these values, the square of what tells them now)."""
+    state, look = bench.state({}), quiet(bench)
+    other = state.sensors.changed(values)
+    (moved,) = bench.moved(state, [other])
+    assert isinstance(moved, Moved)
+    residuals = bench.residuals(state, moved)
+    rival = Tried(change_of(bench, "add afterpulsing"), values, moved, 0.0, 1.0, other, residuals=residuals)
+    (told,) = outlook.advice(look, state, change_of(bench, found), rival)
+    return told, look.square(residuals) - look.square(state.residuals)
+
+
+def test_dark_rates_are_told_by_a_long_dark_capture(lab):
+    """130 Hz for 100 Hz in 4 pixels and 100 s: log 1.3 beside 1 / root of 40,000 detections."""
+    told, now = advised(bench_of(lab()), "set dark_counts.rate", {("dark_counts", "rate"): 130.0})
+    assert told["capture"] == "dark, 100 s"
+    assert told["separates"] == ["dark_counts", "afterpulsing"]
+    assert now > 0 and told["significance_now"] == pytest.approx(math.sqrt(now), rel=1e-4)
+    more = told["significance_then"] ** 2 - now
+    # sixteen recordings know their scatter to a fifth
+    assert math.sqrt(more) == pytest.approx(math.log(1.3) * math.sqrt(40_000), rel=0.4)
+
+
+def test_dead_times_are_told_by_a_brighter_flat_field(lab):
+    """Intervals of 50 to 60 ns are as many as rate^2 x exposure x 10 ns: 16 times here, ten times in a longer one.
+
+    They show in some statistics at once, so that all together tell more than their number.
+    """
+    bench = bench_of(lab())
+    told, now = advised(bench, "set dead_time.duration", {DURATION: 60e-9})
+    assert told["capture"] == "a flat field 4 times as bright as flat"
+    assert now > 0 and told["significance_now"] == pytest.approx(math.sqrt(now), rel=1e-4)
+    alive = bench.seen["flat"].total / (4 * 20e-3)
+    rate = 4 * alive / (1 - alive * 50e-9)
+    missing = 4 * rate**2 / (1 + rate * 50e-9) * 20e-3 * 10e-9
+    assert 0.9 * missing < told["significance_then"] ** 2 - now < 2.0 * missing
+
+
+# --- what would have been seen -----------------------------------------------------------------------------------
+
+
+def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
+    """(upper limit of an effect, standard deviations of each of its shapes' traces that the data have)."""
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, f"add {name}")
+    tried = look.looked_at(state, change, look.begun(state, change))
+    assert tried and all(isinstance(t, Tried) for t in tried)
+    found, hidden = outlook.upper_limits(look, state, tried)
+    assert [e["effect"] for e in [*found, *hidden]] == [name]
+    limit = found[0]["upper_limit_95"] if found else math.inf
+    return limit, [outlook._size(look, state, t.moved)[1] for t in tried]
+
+
+def test_what_would_have_been_seen_is_seen(lab):
+    """Twice the limit stands out beyond what a right model shows by chance, and the limit is no longer so low."""
+    usual, chance = limit_of(bench_of(lab()), "crosstalk")
+    assert 0 < usual < 0.05 and max(chance) < 3
+    for seed in (1, 2):
+        bench = bench_of(lab(f"    crosstalk: {{probability: {2 * usual}}}\n", seed=seed))
+        limit, along = limit_of(bench, "crosstalk")
+        assert max(along) > 3 and limit > usual
+
+
+# --- steps that are none -----------------------------------------------------------------------------------------
+
+
+def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
+    course = diagnose._begun(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
+    taken(course, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, settle=False)
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    diagnose._drop_needless(course)
+    assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
+    assert [c.name for c in course.search.accepted] == ["add crosstalk"]
+    assert course.ladder[-1]["model"] == "- afterpulsing"
+
+
+def test_a_step_that_is_needed_stays(lab):
+    course = diagnose._begun(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
+    taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    values, rungs = dict(course.values), len(course.ladder)
+    diagnose._drop_needless(course)
+    assert names(course) == ["add afterpulsing", "add crosstalk"] and course.values == values
+    assert len(course.ladder) == rungs
+
+
+def with_residuals(state: fit.State, sizes: dict[str, float]) -> fit.State:
+    """The state with residuals as large as that in the cells of these statistics of the flat field, 0 elsewhere."""
+    own = {cell: np.full(len(z), sizes.get(cell[1], 0.0)) for cell, z in state.residuals.items()}
+    return replace(state, residuals=own, exact=[])
+
+
+def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
+    """A step's own cells must be in order; another one that explains its own stays, whatever remains elsewhere."""
+    course = diagnose._begun(bench_of(lab()))
+    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 10.0})
+    end = with_residuals(course.state, {"intervals": 9.0})
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
+    course.state, course.judged = end, None
+    for step, name in zip(course.steps, ("neighbours", "intervals"), strict=True):
+        step.before = dict(start.residuals)
+        step.template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
+    monkeypatch.setattr(diagnose, "_settle_all", lambda course, settled=None: None)
+    assert course.failed
+    diagnose._drop_mimics(course, start)
+    assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
+    # and nothing is left of steps that made all of it worse
+    course.state = with_residuals(end, {"intervals": 30.0})
+    diagnose._drop_mimics(course, start)
+    assert not course.steps and not course.values
+
+
+# --- two that look the same --------------------------------------------------------------------------------------
+
+
+def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab):
+    bench = bench_of(lab())
+    state = bench.state({})
+    clean, foul = with_residuals(state, {}).residuals, with_residuals(state, {"intervals": 10.0}).residuals
+    kinds = [change_of(bench, f"add {name}") for name in ("afterpulsing", "slow_afterpulsing", "crosstalk")]
+    best, near, third = (Tried(c, {}, Moved({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
+
+    def told(**other: Any) -> list[tuple[str, bool]]:
+        found = diagnose._alternatives(bench, state, best, [], [best, replace(near, **other)])
+        return [(a["effect"], a["confused"]) for a in found]
+
+    assert told(gain=93.0) == [("slow_afterpulsing", True)]
+    assert told(gain=91.0) == [("slow_afterpulsing", False)]
+    assert told(residuals=foul) == [("slow_afterpulsing", False)]
+    assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
+    many = diagnose._alternatives(bench, state, best, [], [best, near, near, third])
+    assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
+
+
+def test_verdicts(lab):
+    course = diagnose._begun(bench_of(lab()))
+    step, some = object(), [object()]
+    assert diagnose._verdict(course, [], False, None) == "adequate"
+    assert diagnose._verdict(course, [], True, None) == "setup"
+    assert diagnose._verdict(course, some, False, None) == "unexplained"  # type: ignore[arg-type]
+    course.steps.append(step)  # type: ignore[arg-type]
+    assert diagnose._verdict(course, [], False, None) == "explained"
+    assert diagnose._verdict(course, some, False, None) == "partly_explained"  # type: ignore[arg-type]
+    assert diagnose._verdict(course, [], True, given(course, "add crosstalk", {}, False)) == "confused"
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_answer(lab, monkeypatch):
+    kinds = ("add afterpulsing", "add crosstalk")
+    few = [c for c in candidates.changes(lab()[0].settled()) if c.name in kinds]
+    monkeypatch.setattr(search, "changes", lambda sensor: few)
+    made = lab("    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n")
+    one, same = (diagnose.diagnose(*made, quick=True, jobs=1, max_steps=1) for _ in range(2))
+    assert [step.change.name for step in one.steps] == ["add afterpulsing"]
+    assert canonical(one) == canonical(same)
+
+
+def test_no_chance_is_none_at_all(lab):
+    """However wrong a model is: p-values have logarithms, and JSON has no infinite numbers."""
+    sensor, data = lab("    afterpulsing: {probability: 40 %, lifetime: 50 ns}\n")
+    checks = json.loads(json.dumps(compare.compare(sensor, data, jobs=1, replicates=16).as_data(), allow_nan=False))
+    p = [check["p_value"] for check in checks["checks"]]
+    assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
+    course = diagnose._begun(bench_of((sensor, data)))
+    one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
+    significance, chance = course.search.calibrated(course.state, [one], replace(one, gain=1e12))
+    assert 0 < chance < 1e-100 and math.isfinite(significance)
