@@ -133,7 +133,7 @@ def make(args: argparse.Namespace) -> int:
         return 2
     seed = secrets.randbits(63) if args.seed is None else args.seed
     cases = chosen(args.cases, args.quick, args.nulls)
-    order = np.random.default_rng(seed).permutation(len(cases))
+    order = np.random.default_rng(seed).permutation(len(cases))[: args.sample]
     unfinished = folder.with_name(folder.name + ".unfinished")
     for part in ("cases", "unseen", "sealed"):
         shutil.rmtree(unfinished / part, ignore_errors=True)
@@ -152,7 +152,7 @@ def make(args: argparse.Namespace) -> int:
         folder.rmdir()
     unfinished.rename(folder)
     print(
-        f"{len(cases)} cases in {folder / 'cases'}, {time.perf_counter() - began:.0f} s, "
+        f"{len(tasks)} cases in {folder / 'cases'}, {time.perf_counter() - began:.0f} s, "
         f"{np.median(seconds):.1f} s each, {max(seconds):.1f} s at most; the truth is sealed in {folder / 'sealed'}"
     )
     return 0
@@ -363,6 +363,7 @@ def main(arguments: list[str] | None = None) -> int:
     making.add_argument("--seed", type=int, help="default: nobody knows it")
     making.add_argument("--quick", action="store_true", help="16 of the cases, captures half as long")
     making.add_argument("--nulls", type=int, default=30, help="measurements without any effect [30]")
+    making.add_argument("--sample", type=int, metavar="N", help="so many of them, drawn by lot [all]")
     making.add_argument("--jobs", type=int, default=processors)
     running = verbs.add_parser("run", help="spadmnist compare and diagnose over all cases; again: what is missing")
     running.add_argument("folder", metavar="FOLDER")

@@ -26,7 +26,7 @@ from .answer import Diagnosis, Step, Trace, Value, plain, title
 from .candidates import Change, Key, changes
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
 from .ladder import errors_of, placebo_row, row
-from .search import Search, Tried, is_pattern
+from .search import ALIKE, Search, Tried, is_pattern
 
 _LEAST_P = 1e-300
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
@@ -166,6 +166,9 @@ def _diagnosed(
         before, earlier = course.state, course.kept()
         fell = course.misfit
         new = _accept(course, best, significance)
+        if best.maps is None and not best.phases:
+            unseen = search.scattered(before, course.values, best)
+            refined, second = refined + unseen, second + unseen
         new[0].alternatives = _alternatives(bench, before, best, refined, second)
         named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
         placebo = placebo or placebo_row(bench, before, tried, best, named)
@@ -531,7 +534,7 @@ def _alternatives(
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
         checks = fit.blocks(bench, state, residuals)
-        alike = one.residuals is not None and best.gain - one.gain < 8 and not fit.failing(checks)
+        alike = one.residuals is not None and best.gain - one.gain < ALIKE and not fit.failing(checks)
         out.append(
             {
                 "change": one.change.kind,

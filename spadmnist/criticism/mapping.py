@@ -28,6 +28,7 @@ _ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: th
 _TELLING, _LEAST_WIDTH = 0.2, 1e-3  # noise of a logarithm below which pixels tell how wide they lie; no narrower
 _TURNS = 16
 _MOST = 10.0  # of a logarithm
+_ODD = 4.0  # standard deviations of a pixel that is
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
@@ -227,7 +228,7 @@ def _begun(
     none: Sequence[np.ndarray],
     step: float,
 ) -> list[np.ndarray]:
-    """Where to begin: each map by the capture that tells most of it. An odd pixel is not found from the middle."""
+    """Where to begin: in the middle, but for odd pixels, which are not found from there; by the capture that tells most."""
     now, out = model(none), []
     for i, group in enumerate(groups):
         other = model([d + (step if j == i else 0) for j, d in enumerate(none)])
@@ -239,10 +240,12 @@ def _begun(
             told = float((slope**2 / line.variance(np.maximum(expected, 0.5), 0.0)).sum())
             if told > most and not line.saturated(counts):
                 scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
-                measured = np.bincount(group, counts, none[i].size) + 0.5
-                usual = np.bincount(group, expected * scale, none[i].size) + 0.5
+                measured = np.bincount(group, counts, none[i].size)
+                usual = np.bincount(group, expected * scale, none[i].size)
                 elasticity = max(float(slope.sum() / expected.sum()), 0.3)
-                most, best = told, np.clip(np.log(measured / usual) / elasticity, -_MOST / 2, _MOST / 2)
+                logs = np.clip(np.log((measured + 0.5) / (usual + 0.5)) / elasticity, -_MOST / 2, _MOST / 2)
+                odd = np.abs(measured - usual) > _ODD * np.sqrt(line.variance(usual, 0.0) + 1)
+                most, best = told, np.where(odd, logs, 0.0)
         out.append(best)
     return out
 

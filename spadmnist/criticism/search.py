@@ -17,6 +17,7 @@ from scipy import stats
 
 from ..effects import Effect
 from ..errors import SpadError
+from ..sensor import Sensor
 from . import fit, mapping
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
@@ -42,6 +43,9 @@ _SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
+_SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
+_TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
+ALIKE = 8.0  # in chi square, between candidates of which neither is better
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 _LEAST_P = 1e-300
 EACH = 9.0  # in chi square: what a further number must be worth
@@ -477,6 +481,35 @@ class Search:
             rest.insert(0, first)
         return rest
 
+    def scattered(self, state: State, values: dict[Key, Any], like: Tried) -> list[Tried]:
+        """Maps that no pixel tells by its counts, but that may do to all else what a candidate does.
+
+        Pixels that differ at random: every recording has others. Those that bring the data as near as `like` does.
+        """
+        levels = mapping.levels_of(self.bench, state)
+        out = []
+        for change in changes(state.sensors.one):
+            if change.per != "pixel" or change.carrier is None or change.effect == like.change.effect:
+                continue
+            told = sum(mapping.information(self.bench, values, change, levels).values())
+            if float(np.median(told)) > _TOLD:
+                continue
+            models = [_scattered(state.sensors, change, sigma) for sigma in _SIGMAS]
+            best: Tried | None = None
+            for sensors, moved in zip(models, self.bench.moved(state, models), strict=True):
+                if isinstance(moved, str):
+                    continue
+                one = Tried(change, {}, moved, 0.0, 1.0, sensors)
+                gains = [(self.square(self.bench.residuals(state, moved, x)), x) for x in _NEAR]
+                square, one.times = min(gains)
+                one.gain = self.square(state.residuals) - square
+                if best is None or one.gain > best.gain:
+                    best = one
+            if best is not None and best.gain > like.gain - ALIKE:
+                best.residuals = self.bench.residuals(state, best.moved, best.times)
+                out.append(best)
+        return out
+
     # --- settling ------------------------------------------------------------------------------------------------
 
     def worth(self, second: Sequence[Tried]) -> list[Tried]:
@@ -621,6 +654,20 @@ class Search:
             largest = np.maximum(largest, np.abs(along) / spread)
             marks[n] = abs(float(z @ t)) / spread
         return marks, largest
+
+
+def _scattered(sensors: Sensors, change: Change, sigma: float) -> Sensors:
+    """These sensors with pixels that differ at random by `sigma`, of a logarithm, in each recording."""
+    effect, parameter = change.carrier  # type: ignore[misc]
+
+    def of(capture: str, number: int) -> Sensor:
+        sensor = sensors.of(capture, number)
+        rng = np.random.Generator(np.random.Philox(key=[number, 11]))
+        usual = np.asarray(getattr(sensor.effect(effect), parameter), np.float64)
+        draws = np.exp(sigma * rng.standard_normal(sensor.layout.pixels))
+        return with_values(sensor, {(effect, parameter): usual * draws})
+
+    return Sensors(of, sensors.one, alike=False, typical=sensors.usual)
 
 
 def _gumbel_tail(largest: np.ndarray, mark: float) -> float:
