@@ -19,11 +19,15 @@ _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 @dataclass(frozen=True)
 class Line:
-    """A frequency that stands out. error: standard deviation of it, Hz; p: of anything as clear at any frequency."""
+    """A frequency that stands out. error: standard deviation of it, Hz; log_p: of anything as clear at any frequency."""
 
     frequency: float
     error: float
-    p: float
+    log_p: float
+
+    @property
+    def p(self) -> float:
+        return math.exp(max(self.log_p, -690.0))
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def lines(bench: Bench, state: State) -> list[Line]:
     for group in groups:
         found += _in(group, len(groups))
     kept: list[Line] = []
-    for line in sorted(found, key=lambda one: one.p):
+    for line in sorted(found, key=lambda one: one.log_p):
         apart = _APART * max(s.step for s in spectra)
         if all(abs(line.frequency - other.frequency) > apart for other in kept):
             kept.append(line)
@@ -83,16 +87,18 @@ def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
         bins = s.bins(grid)
         total += np.where(bins >= 0, s.surprise[bins], 0.0)
         number += bins >= 0
-    p = stats.gamma.sf(total, np.maximum(number, 1.0)) * grid.size * groups
+    tail = stats.gamma.logsf(total, np.maximum(number, 1.0))
+    # beyond what a double holds, by the exponential that it ends in
+    log_p = np.where(np.isfinite(tail), tail, -total) + math.log(grid.size * groups)
     out: list[Line] = []
-    for k in np.argsort(p)[: 2 * _MOST]:
-        if p[k] > _CLEAR:
+    for k in np.argsort(log_p)[: 2 * _MOST]:
+        if log_p[k] > math.log(_CLEAR):
             break
-        out.append(_line(group, float(grid[k]), float(p[k])))
+        out.append(_line(group, float(grid[k]), float(log_p[k])))
     return out
 
 
-def _line(group: Sequence[_Spectrum], about: float, p: float) -> Line:
+def _line(group: Sequence[_Spectrum], about: float, log_p: float) -> Line:
     """Where exactly: the mean over the spectra that show it."""
     weight = mean = 0.0
     for s in group:
@@ -103,8 +109,8 @@ def _line(group: Sequence[_Spectrum], about: float, p: float) -> Line:
         if abs(f - about) < 1.5 * s.step:
             mean, weight = mean + f / error**2, weight + error**-2
     if weight == 0:
-        return Line(about, min(s.step for s in group), p)
-    return Line(mean / weight, weight**-0.5, p)
+        return Line(about, min(s.step for s in group), log_p)
+    return Line(mean / weight, weight**-0.5, log_p)
 
 
 def _between_bins(power: np.ndarray, cell: int, step: float) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from simple_sensor import FRAME, many, reduced, sigmas, stamped, str_of
 
 from spadmnist import recording as recordings
 from spadmnist.recording import Recording
-from spadmnist.statistics.first import FirstArrivals
+from spadmnist.statistics.first import FirstArrivals, FrameEnds
 
 STEADY = partial(stamped, shape=(500, 8, 8), share=0.3, tick=1e-9)
 
@@ -42,6 +42,26 @@ def test_a_small_recording(share: float, tick: float, monkeypatch: pytest.Monkey
     monkeypatch.setattr(recordings, "_CHUNK", 1)
     again = Recording(**{**recording.__dict__, "_kept": {}})
     assert np.array_equal(reduced(FirstArrivals, again).values, summary.values)
+
+
+def test_the_ends_of_a_small_recording() -> None:
+    recording = stamped(3, (203, 5, 7), 0.3, 1e-9)
+    stamps = np.asarray(recording.frames[:]).ravel().astype(np.int64)  # type: ignore[index]
+    stamps = stamps[stamps < 10_000]
+    octaves = 8  # up to 128 ticks, half of a fortieth of the frame
+    edges = [0, *(2**k for k in range(octaves))]
+    away = [np.histogram(x, [*edges[:-1], edges[-1] - 0.5])[0] for x in (stamps, 9999 - stamps)]
+    summary = reduced(FrameEnds, recording)
+    assert summary.values.tolist() == np.concatenate(away).tolist()
+    assert summary.where(0) == "0 to 1 ns after the start of the frame"
+    assert summary.where(octaves + 1) == "1 to 2 ns before the end of the frame"
+
+
+def test_a_frame_that_ends_a_little_early_is_seen_at_its_end() -> None:
+    stamps = np.asarray(STEADY(1).frames[:])  # type: ignore[index]
+    found = sigmas(FrameEnds, str_of(np.where(stamps >= 9968, 10_000, stamps), 1e-9), STEADY)
+    assert found[8 + 5] < -4 and np.abs(found[:8]).max() < 4 and abs(found[-1]) < 4
+    null_laws.poisson(many(FrameEnds, STEADY, 120), 0.9)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.97])

@@ -1,0 +1,73 @@
+"""Lines: frequencies that stand out of the power spectra."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from spadmnist.criticism.lines import lines
+
+STEPS = {"dark": 10.0, "dim": 20.0, "bright": 66.7, "red": 33.3}  # Hz, from bin to bin
+BINS = 400
+
+
+def beside(powers: dict[str, np.ndarray]) -> tuple[Any, Any]:
+    """A bench and a state that have these spectra, in units of their mean."""
+    cells = {(id, "spectrum"): power for id, power in powers.items()}
+    seen = {
+        id: SimpleNamespace(
+            capture=SimpleNamespace(light=SimpleNamespace(dark=id == "dark")),
+            summaries={"spectrum": SimpleNamespace(values=power, axis=STEPS[id] * np.arange(1, power.size + 1))},
+        )
+        for id, power in powers.items()
+    }
+    residuals = {cell: stats.norm.isf(np.exp(-np.clip(p, 1e-12, 700))) for cell, p in cells.items()}
+    nulls = {cell: SimpleNamespace(law="exponential") for cell in cells}
+    return SimpleNamespace(seen=seen), SimpleNamespace(residuals=residuals, nulls=nulls)
+
+
+def noise(seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {id: rng.exponential(size=BINS) for id in STEPS}
+
+
+def swinging(seed: int, frequency: float, strength: float, dark: bool = False) -> dict[str, np.ndarray]:
+    """Noise, and in the captures with light (or the dark one) a line of so much power."""
+    powers = noise(seed)
+    for id, power in powers.items():
+        if (id == "dark") == dark:
+            power[round(frequency / STEPS[id]) - 1] += strength
+    return powers
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_line_that_no_capture_shows_by_itself_is_seen_in_all_of_them(seed: int) -> None:
+    # e^-9 in one of 400 bins is nothing; three of them at one frequency are 1e-8 after 400 bins of four captures
+    found = lines(*beside(swinging(seed, 200.0, 9.0)))
+    assert found and abs(found[0].frequency - 200.0) < 40.0 and found[0].p < 1e-3
+
+
+def test_a_line_of_the_dark_capture_alone_is_seen_too() -> None:
+    found = lines(*beside(swinging(3, 1000.0, 40.0, dark=True)))
+    assert len(found) == 1 and abs(found[0].frequency - 1000.0) < 10.0
+
+
+def test_of_noise_no_more_is_called_a_line_than_is_said() -> None:
+    # each set has a line with p <= 1e-3; of 300 sets 4 and more do with a chance of 3e-4
+    assert sum(bool(lines(*beside(noise(1000 + n)))) for n in range(300)) <= 3
+
+
+def test_where_it_lies_between_two_bins() -> None:
+    time = np.arange(4096) * 1e-4
+    powers = {}
+    for id, length in (("dark", 1000), ("dim", 500), ("bright", 150), ("red", 300)):
+        swing = 0.0 if id == "dark" else 0.3
+        n = np.random.default_rng(length).poisson(1000 * (1 + swing * np.cos(2 * np.pi * 213.0 * time[:length])))
+        power = np.abs(np.fft.rfft(n)[1:-1]) ** 2
+        powers[id] = power / np.median(power) * np.log(2)
+    found = lines(*beside(powers))
+    assert abs(found[0].frequency - 213.0) < 3 * found[0].error and found[0].error < 3.0

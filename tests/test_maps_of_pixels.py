@@ -1,0 +1,70 @@
+"""Maps: what each pixel's own value is; and closed forms of frames, on which they rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from joblib import Parallel
+
+from spadmnist import config, twin
+from spadmnist import measurement as measurements
+from spadmnist.criticism import mapping, recordings
+from spadmnist.criticism.candidates import changes, with_values
+from spadmnist.criticism.fit import Bench
+
+SIDE, FRAMES = 20, 60_000
+SENSOR = f"""sensor:
+  name: array
+  rules: device
+  layout: {{rows: {SIDE}, columns: {SIDE}, pixel_area: 100 um^2, fill_factor: 1.0}}
+  effects:
+    detection: {{pdp: 0.42}}
+    dark_counts: {{rate: 200 Hz}}
+"""
+CAPTURES = f"""format: spadmnist-measurement/1
+name: lab
+layout: {{rows: {SIDE}, columns: {SIDE}}}
+captures:
+  - {{id: dark, file: dark.h5, modality: qis, light: {{kind: dark}}, frames: {FRAMES},
+     frame_time: 1 us, frame_period: 1 us}}
+"""
+
+
+@pytest.mark.parametrize("usual", [20.0, 200.0])
+def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp_path: Path) -> None:
+    """The sensor lists the mean of pixels of which nearly all are quiet, or what most of them have."""
+    (tmp_path / "plan.yaml").write_text(CAPTURES)
+    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    rates = np.full(SIDE * SIDE, usual)
+    rates[[3, 77, 150, 256, 300]] = [200.0, 400.0, 2000.0, 9000.0, 60_000.0]
+    truth = with_values(sensor, {("dark_counts", "rate"): rates})
+    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
+    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
+    change = next(c for c in changes(sensor) if c.name == "per_pixel dark_counts.rate")
+    found = mapping.settle_maps(bench, {}, [change], {"dark": 1.0})[("dark_counts", "rate")].values()
+    counts = bench.seen["dark"].counts
+    assert counts is not None
+    expected = found * FRAMES * 1e-6
+    # 5 sigma of all of them, of what most have, of the hot ones
+    assert abs(expected.sum() - counts.sum()) < 5 * np.sqrt(counts.sum())
+    assert abs(np.median(found) / usual - 1) < 5 / np.sqrt(usual * SIDE**2 * FRAMES * 1e-6) + 0.02
+    hot = rates > 1000
+    assert np.all(np.abs(expected[hot] - counts[hot]) < 0.25 * counts[hot])
+
+
+@pytest.mark.parametrize("fraction", [1.0, 0.6])
+def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_path: Path) -> None:
+    (tmp_path / "sensor.yaml").write_text(SENSOR.replace("200 Hz", "100 kHz"))
+    gaps = CAPTURES.replace("frame_period: 1 us", "frame_period: 4 us").replace(str(FRAMES), "2000")
+    (tmp_path / "plan.yaml").write_text(gaps)
+    sensor = with_values(config.read_sensor(tmp_path / "sensor.yaml"), {("short_gate", "fraction"): fraction})
+    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(sensor, plan, tmp_path / "lab", 5))
+    expected = recordings.closed_form(sensor, data.captures[0])(1e-9)
+    total = float(data.recording("dark", sensor).totals.sum())
+    # about 45,000 detections; 5 sigma are 2 %, the gate makes 40 %
+    assert abs(total / expected - 1) < 5 / np.sqrt(expected)
