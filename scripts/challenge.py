@@ -190,9 +190,9 @@ def run(args: argparse.Namespace) -> int:
 
 def ask_all(folder: Path, case: str, args: argparse.Namespace) -> Iterator[bool]:
     """Ask what is missing of a case, as long as there is time; whether there was an answer."""
-    for question in QUESTIONS:
+    for question in args.ask:
         verb = "diagnose" if question == "diagnose" else "compare"
-        if not args.able[verb] or (args.no_compare and verb == "compare"):
+        if not args.able[verb]:
             continue
         if answer_of(folder, case, question)["answer"] is not None:
             continue
@@ -369,7 +369,7 @@ def main(arguments: list[str] | None = None) -> int:
     running.add_argument("folder", metavar="FOLDER")
     running.add_argument("--jobs", type=int, default=2, help="cases at a time [2]")
     running.add_argument("--quick", action="store_true", help="diagnose --quick")
-    running.add_argument("--no-compare", action="store_true", help="leave out spadmnist compare")
+    running.add_argument("--ask", nargs="+", choices=QUESTIONS, default=QUESTIONS, help="these questions only")
     running.add_argument("--minutes", type=float, default=math.inf, help="ask no new question after so long [no end]")
     running.add_argument("--timeout", type=float, default=1800.0, help="seconds for one answer [1800]")
     scoring = verbs.add_parser("score", help="open the truth, check the seals, write score.md")

@@ -646,11 +646,11 @@ def test_a_part_of_the_cases_is_scored(
 
 
 def test_what_has_failed_is_asked_last(made: Path, stub: Path) -> None:
-    assert challenge.main(["run", str(made), "--jobs", "1", "--no-compare"]) == 1
+    assert challenge.main(["run", str(made), "--jobs", "1", "--ask", "diagnose"]) == 1
     for path in (made / "answers").glob("case-00[5-8].diagnose.json"):
         path.unlink()
     stub.with_suffix(".log").unlink()
-    assert challenge.main(["run", str(made), "--jobs", "1", "--no-compare"]) == 1
+    assert challenge.main(["run", str(made), "--jobs", "1", "--ask", "diagnose"]) == 1
     asked = [Path(line.split()[2]).name for line in stub.with_suffix(".log").read_text().splitlines()]
     assert asked == ["case-005", "case-006", "case-007", "case-008", "case-002"]
 

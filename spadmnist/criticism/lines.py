@@ -19,7 +19,7 @@ _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 @dataclass(frozen=True)
 class Line:
-    """A frequency that stands out. error: standard deviation of it, Hz; log_p: of anything as clear at any frequency."""
+    """A frequency that stands out, Hz, with its standard deviation. log_p: of anything as clear at any frequency."""
 
     frequency: float
     error: float

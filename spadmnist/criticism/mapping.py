@@ -28,7 +28,7 @@ _ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: th
 _TELLING, _LEAST_WIDTH = 0.2, 1e-3  # noise of a logarithm below which pixels tell how wide they lie; no narrower
 _TURNS = 16
 _MOST = 10.0  # of a logarithm
-_ODD = 4.0  # standard deviations of a pixel that is
+_ODD, _WIDE = 3.5, 2.0  # standard deviations of a pixel that is odd; of a logarithm, how wide these lie
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
@@ -209,7 +209,20 @@ def settle_maps(
                 # of the bulk, beyond its noise: what creeps towards none would take long to arrive
                 width = 1.4826 * _middle(np.abs(own_raw - _middle(own_raw)))
                 sigma[i] = math.sqrt(max(width**2 - noise, _LEAST_WIDTH**2))
-            precision[i] = (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + (delta[i] - middle[i]) ** 2)
+            apart = delta[i] - middle[i]
+            odd = _odd(apart, sigma[i] ** 2 + post[i])
+            if noise >= _TELLING**2:
+                # by how much their counts scatter beyond chance: where each says little, so would its own best value
+                told = np.maximum(np.bincount(groups[i], normal[:, i, i], sizes[i]), 1e-9)
+                ratio = np.bincount(groups[i], score[:, i], sizes[i]) / told + apart
+                beyond = (ratio**2 - 1 / told)[~odd] * told[~odd] ** 2
+                relative = float(beyond.sum() / (told[~odd] ** 2).sum())  # of ratios; of logarithms it is less
+                sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), _LEAST_WIDTH**2))
+            precision[i] = np.where(
+                odd,
+                _WIDE**-2,  # they are of another kind, about which the others say nothing
+                (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + apart**2),
+            )
     out = codes
     for i, change in enumerate(wanted):
         assert change.carrier is not None
@@ -221,6 +234,16 @@ def settle_maps(
     return out
 
 
+def _odd(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Which of some logarithms are none of the bulk's, which are normal with this variance about 0, but of any size."""
+    usual = np.exp(-(apart**2) / (2 * variance)) / np.sqrt(2 * math.pi * variance)
+    share = 0.01
+    for _ in range(5):
+        odd = share / (2 * _MOST) > (1 - share) * usual
+        share = (float(odd.sum()) + 1) / (odd.size + 2)
+    return np.asarray(odd)
+
+
 def _begun(
     lines: Sequence[_Line],
     model: Callable[[Sequence[np.ndarray]], Sensor],
@@ -228,7 +251,7 @@ def _begun(
     none: Sequence[np.ndarray],
     step: float,
 ) -> list[np.ndarray]:
-    """Where to begin: in the middle, but for odd pixels, which are not found from there; by the capture that tells most."""
+    """Where to begin: in the middle, but for odd pixels, not to be found from there; by the capture that tells most."""
     now, out = model(none), []
     for i, group in enumerate(groups):
         other = model([d + (step if j == i else 0) for j, d in enumerate(none)])
