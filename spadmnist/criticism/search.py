@@ -436,7 +436,7 @@ class Search:
                 continue
             map_ = found[group[0].carrier]  # type: ignore[index]
             spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
-            if map_.sigma < _LEAST_SIGMA or spread < _LEAST_SPREAD:
+            if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
                 continue
             sensors = sensors.changed({}, self.phases)
             chance = min(self.map_chance(state, c, values, levels) for c in group)
