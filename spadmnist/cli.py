@@ -759,7 +759,7 @@ def fit(
     from . import disk
     from . import measurement as measurements
     from .criticism import answer, next_sensor
-    from .criticism import diagnose as criticism
+    from .criticism import fitted as criticism
 
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)

@@ -12,7 +12,7 @@ from joblib import Parallel
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
-from spadmnist.criticism import candidates, diagnose, fit, mapping
+from spadmnist.criticism import candidates, fit, fitted, mapping
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.recording import Capture, Light
@@ -90,11 +90,11 @@ def test_what_cannot_be_settled_is_told(tmp_path, made):
     sensor, captures, _ = made
     data = measured(tmp_path, sensor, captures)
     with pytest.raises(InputError, match="crosstalk"):
-        diagnose.fitted(sensor, data, add=["cross"])
+        fitted.fitted(sensor, data, add=["cross"])
     with pytest.raises(InputError, match=r"EFFECT\.PARAMETER"):
-        diagnose.fitted(sensor, data, free=["dead_time"])
+        fitted.fitted(sensor, data, free=["dead_time"])
     with pytest.raises(InputError, match="nothing is to be settled"):
-        diagnose.fitted(sensor, data)
+        fitted.fitted(sensor, data)
 
 
 class _Law:

@@ -110,7 +110,13 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ("click", {"cli.py"}),
         ("tqdm", {"cli.py"}),
         ("yaml", {"document.py"}),
-        ("joblib", {"factory.py", *(f"criticism/{name}.py" for name in ("compare", "recordings", "fit", "diagnose"))}),
+        (
+            "joblib",
+            {
+                "factory.py",
+                *(f"criticism/{name}.py" for name in ("compare", "recordings", "fit", "diagnose", "fitted")),
+            },
+        ),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),
         ("pooch", {"images.py", "image_files.py"}),
         ("pydantic", {"config.py", "images.py"}),

@@ -16,6 +16,7 @@ from joblib import Parallel
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.criticism import candidates, compare, diagnose, fit, outlook, search
+from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import canonical
 from spadmnist.criticism.candidates import Change, Key
 from spadmnist.criticism.fit import Bench, Moved
@@ -76,7 +77,7 @@ def change_of(bench: Bench, name: str) -> Change:
     return next(c for c in candidates.changes(bench.start) if c.name == name)
 
 
-def given(course: diagnose._Course, name: str, values: dict[Key, Any], settle: bool) -> Tried:
+def given(course: course_of.Course, name: str, values: dict[Key, Any], settle: bool) -> Tried:
     """A candidate at some values, or settled from there."""
     bench, state = course.bench, course.state
     change = next(c for c in candidates.changes(state.sensors.one) if c.name == name)
@@ -86,11 +87,11 @@ def given(course: diagnose._Course, name: str, values: dict[Key, Any], settle: b
     return course.search.refine(state, one) if settle else one
 
 
-def taken(course: diagnose._Course, name: str, values: dict[Key, Any], settle: bool = True) -> None:
-    diagnose._accept(course, given(course, name, values, settle), 1.0)
+def taken(course: course_of.Course, name: str, values: dict[Key, Any], settle: bool = True) -> None:
+    course_of.accept(course, given(course, name, values, settle), 1.0)
 
 
-def names(course: diagnose._Course) -> list[str]:
+def names(course: course_of.Course) -> list[str]:
     return [step.change.name for step in course.steps]
 
 
@@ -164,21 +165,21 @@ def test_what_would_have_been_seen_is_seen(lab):
 
 
 def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
-    course = diagnose._begun(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
+    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
     taken(course, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, settle=False)
     taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    diagnose._drop_needless(course)
+    course_of.drop_needless(course)
     assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
     assert [c.name for c in course.search.accepted] == ["add crosstalk"]
     assert course.ladder[-1]["model"] == "- afterpulsing"
 
 
 def test_a_step_that_is_needed_stays(lab):
-    course = diagnose._begun(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
+    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
     taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
     taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
     values, rungs = dict(course.values), len(course.ladder)
-    diagnose._drop_needless(course)
+    course_of.drop_needless(course)
     assert names(course) == ["add afterpulsing", "add crosstalk"] and course.values == values
     assert len(course.ladder) == rungs
 
@@ -191,7 +192,7 @@ def with_residuals(state: fit.State, sizes: dict[str, float]) -> fit.State:
 
 def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     """A step's own cells must be in order; another one that explains its own stays, whatever remains elsewhere."""
-    course = diagnose._begun(bench_of(lab()))
+    course = course_of.begun(bench_of(lab()))
     start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 10.0})
     end = with_residuals(course.state, {"intervals": 9.0})
     taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
@@ -200,13 +201,13 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     for step, name in zip(course.steps, ("neighbours", "intervals"), strict=True):
         step.before = dict(start.residuals)
         step.template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
-    monkeypatch.setattr(diagnose, "_settle_all", lambda course, settled=None: None)
+    monkeypatch.setattr(course_of, "settle_all", lambda course, settled=None: None)
     assert course.failed
-    diagnose._drop_mimics(course, start)
+    course_of.drop_mimics(course, start)
     assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
     # and nothing is left of steps that made all of it worse
     course.state = with_residuals(end, {"intervals": 30.0})
-    diagnose._drop_mimics(course, start)
+    course_of.drop_mimics(course, start)
     assert not course.steps and not course.values
 
 
@@ -233,7 +234,7 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
 
 
 def test_verdicts(lab):
-    course = diagnose._begun(bench_of(lab()))
+    course = course_of.begun(bench_of(lab()))
     step, some = object(), [object()]
     assert diagnose._verdict(course, [], False, None) == "adequate"
     assert diagnose._verdict(course, [], True, None) == "setup"
@@ -261,7 +262,7 @@ def test_no_chance_is_none_at_all(lab):
     checks = json.loads(json.dumps(compare.compare(sensor, data, jobs=1, replicates=16).as_data(), allow_nan=False))
     p = [check["p_value"] for check in checks["checks"]]
     assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
-    course = diagnose._begun(bench_of((sensor, data)))
+    course = course_of.begun(bench_of((sensor, data)))
     one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
     significance, chance = course.search.calibrated(course.state, [one], replace(one, gain=1e12))
     assert 0 < chance < 1e-100 and math.isfinite(significance)

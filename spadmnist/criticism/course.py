@@ -1,0 +1,328 @@
+"""A diagnosis under way: the model so far beside the data, and the steps that change it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from . import fit, mapping, recordings
+from .answer import Step, Value, title
+from .candidates import Key
+from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
+from .ladder import errors_of, row
+from .search import Search, Tried
+
+_AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
+_WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
+LEAST_GAIN = 12.0  # in chi square, of a step
+_LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
+_NEEDLESS = 9.0  # a step whose loss costs less is dropped
+
+
+@dataclass
+class Course:
+    """A diagnosis under way: the model so far beside the data."""
+
+    bench: Bench
+    search: Search
+    state: State
+    values: dict[Key, Any]
+    steps: list[Step]
+    ladder: list[dict[str, Any]]
+    judged: dict[Cell, np.ndarray] | None = None  # residuals of each capture by parameters settled without it
+
+    @property
+    def failed(self) -> list[fit.Block]:
+        """The checks that a right model would hardly fail."""
+        return fit.failing(fit.blocks(self.bench, self.state, self.state.residuals))
+
+    @property
+    def misfit(self) -> float:
+        """On captures that the numbers were not settled with, as far as there are any; 1 is noise."""
+        return fit.misfit(self.state, self.judged or self.state.residuals)
+
+    def kept(self) -> tuple[Any, ...]:
+        """All that a step changes."""
+        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.judged)
+        return (*own, list(self.search.accepted), dict(self.search.phases))
+
+    def back_to(self, kept: tuple[Any, ...]) -> None:
+        """As it was before a step."""
+        self.state, self.values, self.steps, self.ladder, self.judged = kept[:5]
+        self.search.accepted, self.search.phases = kept[5:]
+
+    def rung(self, name: str) -> None:
+        """A row more in the ladder of errors: the model as it is now."""
+        errors = errors_of(self.bench, self.state, self.judged or self.state.residuals)
+        self.ladder.append(row(name, self.misfit, errors))
+
+
+def begun(bench: Bench) -> Course:
+    """The model as it is stated, the phases of what swings settled."""
+    bench.say("the model as it is")
+    search = Search(bench, bench.say)
+    state = bench.state({})
+    keys = recordings.swinging(bench.start)
+    if keys:  # what swings begins anew in every capture
+        turns = search.turns(keys)
+        turned = bench.moved(state, [state.sensors.changed({}, t) for t in turns], fit.FEW)
+        if not any(isinstance(m, str) for m in turned):
+            *_, phases = search.best_phases(state, turned, turns, (1.0,))  # type: ignore[arg-type]
+            state = bench.state({}, state.sensors.changed({}, phases))
+            search.phases.update(phases)
+    course = Course(bench, search, state, {}, [], [])
+    course.rung("start")
+    return course
+
+
+def accept(course: Course, best: Tried, significance: float) -> list[Step]:
+    """Add the best candidate to the model, settle everything anew beside the data."""
+    bench, before = course.bench, course.state
+    new = [
+        Step(
+            change,
+            {},
+            0.0,
+            significance,
+            material(best),
+            dials=best.settled.dials if best.settled is not None and not best.faint else (),
+            template=bench.template(before, best.moved),
+            before=dict(before.residuals),
+            phased=bool(best.phases),
+            chips=best.chips,
+            intervals=dict(best.intervals),
+        )
+        for change in best.changes
+    ]
+    course.search.accepted += best.changes
+    course.search.phases.update(best.phases)
+    course.steps += new
+    course.values = {**course.values, **best.values}
+    settle_all(course, best.settled)
+    if best.faint and best.settled is not None:
+        for i, dial in enumerate(best.settled.dials):
+            new[0].values[dial.parameter] = Value(*best.settled.interval(i), dial.unit)
+    for step in new:
+        step.misfit = course.misfit
+    course.rung("+ " + " + ".join(title(step.change) for step in new))
+    return new
+
+
+def settle_all(course: Course, settled: Settled | None = None) -> None:
+    """The model with all its steps beside the data: maps, then all numbers together. settled: those of the last."""
+    bench, search = course.bench, course.search
+    sensors, maps = _model(course)
+    state = bench.state(course.values, sensors)
+    dials = tuple(d for step in course.steps for d in step.dials)
+    errors = errors_known(course, settled)
+    if settled is not None and settled.dials != dials:
+        settled = None
+    for step in course.steps:
+        if step.phased:
+            keys = _keys_of(step, course)
+            own = {k: v for k, v in course.values.items() if k in keys}
+            known = {pair: x for pair, x in search.phases.items() if pair[1] in step.change.phases}
+            one = Tried(step.change, own, Moved({}, {}, {}), 0.0, 1.0, phases=known)
+            course.values = {**course.values, **search.tuned(state, one, own, (math.pi / 4,))}
+            search.phases.update(one.phases)
+            step.intervals.update(one.intervals)
+            sensors, maps = _model(course)
+            state = bench.state(course.values, sensors)
+    # from where it nearly is right: the scatter of the cells is that of the model with the effect
+    for turn in range(_AGAIN + 1 if dials else 0):
+        here = {d.key: course.values[d.key] for d in dials}
+        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors)
+        if isinstance(closer, str):
+            break
+        settled = closer
+        if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
+            break
+        before = course.values, sensors, maps, state
+        course.values = {**course.values, **closer.values}
+        sensors, maps = _model(course)
+        state = bench.state(course.values, sensors)
+        if search.square(state.residuals) > search.square(before[3].residuals):
+            # a line or an edge: slopes do not lead further
+            course.values, sensors, maps, state = before
+            settled = replace(settled, point=fit.point_of(dials, here))
+            break
+    course.state = state
+    if settled is not None and dials:
+        point, covariance = settled.point, settled.covariance
+        course.judged = _unseen(state, settled)
+        place = {d.key: i for i, d in enumerate(settled.dials)}
+        for step in course.steps:
+            for dial in step.dials:
+                i = place[dial.key]
+                half, u = 1.96 * math.sqrt(max(float(covariance[i, i]), 0.0)), float(point[i])
+                step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
+                course.values[dial.key] = dial.value(u)
+    else:
+        course.judged = None
+    for step in course.steps:
+        if step.change.carrier and step.change.carrier in maps:
+            step.values = _map_values(maps[step.change.carrier])
+        for (effect, name), (low, high) in step.intervals.items():
+            unit = next(d.unit for d in step.change.dials if d.key == (effect, name))
+            step.values[name] = Value(float(course.values[effect, name]), low, high, unit)
+        for (_, name), value in step.change.fixed:
+            if name not in step.values and isinstance(value, (bool, int, float)):
+                step.values[name] = Value(float(value), None, None)
+
+
+def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, float]:
+    """Standard deviations of the coordinates of what is settled already."""
+    out = {}
+    for step in course.steps:
+        for dial in step.dials:
+            v = step.values.get(dial.parameter)
+            if v is not None and v.low is not None and v.high is not None:
+                out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * 1.96)
+    if settled is not None:
+        out |= {d.key: math.sqrt(max(float(settled.covariance[i, i]), 0.0)) for i, d in enumerate(settled.dials)}
+    return out
+
+
+def _model(course: Course) -> tuple[Sensors, dict[Key, mapping.Map]]:
+    """The model with all its steps, its maps settled to the data."""
+    bench, search = course.bench, course.search
+    held = [c for c in search.accepted if c.carrier]
+    chips = any(step.chips for step in course.steps)
+    if not held:
+        return Sensors.same(bench.start).changed(course.values, search.phases, chips), {}
+    levels = mapping.levels_of(bench, course.state)
+    sensors, maps, course.values = mapping.sensors_with(bench, course.values, held, levels)
+    return sensors.changed({}, search.phases, chips), maps
+
+
+def _map_values(map_: mapping.Map) -> dict[str, Value]:
+    told = {name: Value(number, None, None) for name, number in mapping.summary(map_).items()}
+    sigma, noise = told["sigma"].value, float(np.median(map_.raw_error))
+    # of a variance, which is what remains of the differences without the noise
+    half = 1.96 * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
+    ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
+    told["sigma"] = Value(sigma, ends[0], ends[1])
+    for name in ("low_fraction", "high_fraction"):
+        n, k = len(map_.raw), told[name].value * len(map_.raw)
+        low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
+        high = float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+        told[name] = Value(told[name].value, low, high)
+    return told
+
+
+def material(one: Tried) -> str:
+    """What a candidate changes of the mean rate, for people."""
+    logs = [x * one.times for x in one.moved.logs.values()]
+    return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
+
+
+def _stacked(state: State, settled: Settled) -> tuple[list[Cell], np.ndarray, np.ndarray]:
+    keys = [k for k in settled.slopes if k in state.residuals and len(state.residuals[k]) == len(settled.slopes[k])]
+    return keys, stacked(state.residuals, keys), np.concatenate([settled.slopes[k] for k in keys])
+
+
+def _unseen(state: State, settled: Settled) -> dict[Cell, np.ndarray]:
+    """Residuals of each capture, the numbers being settled without it (to first order).
+
+    Where one capture alone tells a number, each of its cells is judged by what the others of them say.
+    """
+    keys, z, slopes = _stacked(state, settled)
+    normal = slopes.T @ slopes
+    out = dict(state.residuals)
+    ridge = 1e-9 * np.trace(normal) * np.eye(len(normal))
+    for id in {k[0] for k in keys}:
+        mine = np.concatenate([np.full(len(state.residuals[k]), k[0] == id) for k in keys])
+        rest = normal - slopes[mine].T @ slopes[mine]
+        alone = bool(np.any(np.diag(rest) < 0.3 * np.diag(normal)))
+        start = 0
+        if not alone:
+            shift = -np.linalg.solve(rest + ridge, slopes[~mine].T @ z[~mine])
+        hat = np.einsum("ij,jk,ik->i", slopes, np.linalg.inv(normal + ridge), slopes)
+        for key in keys:
+            size = len(state.residuals[key])
+            part = slice(start, start + size)
+            start += size
+            if key[0] == id and key != RATES:
+                out[key] = z[part] / (1 - np.minimum(hat[part], 0.9)) if alone else z[part] + slopes[part] @ shift
+    return out
+
+
+def drop_needless(course: Course) -> None:
+    """Steps that later ones made superfluous are taken out again."""
+    bench = course.bench
+    for step in list(course.steps[:-1]):
+        if step.change.carrier or len(course.steps) < 2 or step.phased:
+            continue
+        rest = {k: v for k, v in course.values.items() if k not in _keys_of(step, course)}
+        sensors = Sensors.same(bench.start).changed(rest, course.search.phases)
+        if any(s.change.carrier for s in course.steps):
+            continue  # a map would have to be settled anew
+        (moved,) = bench.moved(course.state, [sensors], fit.FEW)
+        if isinstance(moved, str):
+            continue
+        others = tuple(d for s in course.steps if s is not step for d in s.dials)
+        z = bench.residuals(course.state, moved)
+        loss = course.search.square(z) - course.search.square(course.state.residuals)
+        if loss > 30 and not others:
+            continue
+        point = {d.key: rest[d.key] for d in others}
+        closer = fit.settle(bench, course.state, others, point, sensors.changed, 2) if others else None
+        if isinstance(closer, Settled):
+            loss = closer.square - course.search.square(course.state.residuals)
+        if loss < _NEEDLESS:
+            bench.say(f"{title(step.change)} is no longer needed")
+            course.steps.remove(step)
+            course.search.accepted.remove(step.change)
+            course.values = rest
+            settle_all(course)
+            course.rung(f"- {title(step.change)}")
+
+
+def _keys_of(step: Step, course: Course) -> set[Key]:
+    if step.change.kind == "add":
+        return {k for k in course.values if k[0] == step.change.effect}
+    return {(step.change.effect, step.change.parameter or "")}
+
+
+def drop_mimics(course: Course, start: State) -> None:
+    """Where something remains, steps that only happen to look like it are no findings.
+
+    The cells that a step speaks of must be in order with it; and of totals alone, whatever remains may be the cause.
+    """
+    while course.steps and course.failed:
+        # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
+        left = {id(s): _left_of_own(s, course.state) for s in course.steps}
+        worst = max(course.steps, key=lambda s: left[id(s)])
+        kept = [s for s in course.steps if s is not worst or left[id(s)] < 1]
+        if fit.misfit(course.state, course.state.residuals) > fit.misfit(start, start.residuals):
+            kept = []
+        if len(kept) == len(course.steps):
+            return
+        course.steps = kept
+        course.search.accepted = [c for c in course.search.accepted if any(c is s.change for s in kept)]
+        known = set().union(*(_keys_of(s, course) for s in kept))
+        course.values = {k: v for k, v in course.values.items() if k in known}
+        if kept:
+            settle_all(course)
+            course.rung("without what only looks alike")
+
+
+def _left_of_own(step: Step, state: State) -> float:
+    """What is left of the cells that a step speaks of; from 1 on it only happens to look like what is there."""
+    weight, after, before, shape, shapes = 0.0, 0.0, 0.0, 0.0, 0.0
+    for cell, t in step.template.items():
+        z, old = state.residuals.get(cell), step.before.get(cell)
+        if z is None or old is None or len(z) != len(t) or len(old) != len(t):
+            continue
+        w = t**2
+        weight, after, before = weight + float(w.sum()), after + float(w @ z**2), before + float(w @ old**2)
+        if cell != RATES:
+            shape, shapes = shape + float(old @ old - z @ z), shapes + float(w.sum())
+    # of totals alone, whatever remains may be the cause
+    if weight <= 0 or shape < LEAST_GAIN or shapes < 0.5 * weight:
+        return math.inf
+    return after / weight / max(4.0, _LEFT * before / weight)

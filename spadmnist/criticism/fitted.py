@@ -1,0 +1,151 @@
+"""Fitted: settle what the caller names, by the exact likelihood where there is one, or by simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from joblib import Parallel
+
+from ..errors import InputError
+from ..measurement import Measurement
+from ..sensor import Sensor
+from . import fit, likelihood, recordings
+from .answer import Diagnosis, Step, title
+from .candidates import Change, Key, changes
+from .course import Course, accept, begun, errors_known, material, settle_all
+from .findings import nuisances, remainder, traces
+from .fit import Bench, Moved, Settled
+from .search import Tried
+
+
+def fitted(
+    sensor: Sensor,
+    measurement: Measurement,
+    add: Sequence[str] = (),
+    free: Sequence[str] = (),
+    per_pixel: Sequence[str] = (),
+    seed: int = 0,
+    jobs: int = 2,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Settle what the caller names: whole effects (`add`), "effect.parameter" (`free`), and maps (`per_pixel`).
+
+    By the exact likelihood where all that is asked for and all that the sensor has is in it, otherwise by simulation.
+    Raises InputError where there is no such effect or parameter.
+    """
+    say = progress or (lambda what: None)
+    every = changes(sensor.settled())
+    wanted = [
+        *(_named(every, "add", name, None) for name in add),
+        *(_named(every, "set", *_halves(name)) for name in free),
+        *(_named(every, "per_pixel", *_halves(name)) for name in per_pixel),
+    ]
+    if not wanted:
+        raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
+    with Parallel(n_jobs=jobs) as parallel:
+        bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
+        course = begun(bench)
+        start, before = course.state, course.misfit
+        say("settling " + ", ".join(title(change) for change in wanted))
+        data = [measurement.recording(c.id, bench.start) for c in measurement.captures if c.mean is None]
+        exact = likelihood.settled(bench.start, data, wanted) if len(data) == len(bench.seen) else "a mean alone"
+        if isinstance(exact, str):
+            say(f"by simulation, for there is no likelihood of {exact}")
+            _by_simulation(course, wanted)
+        else:
+            _by_likelihood(course, wanted, exact)
+        left = course.failed
+        return Diagnosis(
+            bench.start.name,
+            measurement.name,
+            "partly_explained" if left else "explained",
+            before,
+            course.misfit,
+            fit.usual_misfit(start),
+            nuisances(bench, course.state),
+            course.steps,
+            [],
+            remainder(bench, course.state, course.state.residuals),
+            course.ladder,
+            [],
+            [],
+            [],
+            traces(bench, start, course.state),
+            course.values,
+            None,
+            bench.simulations,
+            bench.dark,
+        )
+
+
+def _by_likelihood(course: Course, wanted: Sequence[Change], exact: likelihood.Exact) -> None:
+    """Steps with these numbers; their misfit is found as that of all others."""
+    bench, before = course.bench, course.state
+    for change, gain in zip(wanted, exact.gains, strict=True):
+        intervals = {d.key: exact.intervals[d.key] for d in change.dials}
+        own = {**dict(change.fixed), **{key: exact.values[key] for key in intervals}}
+        moved = bench.told(before, before.sensors.changed(own))
+        told = material(Tried(change, own, moved, gain, 1.0))
+        step = Step(change, {}, 0.0, math.sqrt(max(gain, 0.0)), told, intervals=intervals)
+        step.template, step.before = bench.template(before, moved), dict(before.residuals)
+        course.steps.append(step)
+    course.search.accepted += wanted
+    course.values = {**course.values, **exact.values}
+    settle_all(course)
+    for step in course.steps:
+        step.misfit = course.misfit
+        step.values = {name: replace(v, method="likelihood") for name, v in step.values.items()}
+    course.rung("+ " + " + ".join(title(change) for change in wanted))
+
+
+def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
+    """A step for each, maps last; then the intervals of all numbers by profile."""
+    bench = course.bench
+    for change in sorted(wanted, key=lambda c: bool(c.carrier)):
+        if change.carrier:
+            best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={})
+        else:
+            best = course.search.refine(course.state, _started(course, change), 5)
+        accept(course, best, math.sqrt(max(best.gain, 0.0)))
+    ends: dict[Key, tuple[float, float]] = {}
+    dials = tuple(d for step in course.steps for d in step.dials)
+    if dials:
+        bench.say("intervals")
+        # the state's own numbers, from which the settled ones are one step away
+        here = {d.key: course.state.values.get(d.key, course.values[d.key]) for d in dials}
+        sensors, few = course.state.sensors.changed, 2 * fit.FEW
+        settled = fit.follow(bench, course.state, dials, here, sensors, few, errors_known(course))
+        if isinstance(settled, Settled):
+            settled = replace(settled, point=fit.point_of(dials, course.values))
+            ends = fit.profiled(bench, course.state, settled, sensors, few)
+    for step in course.steps:
+        for name, value in step.values.items():
+            low, high = ends.get((step.change.effect, name), (value.low, value.high))
+            how = "counts" if step.change.carrier else "simulation"
+            step.values[name] = replace(value, low=low, high=high, method=how)
+
+
+def _started(course: Course, change: Change) -> Tried:
+    """The template of a change that comes nearest, at the strength that suits it."""
+    found = course.search.looked_at(course.state, change, course.search.begun(course.state, change))
+    if not found:
+        raise InputError(f"{title(change)} cannot be simulated in these captures")
+    return max(found, key=lambda t: t.gain)
+
+
+def _halves(name: str) -> tuple[str, str]:
+    effect, dot, parameter = name.partition(".")
+    if not dot or not parameter:
+        raise InputError(f"{name!r} is not EFFECT.PARAMETER, for example dead_time.duration")
+    return effect, parameter
+
+
+def _named(every: Sequence[Change], kind: str, effect: str, parameter: str | None) -> Change:
+    for change in every:
+        if (change.kind, change.effect) == (kind, effect) and (kind == "add" or change.parameter == parameter):
+            return change
+    name = effect + (f".{parameter}" if parameter else "")
+    able = sorted({c.effect + (f".{c.parameter}" if c.parameter else "") for c in every if c.kind == kind})
+    raise InputError(f"{name} cannot be settled here; those that can: {', '.join(able)}")
