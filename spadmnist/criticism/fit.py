@@ -438,7 +438,7 @@ class Bench:
         noise: dict[Cell, float] = {}
         logs = {}
         nothing = True
-        for id in state.rates.keys() - state.made.keys():
+        for id in state.rates.keys() - made.keys():  # not simulated: of a capture's total the closed form tells enough
             logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
             base, some = state.made[id], other.numbers.astype(int)
@@ -669,10 +669,11 @@ def settle(
     rounds: int = 3,
     few: int = FEW,
     stronger: tuple[float, float] = (1.0, 1.0),
+    only: Sequence[str] = (),
 ) -> Settled | str:
     """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated.
 
-    stronger: (factor, power). Of faint effects, what one `factor` times as strong does is simulated, and taken for
+    only: of these captures; the others' cells are taken not to follow. stronger: (factor, power). Of faint effects, what one `factor` times as strong does is simulated, and taken for
     factor^power times what it does itself.
     """
     dials = tuple(dials)
@@ -683,7 +684,7 @@ def settle(
         return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(dials, u, strict=True)}}
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | str]:
-        found = bench.moved(state, [sensors_of(boosted(at(u))) for u in points], few)
+        found = bench.moved(state, [sensors_of(boosted(at(u))) for u in points], few, only)
         times = stronger[0] ** -stronger[1]
         return [m if isinstance(m, str) else stacked(bench.residuals(state, m, times), keys) for m in found]
 
@@ -700,10 +701,11 @@ def settle(
     slopes, there, damping, promised = np.zeros((0, len(dials))), u, 0.0, 0.0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in dials])
+    seen = np.ones(len(dials), bool)  # which of the dials anything follows
     for turn in range(2 * rounds):
         # slopes hold for a while: they are found anew where the point has moved on, or did not gain what they promised
         anew = turn == 0 or bool(np.any(np.abs(u - there) > reach))
-        found = evaluate([u, *(_aside(dials, u, steps) if anew else [])])
+        found = evaluate([u, *(_aside(dials, u, steps, seen) if anew else [])])
         if isinstance(found[0], str):
             return found[0]
         z = found[0]
@@ -711,10 +713,12 @@ def settle(
         if best is not None and not anew and best[0] - square < 0.3 * promised:
             if promised < 4:
                 break
-            found = [z, *evaluate(_aside(dials, u, steps))]
+            found = [z, *evaluate(_aside(dials, u, steps, seen))]
             anew = True
         if anew:
-            slopes, there = _slopes(found[1:], _aside(dials, u, steps), len(z)), u
+            slopes, there = np.zeros((len(z), len(dials))), u
+            slopes[:, seen] = _slopes(found[1:], _aside(dials, u, steps, seen), len(z), np.flatnonzero(seen))
+            seen = np.einsum("ij,ij->j", slopes, slopes) >= _BLIND
         if best is None or square < best[0]:
             best, damping = (square, u, z), damping / 3
         else:
@@ -737,10 +741,15 @@ def settle(
     )
 
 
-def _aside(dials: Sequence[Dial], u: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
-    """Points to both sides of one, dial by dial: what chance does to the point itself must not be in the slope."""
+def _aside(dials: Sequence[Dial], u: np.ndarray, steps: np.ndarray, seen: np.ndarray | None = None) -> list[np.ndarray]:
+    """Points to both sides of one, dial by dial: what chance does to the point itself must not be in the slope.
+
+    seen: of which dials.
+    """
     out = []
     for i, dial in enumerate(dials):
+        if seen is not None and not seen[i]:
+            continue
         for h in (steps[i], -steps[i]):
             other = u.copy()
             other[i] = dial.coordinate(dial.value(u[i] + h))
@@ -748,12 +757,21 @@ def _aside(dials: Sequence[Dial], u: np.ndarray, steps: np.ndarray) -> list[np.n
     return out
 
 
-def _slopes(found: Sequence[np.ndarray | str], places: Sequence[np.ndarray], cells: int) -> np.ndarray:
-    """(cells, dials) how residuals follow the dials, from those at points `_aside`; 0 where one could not be made."""
+def _slopes(
+    found: Sequence[np.ndarray | str],
+    places: Sequence[np.ndarray],
+    cells: int,
+    which: Sequence[int] | np.ndarray | None = None,
+) -> np.ndarray:
+    """(cells, dials) how residuals follow the dials, from those at points `_aside`; 0 where one could not be made.
+
+    which: the numbers of the dials.
+    """
     out = np.zeros((cells, len(places) // 2))
     for i in range(out.shape[1]):
         up, down = found[2 * i], found[2 * i + 1]
-        apart = places[2 * i][i] - places[2 * i + 1][i]
+        k = i if which is None else which[i]
+        apart = places[2 * i][k] - places[2 * i + 1][k]
         if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
             out[:, i] = (up - down) / apart
     return out

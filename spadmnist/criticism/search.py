@@ -33,6 +33,7 @@ _NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _TURNS = 8  # phases that are tried first
 _NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
+_SHOWS = 0.01  # of the square of a trace, in a capture that tells it
 _MAP = "pixel_map"
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
@@ -538,6 +539,7 @@ class Search:
             lambda v: state.sensors.changed(v, one.phases, one.chips),
             rounds,
             stronger=(boost, one.power),
+            only=() if one.phases else self._showing(state, one.moved),
         )
         if isinstance(found, str):
             return one
@@ -550,6 +552,15 @@ class Search:
         if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
             one.gain = max(one.gain, self.beside(state, one.sensors))
         return one
+
+    def _showing(self, state: State, moved: Moved) -> list[str]:
+        """The captures that show what a model does: all but those that have hardly any of its trace."""
+        share = dict.fromkeys(state.made, 0.0)
+        for (id, _), t in self.bench.template(state, moved).items():
+            if id in share:
+                share[id] += float(t @ t)
+        least = _SHOWS * max(sum(share.values()), 1e-12)
+        return [id for id, x in share.items() if x >= least]
 
     def _boost(self, state: State, one: Tried, given: Mapping[Key, Any], size: float) -> float:
         """How much stronger a faint effect is simulated; 1 where its trace does not grow in proportion: an edge."""
