@@ -673,8 +673,8 @@ def settle(
 ) -> Settled | str:
     """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated.
 
-    only: of these captures; the others' cells are taken not to follow. stronger: (factor, power). Of faint effects, what one `factor` times as strong does is simulated, and taken for
-    factor^power times what it does itself.
+    only: of these captures; the others' cells are taken not to follow. stronger: (factor, power). Of faint effects,
+    what one `factor` times as strong does is simulated, and taken for factor^power times what it does itself.
     """
     dials = tuple(dials)
     keys = list(state.residuals)
