@@ -23,7 +23,7 @@ from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needles
 from .findings import nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
-from .search import ALIKE, Tried, is_pattern
+from .search import Tried, alike, is_pattern
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 5e-4  # p-value of a trace that is followed where no check fails by itself
@@ -222,14 +222,14 @@ def _alternatives(
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
         checks = fit.blocks(bench, state, residuals)
-        alike = one.residuals is not None and best.gain - one.gain < ALIKE and not fit.failing(checks)
+        as_good = one.residuals is not None and best.gain - one.gain < alike(best.gain) and not fit.failing(checks)
         out.append(
             {
                 "change": one.change.kind,
                 "effect": one.change.effect,
                 "parameter": one.change.parameter,
                 "misfit": plain(fit.misfit(state, residuals)),
-                "confused": alike,
+                "confused": as_good,
                 "tried": one,
             }
         )

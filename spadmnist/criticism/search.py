@@ -46,7 +46,7 @@ _SWINGING = 6  # recordings for phases: what swings has other random numbers tha
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
-ALIKE = 8.0  # in chi square, between candidates of which neither is better
+_ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 _LEAST_P = 1e-300
 EACH = 9.0  # in chi square: what a further number must be worth
@@ -495,19 +495,22 @@ class Search:
             told = sum(mapping.information(self.bench, values, change, levels).values())
             if float(np.median(told)) > _TOLD:
                 continue
-            models = [_scattered(state.sensors, change, sigma) for sigma in _SIGMAS]
             best: Tried | None = None
-            for sensors, moved in zip(models, self.bench.moved(state, models), strict=True):
-                if isinstance(moved, str):
-                    continue
-                one = Tried(change, {}, moved, 0.0, 1.0, sensors)
-                gains = [(self.square(self.bench.residuals(state, moved, x)), x) for x in _NEAR]
-                square, one.times = min(gains)
-                one.gain = self.square(state.residuals) - square
-                if best is None or one.gain > best.gain:
-                    best = one
-            if best is not None and best.gain > like.gain - ALIKE:
-                best.residuals = self.bench.residuals(state, best.moved, best.times)
+            about, sigmas = 0.0, np.array(_SIGMAS)
+            for _ in range(3):  # ever closer to the width that suits
+                models = [_scattered(state.sensors, change, float(sigma)) for sigma in sigmas]
+                for sigma, sensors, moved in zip(sigmas, models, self.bench.moved(state, models), strict=True):
+                    if isinstance(moved, str):
+                        continue
+                    residuals = self.bench.residuals(state, moved)
+                    gain = self.square(state.residuals) - self.square(residuals)
+                    if best is None or gain > best.gain:
+                        best = Tried(change, {}, moved, gain, 1.0, sensors, residuals=residuals)
+                        about = float(sigma)
+                if best is None or best.gain < like.gain / 2:
+                    break
+                sigmas = about * np.exp(math.log(sigmas[1] / sigmas[0]) * np.array([-0.6, -0.3, 0.3, 0.6]))
+            if best is not None and best.gain > like.gain - alike(like.gain):
                 out.append(best)
         return out
 
@@ -665,6 +668,11 @@ class Search:
             largest = np.maximum(largest, np.abs(along) / spread)
             marks[n] = abs(float(z @ t)) / spread
         return marks, largest
+
+
+def alike(gain: float) -> float:
+    """By how much less than the best another candidate may gain that is as good."""
+    return _ALIKE + _BLURRED * math.sqrt(max(gain, 0.0))
 
 
 def _scattered(sensors: Sensors, change: Change, sigma: float) -> Sensors:
