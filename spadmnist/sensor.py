@@ -27,6 +27,7 @@ from .streams import BLOCK, Draws, Streams
 
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
 _GENERATIONS = 10_000
+_CHILDREN = 200  # times the events that they come from: more is a cascade without end
 _NONE = np.zeros(0)
 _NOBODY = np.zeros(0, np.int64)
 
@@ -486,10 +487,10 @@ class Sensor:
         current, index, known = events, np.arange(len(events)) if correlated else _NONE, len(events)
         generation = 0
         while correlated and len(current) and (cascade or generation == 0):
-            if generation == _GENERATIONS:
+            if generation == _GENERATIONS or known > _CHILDREN * (len(events) + _CHILDREN):
                 raise SpadError(
-                    f"the cascade of avalanches does not end ({_GENERATIONS} generations); "
-                    "lower the probabilities of the correlated effects"
+                    f"the cascade of avalanches does not end ({known - len(events)} of {len(events)} events in "
+                    f"{generation} generations); lower the probabilities of the correlated effects"
                 )
             suffix = f"/generation {generation}" if generation else ""
             found = [self._spawn(effect, current, streams, suffix) for effect in correlated]

@@ -89,8 +89,8 @@ def _diagnosed(
             first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
             bench.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
             tried = search.scan(course.state)
-        held = {d.key for s in course.steps for d in s.dials}  # settled anew with every step: no finding of their own
-        tried = [t for t in tried if t.change.kind != "set" or not held & {d.key for d in t.change.dials}]
+        # what a step has set is settled anew with every other one: no finding of its own
+        tried = [t for t in tried if t.change.kind != "set" or course.values.keys().isdisjoint(t.values)]
         bench.say(f"step {number}: the best of them on all captures")
         second = search.structured(course.state, search.again(course.state, course.values, tried))
         if not second:
