@@ -87,10 +87,12 @@ class Null:
         """(p-value of residuals, by their sum of squares or their largest; which is the largest)."""
         square = float(np.mean(z**2))
         mean, variance = max(float(self.own.mean()), 0.05), float(self.own.var(ddof=1))
+        if self.law == "poisson":  # cells that are always empty would not scatter at all, and one count be impossible
+            variance = max(variance, 1 / z.size)
         # a variance of so many recordings may be too small by about so much; then rare values would look too rare
         variance *= 1 + math.sqrt(5 / self.recordings)
         shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
-        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
+        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape)) if square > mean else 1.0
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))

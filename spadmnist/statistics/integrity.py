@@ -94,13 +94,13 @@ def chances_of_repeats(frames, same, likely, log_best, loss, least, of_stamp):
 
 @jit
 def faults(stamps, offsets, end):
-    """(stamps that are smaller than the one before in the same row, equal to it, and those not below `end`)."""
+    """(stamps that are smaller than the one before in the same row, equal to it, and those behind `end`)."""
     smaller = 0
     equal = 0
     late = 0
     for row in range(offsets.size - 1):
         for i in range(offsets[row], offsets[row + 1]):
-            if not stamps[i] < end:
+            if not stamps[i] <= end:  # one may have been rounded to the end
                 late += 1
             if i > offsets[row]:
                 smaller += stamps[i] < stamps[i - 1]
@@ -298,7 +298,7 @@ class Disorder(Statistic):
 
 
 class EqualStamps(Statistic):
-    """Time stamps that the pixel already has, and stamps from the end of the exposure on.
+    """Time stamps that the pixel already has, and stamps behind the end of the exposure.
 
     Law: Poisson, rare things. With a dead time longer than a tick there are no equal stamps at all.
     Shows: events that were stored twice, a dead time or an exposure that is not what it should be.
