@@ -13,7 +13,7 @@ import pytest
 import spadmnist
 from spadmnist import config, factory, report
 from spadmnist.effects import Conditions, Effect
-from spadmnist.errors import ConfigError
+from spadmnist.errors import ConfigError, SpadError
 from spadmnist.events import Layout
 from spadmnist.readout import Recorded
 from spadmnist.sensor import Sensor
@@ -127,6 +127,13 @@ def test_an_effect_that_loses_the_causes_is_named() -> None:
 
 
 # --- counts -------------------------------------------------------------------------------------------------------
+
+
+def test_a_cascade_without_end_is_refused_before_it_fills_the_memory() -> None:
+    """Every avalanche fires 3 others in the mean: 3^n in generation n, on an array that is never wholly blind."""
+    many = sensor("device", crosstalk={"probability": 0.6, "delay": 1e-6})
+    with pytest.raises(SpadError, match="does not end"):
+        expose(many, False, images=1)
 
 
 def test_counts_are_sums_of_binary_frames() -> None:

@@ -193,6 +193,8 @@ def test_stamps_out_of_order_equal_or_late(tick: float | None) -> None:
     assert reduced(Disorder, recording).values.tolist() == [1]
     assert reduced(Disorder, recording).law == "exact"
     assert reduced(EqualStamps, recording).values.tolist() == [3, 1]
+    rounded = tr_of([np.array([1e-6, 1e-5])], grid(1, 1), 1e-5, tick)  # to the very end, which is not behind it
+    assert reduced(EqualStamps, rounded).values.tolist() == [0, 0]
     whole = tr(1, grid(4, 4), 1e6, 1e-3, 50e-9, tick=tick)
     assert reduced(Disorder, whole).values.tolist() == [0]
     assert reduced(EqualStamps, whole).values.tolist() == [0, 0]
