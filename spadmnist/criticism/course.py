@@ -175,15 +175,16 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
 
 
 def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, float]:
-    """Standard deviations of the coordinates of what is settled already."""
+    """Standard deviations of the coordinates of strengths that are settled already: edges have slopes close by only."""
     out = {}
     for step in course.steps:
         for dial in step.dials:
             v = step.values.get(dial.parameter)
-            if v is not None and v.low is not None and v.high is not None:
+            if dial.off is not None and v is not None and v.low is not None and v.high is not None:
                 out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * 1.96)
     if settled is not None:
-        out |= {d.key: math.sqrt(max(float(settled.covariance[i, i]), 0.0)) for i, d in enumerate(settled.dials)}
+        spread = np.sqrt(np.maximum(np.diag(settled.covariance), 0.0))
+        out |= {d.key: float(x) for d, x in zip(settled.dials, spread, strict=True) if d.off is not None}
     return out
 
 
