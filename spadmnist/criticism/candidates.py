@@ -247,7 +247,7 @@ def templates(change: Change) -> list[dict[Key, float]]:
 
 
 def first_strengths(dial: Dial) -> list[float]:
-    """Strengths that should show and not saturate: one, or two where little is seen by other signs than much."""
+    """Strengths that should show and not saturate: one, or several where little is seen by other signs than much."""
     off, whole = dial.off or 0.0, dial.high - dial.low
     if dial.lacks:
         return [off - x * whole for x in (0.2, 2e-3, 2e-4)]
