@@ -608,7 +608,7 @@ def source_noise(lab: Lab, x: float) -> Hidden:
         "a random level in each coherence time",
         added("source_noise"),
         settings,
-        {"source_noise.contrast": x},
+        {"source_noise.contrast": math.sqrt(x)},  # the catalogue's is the standard deviation of the level
         {"source_noise.coherence_time": 2 * hold},
     )
 

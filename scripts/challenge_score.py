@@ -34,6 +34,7 @@ RULES = {
     "columns": "column_pattern",
     "surface": "illumination_gradient",
     "slow_series": "blinking_dark_counts",
+    "hot_series": "blinking_dark_counts",
     "spacing": "readout_loss",
     "first_arrivals": "short_gate",
     "rate": "background_light",

@@ -51,6 +51,7 @@ class Parameter:
     by_wavelength: bool = False
     choices: tuple[str, ...] = ()
     required: bool = False
+    needs: str = ""  # the parameter without which this one does nothing
     name: str = ""
 
     @property
@@ -98,6 +99,7 @@ def parameter(
     by_wavelength: bool = False,
     choices: tuple[str, ...] = (),
     required: bool = False,
+    needs: str = "",
 ) -> Any:
     """Declare a parameter in the body of a plug-in's class.
 
@@ -105,7 +107,8 @@ def parameter(
     off: the value at which the effect vanishes. bounds: what is possible. search: where a fit looks.
     per_pixel: it may be a map from a file or a distribution; per: the same over "row", "column" or "code" (of a
     converter; the effect declares a parameter `period`, their number) instead of "pixel". by_wavelength: it may be a
-    table over the wavelength. choices: the words that are allowed, where it is no number.
+    table over the wavelength. choices: the words that are allowed, where it is no number. needs: another parameter,
+    without which this one does nothing.
     """
     per = "pixel" if per_pixel else per
     if per not in PER:
@@ -115,7 +118,7 @@ def parameter(
     if unit != "bool" and not units.is_known(unit):
         raise TypeError(f"{unit!r} is not an SI unit that is known here")
     return Parameter(
-        default, unit, about, symbol, bounds, open_bounds, off, search, per, by_wavelength, choices, required
+        default, unit, about, symbol, bounds, open_bounds, off, search, per, by_wavelength, choices, required, needs
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -158,6 +158,82 @@ def test_nothing_is_told_where_nothing_happened(sensor: Sensor) -> None:
     assert exact.intervals[CHANCE] == pytest.approx((1e-4, 0.2))
 
 
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """Where the likelihood is asked for from now on."""
+    asked: list[np.ndarray] = []
+    value = likelihood.Likelihood.__call__
+
+    def call(self: likelihood.Likelihood, u: np.ndarray) -> float:
+        asked.append(u)
+        return value(self, u)
+
+    monkeypatch.setattr(likelihood.Likelihood, "__call__", call)
+    return asked
+
+
+@pytest.mark.parametrize("off", [0.5, 2.0, 40.0])
+def test_a_start_saves_time_and_changes_nothing(sensor: Sensor, monkeypatch: pytest.MonkeyPatch, off: float) -> None:
+    """Even where it is none."""
+    rest = [e for e in sensor.effects if e.name not in CHANCE]
+    without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
+    hidden = candidates.with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9, DEAD: 52e-9})
+    data = stamps(hidden, 5e-3, 1e6, 1)
+    changes = named(without, "add afterpulsing", "set dead_time.duration")
+    asked = counted(monkeypatch)
+    exact = likelihood.settled(without, data, changes)
+    assert isinstance(exact, likelihood.Exact)
+    alone = len(asked)
+    dials = {d.key: d for change in changes for d in change.dials}
+    ends = {key: [dials[key].coordinate(x) for x in interval] for key, interval in exact.intervals.items()}
+    errors = {key: (high - low) / 3.92 for key, (low, high) in ends.items()}
+    start = {key: d.value(d.coordinate(exact.values[key]) - off * errors[key]) for key, d in dials.items()}
+    again = likelihood.settled(without, data, changes, start=start, errors=errors)
+    assert isinstance(again, likelihood.Exact)
+    assert len(asked) - alone < (0.7 if off < 10 else 2.0) * alone
+    for key, d in dials.items():
+        assert abs(d.coordinate(again.values[key]) - d.coordinate(exact.values[key])) < 0.2 * errors[key]
+        assert [d.coordinate(x) for x in again.intervals[key]] == pytest.approx(ends[key], abs=0.05 * errors[key])
+
+
+def test_a_number_that_nothing_follows_is_left_alone(sensor: Sensor) -> None:
+    """A tail without weight."""
+    bounds = np.array([[-5.0, -5.0], [5.0, 5.0]])
+    top = likelihood._topped(lambda u: -(u[0] ** 2), np.array([1.0, 1.0]), np.ones(2), bounds)
+    assert top is not None
+    assert top.tells.tolist() == [True, False]
+    assert top.u == pytest.approx([0.0, 1.0], abs=1e-6)
+    model = candidates.with_values(sensor, {("jitter", "sigma"): 300e-12})
+    hidden = candidates.with_values(model, {DEAD: 52e-9})
+    data = stamps(hidden, 4e-3, 4e6, 1)
+    alone = found(model, data, "set dead_time.duration")
+    both = found(model, data, "set dead_time.duration", "set jitter.tail")
+    (dial,) = named(model, "set jitter.tail")[0].dials
+    assert both.intervals[dial.key] == pytest.approx((dial.low, dial.high))
+    assert both.intervals[DEAD] == pytest.approx(alone.intervals[DEAD], rel=1e-5)
+
+
+@pytest.mark.parametrize("first", [1e-4, 1.0, 30.0])
+@pytest.mark.parametrize(
+    ("fallen", "where"),
+    [
+        (lambda x: x**2, math.sqrt(2)),
+        (lambda x: (x - 1) ** 2 - 1, 1 + math.sqrt(3)),  # it rises first
+        (lambda x: 0.1 * x + 1e6 * (x > 0.7), 0.7),  # it jumps
+        (lambda x: 1e-3 * x, 50.0),  # it never comes to it
+        (lambda x: 0.0, 50.0),
+    ],
+)
+def test_where_a_fall_comes_to_so_much(fallen: Callable[[float], float], where: float, first: float) -> None:
+    asked = []
+
+    def of(x: float) -> float:
+        asked.append(x)
+        return fallen(x)
+
+    assert likelihood._reached(of, 2.0, first, 50.0, 0.01)[2] == pytest.approx(where, rel=0.02)
+    assert len(asked) < 25
+
+
 @pytest.mark.parametrize("history", [[1e-6], [1e-6, 1.07e-6], [1e-6, 1.07e-6, 1.6e-6]])
 def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
     """The next detection comes at some time, or not before the end."""
@@ -165,9 +241,16 @@ def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
 
     def density(end: float, *later: float) -> float:
         times = np.array([*history, *later])
-        offsets, hazard = np.array([0, len(times)]), np.zeros(len(times))
-        base, awake = likelihood._followed(times, offsets, end, dead, chance, lifetime, rate, 500e-12, 0.0, hazard)
-        return math.exp(float(base[0] + likelihood._of_rates(hazard, offsets, awake, rate)[0][0]))
+        # every gap is followed: those between, then the one to the end; none comes before the first
+        gaps, kinds = np.diff([*times, end]), np.array([*[likelihood._FOLLOWS] * (len(times) - 1), 0], np.uint8)
+        kinds = np.roll(kinds, 1)
+        kinds[-1] |= likelihood._LAST
+        offsets, counts = np.array([0, len(gaps)]), np.array([len(times)])
+        hazard, used = np.zeros(len(gaps)), np.zeros(1, np.int64)
+        about = counts, end, dead, chance, lifetime, rate, 500e-12, 0.0
+        base, awake = likelihood._followed(gaps, kinds, offsets, *about, hazard, used)
+        rest = hazard, offsets, used, counts, awake
+        return math.exp(float(base[0] + likelihood._of_rates(*rest, rate)[0][0]))
 
     last, end = history[-1], history[-1] + 3e-6
     grid = last + np.concatenate([np.linspace(49e-9, 51e-9, 801), np.geomspace(51.01e-9, 3e-6, 3001)])

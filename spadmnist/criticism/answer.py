@@ -62,6 +62,7 @@ class Step:
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+    slopes: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)  # (cells, dials), where faint
 
     def as_data(self) -> dict[str, Any]:
         kind = "per_pixel" if self.change.kind == "per_pixel" else self.change.kind
@@ -155,6 +156,8 @@ def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
         "rescaled",
         "rescaled_lag",
         "pixel_fano",
+        "slow_series",
+        "hot_series",
     }
     if "far_pairs" in names:
         who = "pixels far from each other share it"

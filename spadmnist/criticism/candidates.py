@@ -168,7 +168,12 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Chang
     wholes = {k: p for k, p in parameters.items() if _numeric(p) and p.per in ("", "pixel")}
     phases = tuple((name, k) for k, p in wholes.items() if p.unit == "rad")
     off = {k: p for k, p in wholes.items() if p.off is not None and (name, k) not in phases}
-    shapes = tuple(_dial(name, p, None) for k, p in wholes.items() if k not in off and (name, k) not in phases)
+    idle = {k for k, p in off.items() if p.default == p.off}
+    shapes = tuple(
+        _dial(name, p, None)
+        for k, p in wholes.items()
+        if k not in off and (name, k) not in phases and p.needs not in idle
+    )
     lines = [p for p in parameters.values() if p.per in ("row", "column", "code") and p.off is not None]
     if lines:
         one = lines[0]
@@ -257,6 +262,7 @@ def first_strengths(dial: Dial) -> list[float]:
         return [off + 0.1 * whole]
     if dial.low <= off <= dial.high and off > 0:
         # an edge that has moved is not found by a longer move
-        moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if dial.unit == "s" else (0.1,)
+        edge = dial.unit == "s" and getattr(Effect.registry.find(dial.effect), "stage", "") == "dead_time"
+        moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if edge else (0.1,)
         return [min(max(off * (1 + x), dial.low), dial.high) for x in moves]
     return [math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * whole]

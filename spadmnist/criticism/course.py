@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from . import fit, mapping, recordings
+from ..measurement import Measurement
+from . import fit, likelihood, mapping, recordings
 from .answer import Step, Value, title
-from .candidates import Key
+from .candidates import Change, Key, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
 from .ladder import errors_of, row
 from .search import Search, Tried
@@ -20,6 +21,8 @@ _AGAIN = 2  # times that the numbers are settled anew beside the model with the 
 _WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
 LEAST_GAIN = 12.0  # in chi square, of a step
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
+_HALF = 1.96  # standard deviations: half of an interval of 95 %
+_MOVED = 0.5  # standard deviations, beyond which a model is another one
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -89,7 +92,8 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
             0.0,
             significance,
             material(best),
-            dials=best.settled.dials if best.settled is not None and not best.faint else (),
+            dials=best.settled.dials if best.settled is not None else (),
+            slopes=best.settled.slopes if best.settled is not None and best.faint else {},
             template=bench.template(before, best.moved),
             before=dict(before.residuals),
             phased=bool(best.phases),
@@ -103,9 +107,6 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
     course.steps += new
     course.values = {**course.values, **best.values}
     settle_all(course, best.settled)
-    if best.faint and best.settled is not None:
-        for i, dial in enumerate(best.settled.dials):
-            new[0].values[dial.parameter] = Value(*best.settled.interval(i), dial.unit)
     for step in new:
         step.misfit = course.misfit
     course.rung("+ " + " + ".join(title(step.change) for step in new))
@@ -119,11 +120,12 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
     state = bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
     errors = errors_known(course, settled)
+    slopes = _slopes_known(course)
     if settled is not None and settled.dials != dials:
         settled = None
     for step in course.steps:
         if step.phased:
-            keys = _keys_of(step, course)
+            keys = _keys_of(step.change, course)
             own = {k: v for k, v in course.values.items() if k in keys}
             known = {pair: x for pair, x in search.phases.items() if pair[1] in step.change.phases}
             one = Tried(step.change, own, Moved({}, {}, {}), 0.0, 1.0, phases=known)
@@ -135,7 +137,7 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
     # from where it nearly is right: the scatter of the cells is that of the model with the effect
     for turn in range(_AGAIN + 1 if dials else 0):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors)
+        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes)
         if isinstance(closer, str):
             break
         settled = closer
@@ -158,7 +160,7 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
         for step in course.steps:
             for dial in step.dials:
                 i = place[dial.key]
-                half, u = 1.96 * math.sqrt(max(float(covariance[i, i]), 0.0)), float(point[i])
+                half, u = _HALF * math.sqrt(max(float(covariance[i, i]), 0.0)), float(point[i])
                 step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
     else:
@@ -181,10 +183,54 @@ def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, fl
         for dial in step.dials:
             v = step.values.get(dial.parameter)
             if dial.off is not None and v is not None and v.low is not None and v.high is not None:
-                out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * 1.96)
+                out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * _HALF)
     if settled is not None:
         spread = np.sqrt(np.maximum(np.diag(settled.covariance), 0.0))
         out |= {d.key: float(x) for d, x in zip(settled.dials, spread, strict=True) if d.off is not None}
+    return out
+
+
+def settle_exactly(course: Course, measurement: Measurement) -> None:
+    """All numbers by the likelihood of the data themselves, where all that the model has is in it."""
+    bench = course.bench
+    wanted = [step.change for step in course.steps if step.dials]
+    dials = [d for step in course.steps for d in step.dials]
+    if not wanted or len({d.key for d in dials}) < len(dials) or any(step.phased for step in course.steps):
+        return
+    captures = [seen.capture for seen in bench.seen.values()]
+    if any(likelihood.unknown(course.state.sensors.one, capture) for capture in captures):
+        return
+    bench.say("the likelihood of the data")
+    data = [measurement.recording(capture.id, bench.start) for capture in captures]
+    own = {key for change in wanted for key in _keys_of(change, course)}
+    sensor = with_values(bench.start, {key: x for key, x in course.values.items() if key not in own})
+    start = {d.key: float(course.values[d.key]) for d in dials}
+    errors = {}
+    for step in course.steps:
+        for dial in step.dials:
+            v = step.values[dial.parameter]
+            assert v.low is not None and v.high is not None
+            errors[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * _HALF)
+    found = likelihood.settled(sensor, data, wanted, start=start, errors=errors)
+    if isinstance(found, str):
+        return
+    moved = 0.0
+    for step in course.steps:
+        for dial in step.dials:
+            value, (low, high) = found.values[dial.key], found.intervals[dial.key]
+            moved = max(moved, abs(dial.coordinate(value) - dial.coordinate(start[dial.key])) / errors[dial.key])
+            step.values[dial.parameter] = Value(value, low, high, dial.unit, "likelihood")
+            course.values[dial.key] = value
+    if moved > _MOVED:
+        course.state = bench.state(course.values, _model(course)[0])
+
+
+def _slopes_known(course: Course) -> dict[Key, dict[Cell, np.ndarray]]:
+    """How the cells follow the numbers of faint effects, as stronger ones have told."""
+    out: dict[Key, dict[Cell, np.ndarray]] = {}
+    for step in course.steps:
+        for i, dial in enumerate(step.dials if step.slopes else ()):
+            out[dial.key] = {cell: x[:, i] for cell, x in step.slopes.items()}
     return out
 
 
@@ -204,7 +250,7 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
     told = {name: Value(number, None, None) for name, number in mapping.summary(map_).items()}
     sigma, noise = told["sigma"].value, float(np.median(map_.raw_error))
     # of a variance, which is what remains of the differences without the noise
-    half = 1.96 * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
+    half = _HALF * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
     ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
     told["sigma"] = Value(sigma, ends[0], ends[1])
     for name in ("low_fraction", "high_fraction"):
@@ -217,7 +263,7 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
 
 def material(one: Tried) -> str:
     """What a candidate changes of the mean rate, for people."""
-    logs = [x * one.times for x in one.moved.logs.values()]
+    logs = list(one.moved.at(one.times).logs.values())
     return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
 
 
@@ -258,7 +304,7 @@ def drop_needless(course: Course) -> None:
     for step in list(course.steps[:-1]):
         if step.change.carrier or len(course.steps) < 2 or step.phased:
             continue
-        rest = {k: v for k, v in course.values.items() if k not in _keys_of(step, course)}
+        rest = {k: v for k, v in course.values.items() if k not in _keys_of(step.change, course)}
         sensors = Sensors.same(bench.start).changed(rest, course.search.phases)
         if any(s.change.carrier for s in course.steps):
             continue  # a map would have to be settled anew
@@ -283,10 +329,10 @@ def drop_needless(course: Course) -> None:
             course.rung(f"- {title(step.change)}")
 
 
-def _keys_of(step: Step, course: Course) -> set[Key]:
-    if step.change.kind == "add":
-        return {k for k in course.values if k[0] == step.change.effect}
-    return {(step.change.effect, step.change.parameter or "")}
+def _keys_of(change: Change, course: Course) -> set[Key]:
+    if change.kind == "add":
+        return {k for k in course.values if k[0] == change.effect}
+    return {(change.effect, change.parameter or "")}
 
 
 def drop_mimics(course: Course, start: State) -> None:
@@ -305,7 +351,7 @@ def drop_mimics(course: Course, start: State) -> None:
             return
         course.steps = kept
         course.search.accepted = [c for c in course.search.accepted if any(c is s.change for s in kept)]
-        known = set().union(*(_keys_of(s, course) for s in kept))
+        known = set().union(*(_keys_of(s.change, course) for s in kept))
         course.values = {k: v for k, v in course.values.items() if k in known}
         if kept:
             settle_all(course)

@@ -19,14 +19,14 @@ from ..sensor import Sensor
 from . import compare as comparing
 from . import fit, outlook, recordings, setups
 from .answer import Diagnosis, Step, Value, plain, title
-from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless
+from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, settle_exactly
 from .findings import nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
-from .search import Tried, alike, is_pattern
+from .search import Tried, alike
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
-_TRACE = 5e-4  # p-value of a trace that is followed where no check fails by itself
+_TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 
 
@@ -98,7 +98,7 @@ def _diagnosed(
         worth = search.worth(second)
         bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
         refined = [search.refine(course.state, one) for one in worth]
-        best = refined[0] if is_pattern(refined[0]) else max(refined, key=lambda t: t.gain)
+        best = search.preferred(refined)
         significance, p = search.calibrated(course.state, tried, best)
         if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (LEAST_GAIN if failed else _TRACE_GAIN):
             break
@@ -121,6 +121,8 @@ def _diagnosed(
     if course.steps:
         drop_needless(course)
         drop_mimics(course, start)
+    if course.steps and not short:
+        settle_exactly(course, measurement)
     left = course.failed
     if left and explained and all(b.cell[0] == "" for b in left):
         left = []

@@ -30,11 +30,13 @@ from .nulls import Null, _standardized, learn
 
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
-_LEAST_SPREAD = 0.03  # other models' totals must not lie outside
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _CLOSE = 0.02  # and no nearer
+_TOLD_ASIDE = (0.1, 0.7)  # the same, of slopes that are known but for their size
+_TOLD_SIZE = 2.5  # times what they are thought to be, at most
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
+_LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 _BLIND = 0.05  # squared slope of a number that nothing tells
 FEW = 4  # recordings that tell the difference between two models
 
@@ -84,15 +86,46 @@ class State:
 
 @dataclass
 class Moved:
-    """What another model does: by how much each cell's expectation shifts, and the residuals that it leaves.
+    """What another model does: by how much each cell's expectation shifts, in proportion to its strength.
 
-    nothing: it does nothing at all in these captures, whatever its strength.
+    nothing: it does nothing at all in these captures, whatever its strength. even: what grows with the square of it,
+    and so is the same for both signs.
     """
 
     shifts: dict[Cell, np.ndarray]
     noise: dict[Cell, float]
     logs: dict[str, float]  # of the light that gives as many detections
     nothing: bool = False
+    even: Moved | None = None
+
+    def at(self, times: float) -> Moved:
+        """What it does at so many times its strength."""
+        if self.even is None and times == 1:
+            return self
+        out = Moved(
+            {cell: times * x for cell, x in self.shifts.items()},
+            {cell: times**2 * x for cell, x in self.noise.items()},
+            {id: times * x for id, x in self.logs.items()},
+            self.nothing,
+        )
+        if self.even is not None:
+            for cell, x in self.even.shifts.items():
+                out.shifts[cell] = out.shifts.get(cell, 0.0) + times**2 * x
+            for id, log in self.even.logs.items():
+                out.logs[id] = out.logs.get(id, 0.0) + times**2 * log
+        return out
+
+    @staticmethod
+    def both(up: Moved, down: Moved) -> Moved:
+        """Of what a strength does and what its opposite does: the odd part and the even one."""
+
+        def half(a: Mapping[Any, Any], b: Mapping[Any, Any], sign: float) -> dict[Any, Any]:
+            return {k: 0.5 * (a.get(k, 0.0) + sign * b.get(k, 0.0)) for k in a.keys() | b.keys()}
+
+        noise = half(up.noise, down.noise, 1.0)
+        even = Moved(half(up.shifts, down.shifts, 1.0), {}, half(up.logs, down.logs, 1.0))
+        nothing = up.nothing and down.nothing
+        return Moved(half(up.shifts, down.shifts, -1.0), noise, half(up.logs, down.logs, -1.0), nothing, even)
 
 
 @dataclass(frozen=True)
@@ -297,13 +330,7 @@ class Bench:
         else:
             stated = twin.photons_at(capture, sensor.layout)  # type: ignore[assignment]
         expected = recordings.closed_form(sensor, capture)
-        centre = recordings.level_for(expected, seen.total, stated)
-        uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
-        half = max(recordings.LEAST_SPREAD, recordings.SPREAD * uncertainty)
-        if stated is not None and (
-            seen.total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(seen.total, 1.0))
-        ):
-            centre = stated
+        centre, half = recordings.levels_about(expected, seen.total, stated, capture)
         return centre, stated, expected, half
 
     def state(self, values: Values, sensors: Sensors | None = None, replicates: int | None = None) -> State:
@@ -411,11 +438,18 @@ class Bench:
     # --- other models beside a state ------------------------------------------------------------------------------
 
     def moved(
-        self, state: State, models: Sequence[Sensors], few: int = FEW, only: Sequence[str] = (), hasty: bool = True
+        self,
+        state: State,
+        models: Sequence[Sensors],
+        few: int = FEW,
+        only: Sequence[str] = (),
+        hasty: bool = True,
+        bare: bool = False,
     ) -> list[Moved | str]:
         """What each of these models would change.
 
-        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much.
+        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much; bare: with
+        what is no more than chance.
         """
         numbers = np.arange(few, dtype=np.uint64)
         ids = [id for id in state.made if not only or id in only]
@@ -430,10 +464,10 @@ class Bench:
             part = results[i * len(ids) : (i + 1) * len(ids)]
             wrong = [p for p in part if isinstance(p, str)]
             joined = dict(zip(ids, part, strict=True))
-            out.append(wrong[0] if wrong else self._moved(state, models[i], joined))  # type: ignore[arg-type]
+            out.append(wrong[0] if wrong else self._moved(state, models[i], joined, bare))  # type: ignore[arg-type]
         return out
 
-    def _moved(self, state: State, sensors: Sensors, made: dict[str, Made]) -> Moved | str:
+    def _moved(self, state: State, sensors: Sensors, made: dict[str, Made], bare: bool) -> Moved | str:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
@@ -464,8 +498,9 @@ class Bench:
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
                 shift, left, beta = _difference(new, old, spread)
-                # where the recordings have nothing in common, the null's own chance is in the shift, too
-                shift = _beyond_noise(shift, spread, left + 3.0 * (1 - beta) / null.recordings, null.law)
+                if not bare:
+                    # where the recordings have nothing in common, the null's own chance is in the shift, too
+                    shift = _beyond_noise(shift, spread, left + 3.0 * (1 - beta) / null.recordings, null.law)
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -473,25 +508,25 @@ class Bench:
     def residuals(self, state: State, moved: Moved, times: float = 1.0, noisy: bool = False) -> dict[Cell, np.ndarray]:
         """The data's residuals if the shifts were `times` as large. noisy: their scatter adds to that of the cells."""
         out: dict[Cell, np.ndarray] = {}
+        moved = moved.at(times)
         for cell in state.residuals:
             if cell == RATES:
                 ids, _, root, _ = self.rate_space(state)
                 x = np.array([moved.logs.get(i, 0.0) for i in ids])
-                out[cell] = state.residuals[cell] + (times * (root @ x) if ids else 0.0)
+                out[cell] = state.residuals[cell] + (root @ x if ids else 0.0)
                 continue
             null, seen = state.nulls[cell], self.seen[cell[0]]
             values = seen.summaries[cell[1]].values
             if cell not in moved.shifts:
                 out[cell] = state.residuals[cell]
                 continue
-            out[cell] = _judged(
-                null, values, seen.total, times * moved.shifts[cell], times**2 * moved.noise[cell] * noisy
-            )
+            out[cell] = _judged(null, values, seen.total, moved.shifts[cell], moved.noise.get(cell, 0.0) * noisy)
         return out
 
     def template(self, state: State, moved: Moved) -> dict[Cell, np.ndarray]:
         """The residuals that a model at this state would see in data of the other."""
         out: dict[Cell, np.ndarray] = {}
+        moved = moved.at(1.0)
         for cell in state.residuals:
             if cell == RATES:
                 ids, _, root, _ = self.rate_space(state)
@@ -560,10 +595,12 @@ def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, law: str)
 
 
 def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noise: float) -> np.ndarray:
-    expected, leverage = null.expected(total)
-    expected = expected + shift
+    usual, leverage = null.expected(total)
+    expected = usual + shift
     if null.law in ("poisson", "exponential"):
         expected = np.maximum(expected, 0.5 / null.recordings)
+    if null.law == "exponential":  # detections by chance alone have their power, whatever else there is
+        expected = np.maximum(expected, _LEAST_POWER * usual)
     z = _standardized(null.law, values, expected, null.spread, leverage + noise, null.recordings, null.scaled)
     return np.asarray(z / null.factor)
 
@@ -785,27 +822,39 @@ def follow(
     sensors_of: Callable[[Mapping[Key, Any]], Sensors],
     few: int = FEW,
     errors: Mapping[Key, float] | None = None,
+    known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
 ) -> Settled | str:
     """One step of Gauss and Newton from a state that has these values: as many recordings tell it as the state has.
 
     Only how the cells follow the numbers is found from a few recordings more. errors: standard deviations of
-    coordinates, as far as they are known: about an edge a slope holds no further than it is known.
+    coordinates, as far as they are known: about an edge a slope holds no further than it is known. known: slopes of
+    which only the size is not known for certain: what chance leaves in the cells of a faint effect hides the rest.
     """
     dials = tuple(dials)
     keys = list(state.residuals)
     z, u = stacked(state.residuals, keys), point_of(dials, values)
     own = np.concatenate([state.own[k] for k in keys], axis=1)
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
-    known = np.array([(errors or {}).get(d.key, math.inf) for d in dials])
-    h = np.minimum(h, np.maximum(8 * known, _CLOSE))
+    near = np.array([(errors or {}).get(d.key, math.inf) for d in dials])
+    h = np.minimum(h, np.maximum(8 * near, _CLOSE))
+    known = known or {}
+    told = {i: _stacked_slope(state, known[d.key], keys) for i, d in enumerate(dials) if d.key in known}
+    for i, slope in told.items():  # so far that it is seen
+        h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_TOLD_ASIDE) * (h[i] / _ASIDE)
     points = _aside(dials, u, h)
     values_there = [{d.key: d.value(float(x)) for d, x in zip(dials, p, strict=True)} for p in points]
-    made = bench.moved(state, [sensors_of(v) for v in values_there], few)
-    wrong = [m for m in made if isinstance(m, str)]
-    if wrong:
-        return wrong[0]
-    ends = [m if isinstance(m, str) else stacked(bench.residuals(state, m), keys) for m in made]
+    ends: list[np.ndarray | str] = [np.zeros(0)] * len(points)
+    for bare in (False, True):
+        some = [k for k in range(len(points)) if (k // 2 in told) == bare]
+        made = bench.moved(state, [sensors_of(values_there[k]) for k in some], few, bare=bare)
+        for k, m in zip(some, made, strict=True):
+            if isinstance(m, str):
+                return m
+            ends[k] = stacked(bench.residuals(state, m), keys)
     slopes = _slopes(ends, points, z.size)
+    for i, slope in told.items():
+        size = float(slopes[:, i] @ slope) / max(float(slope @ slope), 1e-12)
+        slopes[:, i] = slope * np.clip(size, 1 / _TOLD_SIZE, _TOLD_SIZE)
     covariance = covariance_of(slopes, own)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
@@ -816,6 +865,16 @@ def follow(
     return Settled(
         dials, point, covariance, _split(left, state, keys), _split(slopes, state, keys), float(left @ left), new
     )
+
+
+def _stacked_slope(state: State, slope: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:
+    """A slope of another state's cells, 0 where this one has others."""
+    parts = []
+    for key in keys:
+        own = slope.get(key)
+        size = len(state.residuals[key])
+        parts.append(own if own is not None and len(own) == size else np.zeros(size))
+    return np.concatenate(parts)
 
 
 def profiled(

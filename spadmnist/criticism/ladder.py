@@ -84,8 +84,5 @@ def placebo_row(
     one = alike[len(alike) // 2]
     times = one.times if one.gain > 0 else 0.0
     residuals = bench.residuals(state, one.moved, times)
-    moved = Moved(
-        {c: times * x for c, x in one.moved.shifts.items()}, {}, {i: times * x for i, x in one.moved.logs.items()}
-    )
-    errors = errors_of(bench, state, residuals, moved)
+    errors = errors_of(bench, state, residuals, one.moved.at(times))
     return row(f"placebo: {title(one.change)}", fit.misfit(state, residuals), errors, True)

@@ -14,9 +14,11 @@ measurement states. Intervals are profiles: twice the log-likelihood falls by so
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,7 +39,13 @@ EDGE_FALL = 5.99  # of an edge that is sharper than intervals are dense: an expo
 _DENSE = 4.0  # intervals within the width of an edge, from which on it is a matter of the normal law
 _LEAST = 1e-9  # of the chance that an interval ends before the dead time does: a wrong stamp is not impossible
 _PROBES = 4096
-_LONG = 30.0  # lifetimes after which a trap is empty
+_LONG = 20.0  # lifetimes after which a trap is empty
+_FOLLOWS, _LAST = 1, 2  # kinds of gaps: after another that may be short; to the end of the exposure
+_NOTHING = 1e-5  # of the log-likelihood: it does not depend on that number
+_TINY = 1e-9  # of a coordinate
+_FAR = 100.0  # of the log-likelihood, by which a start is below the top: it is none
+_HIGHER = 0.05  # of the log-likelihood, by which what was seen elsewhere says that a top is none
+_ROUGH = 0.3, 0.5  # for `_climbed`: near enough for a parabola
 _SHARP = 0.1  # of a lifetime: stamps must be so exact
 
 
@@ -148,96 +156,121 @@ def _risen(x, tick, sigma):
 
 
 @kernels.jit
-def _followed(times, offsets, end, dead, chance, lifetime, rate, tick, sigma, hazard):
-    """(log of the chance of all that does not depend on the rate, s awake) of each pixel; hazard (events,): of traps.
+def _followed(gaps, kinds, offsets, counts, end, dead, chance, lifetime, rate, tick, sigma, hazard, used):
+    """(log of the chance of all that does not depend on the rate, s awake) of each pixel.
 
-    chance: (traps, pixels); lifetime: (traps,) s; rate: (pixels,) 1/s, about, to tell who may have caused what.
+    gaps, kinds, offsets: the gaps that may be short, as `_Stamps.near` gives them; counts: (pixels,) of events; chance:
+    (traps, pixels); lifetime: (traps,) s; rate: (pixels,) 1/s, about, to tell who may have caused what. Of the hazard
+    (gaps,) of traps at events the first `used` (pixels,) from the offset of a pixel on are set; elsewhere it is 0.
     """
-    pixels, traps = offsets.size - 1, lifetime.size
+    pixels, traps = counts.size, lifetime.size
     base, awake = np.zeros(pixels), np.zeros(pixels)
     full, old, own, emptied, blind = np.zeros((5, traps))
     for i in range(pixels):
+        # as if all gaps were long, and every trap empty at their ends; what is not so is set right below
+        awake[i] = end - counts[i] * dead[i]
+        used[i] = 0
         for k in range(traps):
+            full[k] = chance[k, i]  # chance that the trap of the last detection is full; old: sum of those before
             emptied[k], blind[k] = math.log1p(-chance[k, i]), math.exp(-dead[i] / lifetime[k])
-        full[:] = 0.0  # chance that the trap of the last detection is still full; old: the sum of those before
-        old[:] = 0.0
-        since = 0.0
-        stop = offsets[i + 1]
-        for j in range(offsets[i], stop + 1):
-            v = (times[j] if j < stop else end) - since
-            if j < stop and j > offsets[i] and dead[i] > 0.0 and v < tick + 8 * sigma:
+            base[i] += counts[i] * emptied[k]
+            old[k] = 0.0
+        none = 1.0  # a product, for logarithms take long
+        for m in range(offsets[i], offsets[i + 1]):
+            if not kinds[m] & _FOLLOWS:
+                for k in range(traps):
+                    base[i] -= old[k]
+                    old[k] = 0.0
+            v = gaps[m] - dead[i]
+            last = kinds[m] & _LAST
+            if not last and dead[i] > 0.0 and v < tick + 8 * sigma:
                 base[i] += math.log(max(_risen(v, tick, sigma), _LEAST))
-            v = max(v, 0.0)
-            awake[i] += v
+            if v < 0.0:
+                awake[i] -= v
+                v = 0.0
             here = 0.0
             for k in range(traps):
-                if v > _LONG * lifetime[k]:  # as most are
-                    base[i] += (emptied[k] if j > offsets[i] else 0.0) - old[k]
+                if v > _LONG * lifetime[k]:
+                    base[i] -= old[k]
                     own[k] = old[k] = 0.0
                     continue
                 left = math.exp(-v / lifetime[k])
-                none = 1.0 - full[k] * (1.0 - left)
-                base[i] += math.log(none) - old[k] * (1.0 - left)
-                own[k] = full[k] * left / none
+                still = 1.0 - full[k] * (1.0 - left)
+                none *= still
+                base[i] -= emptied[k] + old[k] * (1.0 - left)
+                own[k] = full[k] * left / still
                 old[k] *= left
                 here += (own[k] + old[k]) / lifetime[k]
-            if j == stop:
+            if none < 1e-200:
+                base[i] += math.log(none)
+                none = 1.0
+            if last:
+                old[:] = 0.0  # nobody asks when they leave
                 break
-            hazard[j] = here
+            if here > 0.0:
+                hazard[offsets[i] + used[i]] = here
+                used[i] += 1
             for k in range(traps):
                 # unless it was that one that fired; what leaves while the pixel is blind is lost
-                kept = own[k] * (1.0 - own[k] / lifetime[k] / (rate[i] + here))
+                kept = own[k] * (1.0 - own[k] / (lifetime[k] * (rate[i] + here)))
                 old[k] = (old[k] + kept) * blind[k]
-                full[k] = chance[k, i]
-            since = times[j] + dead[i]
+        base[i] += math.log(none)
+        for k in range(traps):
+            base[i] -= old[k]
     return base, awake
 
 
+@kernels.inline
+def _of_rate(hazard, start, used, count, awake, rate):
+    """(log-likelihood, its derivative by the rate, minus the second one) of a pixel with `count` events.
+
+    hazard: of those where there is one, `used` from `start` on.
+    """
+    unit = 1.0 / rate
+    value, product = count * math.log(rate) - rate * awake, 1.0
+    first = second = np.float64(count - used)
+    for j in range(start, start + used):
+        more = 1.0 + hazard[j] * unit
+        product *= more
+        if product > 1e200:
+            value += math.log(product)
+            product = 1.0
+        share = 1.0 / more
+        first += share
+        second += share * share
+    return value + math.log(product), first * unit - awake, second * unit * unit
+
+
 @kernels.jit
-def _of_rates(hazard, offsets, awake, rate):
+def _of_rates(hazard, offsets, used, counts, awake, rate):
     """(log-likelihood, its derivative by the rate, minus the second one) of each pixel, (pixels,)."""
-    pixels = offsets.size - 1
-    value, first, second = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
-    for i in range(pixels):
-        value[i], first[i] = -rate[i] * awake[i], -awake[i]
-        alone = 0
-        for j in range(offsets[i], offsets[i + 1]):
-            if hazard[j] == 0.0:
-                alone += 1
-                continue
-            inverse = 1.0 / (rate[i] + hazard[j])
-            value[i] -= math.log(inverse)
-            first[i] += inverse
-            second[i] += inverse * inverse
-        value[i] += alone * math.log(rate[i])
-        first[i] += alone / rate[i]
-        second[i] += alone / rate[i] ** 2
+    value, first, second = np.zeros((3, counts.size))
+    for i in range(counts.size):
+        value[i], first[i], second[i] = _of_rate(hazard, offsets[i], used[i], counts[i], awake[i], rate[i])
     return value, first, second
 
 
 @kernels.jit
-def _best_rates(hazard, offsets, awake):
-    """(pixels,) the rates that maximise `_of_rates`, which is concave: by Newton's steps."""
-    pixels = offsets.size - 1
-    out = np.zeros(pixels)
-    for i in range(pixels):
-        count = offsets[i + 1] - offsets[i]
-        if count == 0:
+def _at_best(hazard, offsets, used, counts, awake, rate):
+    """The log-likelihood of all pixels at the rates that maximise it, which is concave: by Newton's steps.
+
+    rate: (pixels,) from where they begin, 0 for anywhere; overwritten by the best ones.
+    """
+    total = 0.0
+    for i in range(counts.size):
+        if counts[i] == 0:
             continue
-        with_trap = np.nonzero(hazard[offsets[i] : offsets[i + 1]])[0] + offsets[i]
-        alone, rate = count - with_trap.size, count / awake[i]
+        if rate[i] <= 0.0 or used[i] == 0:
+            rate[i] = counts[i] / awake[i]
         for _ in range(60):
-            first, second = alone / rate - awake[i], alone / rate**2
-            for j in with_trap:
-                inverse = 1.0 / (rate + hazard[j])
-                first += inverse
-                second += inverse * inverse
+            value, first, second = _of_rate(hazard, offsets[i], used[i], counts[i], awake[i], rate[i])
             step = first / second
-            rate = rate + step if rate + step > 0.2 * rate else 0.2 * rate
-            if abs(step) < 1e-7 * rate:
+            gain = 0.5 * first * step  # by a last step
+            rate[i] = max(rate[i] + step, 0.2 * rate[i])
+            if gain < 1e-7:
                 break
-        out[i] = rate
-    return out
+        total += value + gain
+    return total
 
 
 class _Stamps:
@@ -246,14 +279,43 @@ class _Stamps:
     def __init__(self, recording: Recording):
         assert recording.events is not None
         self.capture = recording.capture
-        self.times, self.offsets = recording.events.times, recording.events.offsets.astype(np.int64)
+        times, offsets = recording.events.times, recording.events.offsets.astype(np.int64)
         self.tick = recording.tick or 0.0
-        self.counts = np.diff(self.offsets)
-        self.hazard = np.zeros(len(self.times))
+        self.counts = np.diff(offsets)
+        pixels = len(self.counts)
+        # of each pixel the gaps between its events and then the one to the end; before its first nothing has happened
+        lit = np.flatnonzero(self.counts)
+        self.gaps = np.diff(np.append(times, 0.0))
+        self.gaps[offsets[lit + 1] - 1] = self.capture.conditions.exposure - times[offsets[lit + 1] - 1]
+        self.last = np.zeros(len(times), bool)
+        self.last[offsets[lit + 1] - 1] = True
+        self.first = np.zeros(len(times), bool)
+        self.first[offsets[lit]] = True
+        self.offsets = offsets
+        self.reach, self.near = -1.0, (np.zeros(0), np.zeros(0, np.uint8), np.zeros(pixels + 1, np.int64))
+        self.hazard, self.used = np.zeros(0), np.zeros(pixels, np.int64)
+        self.best = np.zeros(pixels)
+        self.given: list[np.ndarray] = []
+        self.parts = np.zeros((2, pixels))
 
     def rates(self, sensor: Sensor, level: float) -> np.ndarray:
         """(pixels,) 1/s."""
         return sensor.rates(np.full((1, sensor.layout.pixels), level), self.capture.conditions)[0][0]
+
+    def _look(self, reach: float) -> None:
+        """See to it that `near` has the gaps of at most `reach` s, and not many more.
+
+        near: (s, kind, (pixels + 1,) where the gaps of a pixel begin) of each gap.
+        """
+        if reach <= self.reach < 3 * reach:
+            return
+        self.reach = 1.5 * reach
+        short = self.gaps <= self.reach
+        kinds = np.where(self.last, _LAST, 0).astype(np.uint8)
+        kinds[1:] |= np.where(short[:-1] & ~self.first[1:], _FOLLOWS, 0).astype(np.uint8)
+        kept = np.append(0, np.cumsum(short))
+        self.near = self.gaps[short], kinds[short], kept[self.offsets]
+        self.hazard = np.zeros(len(self.near[0]))
 
     def of(self, sensor: Sensor, blur: float, own: bool) -> tuple[float, Law]:
         """(log-likelihood without what depends on the rates, the rest as a law of the rates).
@@ -262,25 +324,30 @@ class _Stamps:
         """
         dead = np.ascontiguousarray(np.broadcast_to(sensor.dead_times, len(self.counts)), np.float64)
         end = self.capture.conditions.exposure
-        traps = [e for e in sensor.at("correlated") if isinstance(e, Traps)]
-        chance = np.array([-np.expm1(-e.hazards(len(dead))) for e in traps]).reshape(len(traps), len(dead))
-        lifetime = np.array([float(e.lifetime) for e in traps])
-        about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
-        given = self.offsets, end, dead, chance, lifetime, about, self.tick, blur
-        base, awake = _followed(self.times, *given, self.hazard)
+        chances = [(e, -np.expm1(-e.hazards(len(dead)))) for e in sensor.at("correlated") if isinstance(e, Traps)]
+        filled = [(float(e.lifetime), p) for e, p in chances if p.any()]
+        chance = np.array([p for _, p in filled]).reshape(len(filled), len(dead))
+        lifetime = np.array([x for x, _ in filled])
+        given = [dead, chance, lifetime, np.array([blur])]
+        if not (self.given and all(np.array_equal(a, b) for a, b in zip(given, self.given, strict=True))):
+            self._look(float(dead.max(initial=0.0)) + max(_LONG * lifetime.max(initial=0.0), self.tick + 8 * blur))
+            about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
+            what = self.counts, end, dead, chance, lifetime, about, self.tick, blur
+            self.parts = np.array(_followed(*self.near, *what, self.hazard, self.used))
+            self.given = given
+        base, awake = self.parts
+        rest = self.hazard, self.near[2], self.used, self.counts, awake
 
         def law(rate: np.ndarray) -> tuple[np.ndarray, ...]:
-            return _of_rates(self.hazard, self.offsets, awake, np.maximum(rate, 1e-12))
+            return _of_rates(*rest, np.maximum(rate, 1e-12))
 
         whole = float(base.sum())
-        return whole + float(law(_best_rates(self.hazard, self.offsets, awake))[0].sum()) if own else whole, law
+        return whole + (_at_best(*rest, self.best) if own else 0.0), law
 
     def near_edge(self, dead: np.ndarray, blur: float) -> int:
         """Intervals within the width of the edge at the end of the dead time."""
-        pixel = np.repeat(np.arange(len(self.counts)), self.counts)
-        same = pixel[1:] == pixel[:-1]
-        beyond = (np.diff(self.times) - dead[pixel[1:]])[same]
-        return int(np.count_nonzero(np.abs(beyond) <= self.tick + 2 * blur))
+        beyond = self.gaps - np.repeat(dead, self.counts)
+        return int(np.count_nonzero(np.abs(beyond[~self.last]) <= self.tick + 2 * blur))
 
 
 class _Bits:
@@ -349,6 +416,7 @@ class Likelihood:
         self.light = np.array(columns).reshape(-1, len(data)).T
         self.precision = np.array(precision)
         self.shifts = np.zeros(len(precision))
+        self.highest = -math.inf, np.zeros(len(dials))  # seen so far
 
     def sensor_at(self, u: np.ndarray) -> Sensor:
         """The sensor with the dials at some coordinates."""
@@ -382,8 +450,11 @@ class Likelihood:
         sensor = self.sensor_at(u)
         blur = (blur_of(sensor) or 0.0) if self.jittered else self.blur
         parts = [law.of(sensor, blur, self.own) for law in self.laws]
-        fixed = sum(value for value, _ in parts)
-        return fixed if self.own else fixed + self._lit(sensor, [law for _, law in parts])
+        value = sum(value for value, _ in parts)
+        value = value if self.own else value + self._lit(sensor, [law for _, law in parts])
+        if value > self.highest[0]:
+            self.highest = value, u.copy()
+        return value
 
     def _lit(self, sensor: Sensor, laws: Sequence[Law]) -> float:
         """What depends on the rates, the light being as the data and its uncertainty want it: by Newton's steps."""
@@ -414,9 +485,16 @@ class Likelihood:
 
 
 def _climbed(
-    function: Callable[[np.ndarray], float], start: np.ndarray, scales: np.ndarray, ends: np.ndarray
+    function: Callable[[np.ndarray], float],
+    start: np.ndarray,
+    scales: np.ndarray,
+    ends: np.ndarray,
+    exact: tuple[float, float] = (0.02, 0.003),
 ) -> tuple[float, np.ndarray]:
-    """(largest value, where) of a function, by a simplex that begins as large as `scales`; ends: (2, n) bounds."""
+    """(largest value, where) of a function, by a simplex that begins as large as `scales`; ends: (2, n) bounds.
+
+    exact: to which share of `scales`, and to which difference of values, it is found.
+    """
     if not len(start):
         return function(start), start
     units = 1 / scales
@@ -427,74 +505,228 @@ def _climbed(
         start * units,
         method="Nelder-Mead",
         bounds=(ends * units).T,
-        options={"initial_simplex": corners * units, "xatol": 0.02, "fatol": 0.003, "maxfev": 200 * len(start)},
+        options={"initial_simplex": corners * units, "xatol": exact[0], "fatol": exact[1], "maxfev": 80 * len(start)},
     )
     return -float(found.fun), np.asarray(found.x) / units
 
 
-def _spreads(function: Callable[[np.ndarray], float], u: np.ndarray, best: float, ends: np.ndarray) -> np.ndarray:
-    """How far each coordinate goes until the logarithm has fallen by 1/2, the others staying; at most its range."""
-    out = np.zeros(len(u))
-    for i in range(len(u)):
-        reached = []
+def _reached(
+    fallen: Callable[[float], float], wanted: float, first: float, room: float, near: float
+) -> tuple[float, float, float]:
+    """Where what is 0 at 0 and about quadratic comes to `wanted`: (where it was seen last, what it was there, guess).
+
+    By secants of its root; by halves where it jumps. first: where to look first; room: the farthest; near: by which
+    share of its root a point may be off.
+    """
+    low, at_low, high, at_high = 0.0, 0.0, math.inf, math.inf
+    x, sides, halves = min(first, room), 0, False
+    for _ in range(40):
+        fall = fallen(x)
+        root = math.sqrt(max(fall, 0.0) / wanted)
+        if root < 1 and x >= room:
+            return room, fall, room
+        sides = sides + 1 if (root < 1) == (sides > 0) and sides else 1
+        if root < 1:
+            low, at_low, sides = x, root, abs(sides)
+        else:
+            high, at_high, sides = x, root, -abs(sides)
+        if high == math.inf:
+            # a number of which nothing is seen may never be
+            guess = room if abs(fall) < _NOTHING else x * min(1 / max(root, 0.25), 4.0)
+        else:
+            guess = low + (high - low) * (1 - at_low) / (at_high - at_low)
+        if abs(root - 1) < near or high - low < 0.02 * high or high < _TINY:
+            return x, fall, min(guess, room)
+        halves = halves or (abs(sides) > 2 and high < math.inf)
+        if halves:
+            guess = 0.1 * high if low == 0 else math.sqrt(low * high)
+        x = min(guess, room)
+    return x, fall, x
+
+
+@dataclass
+class _Top:
+    """A largest value of a function, where it is, and the parabola there.
+
+    slopes: (n,) of the function; curved: (n, n) minus its second derivatives; tells: (n,) whether it changes at all.
+    """
+
+    value: float
+    u: np.ndarray
+    slopes: np.ndarray
+    curved: np.ndarray
+    tells: np.ndarray
+
+    @property
+    def spreads(self) -> np.ndarray:
+        """(n,) how far each coordinate goes until the function has fallen by 1/2, the others staying."""
+        return 1 / np.sqrt(np.diag(self.curved))
+
+
+def _parabola(
+    function: Callable[[np.ndarray], float], u: np.ndarray, value: float, scales: np.ndarray, ends: np.ndarray
+) -> _Top:
+    """By points at which the function has fallen by about 1/2; scales: (n,) where they are looked for first."""
+    n = len(u)
+    units = np.eye(n)
+    slopes, curved, tells = np.zeros(n), np.eye(n), np.ones(n, bool)
+    seen = []
+    for i in range(n):
+
+        def fallen(sign: float, x: float, i: int = i) -> float:
+            return value - function(u + sign * x * units[i])
+
+        points: list[tuple[float, float]] = []
+        first = float(scales[i])
         for sign in (-1, 1):
-            room = abs(ends[(sign + 1) // 2, i] - u[i])
-            low, high = 1e-12, max(room, 1e-9)
-            for _ in range(24):
-                middle = math.sqrt(low * high)
-                there = u.copy()
-                there[i] += sign * middle
-                low, high = (middle, high) if best - function(there) < 0.5 else (low, middle)
-            reached.append(high)
-        out[i] = math.sqrt(reached[0] * reached[1]) if min(reached) > 1e-8 else max(reached)
-    return out
+            room = abs(float(ends[(sign + 1) // 2, i] - u[i]))
+            if room > _TINY:
+                x, fall, _ = _reached(functools.partial(fallen, sign), 0.5, first, room, 0.5)
+                points.append((sign * x, fall))
+                first = x if fall > _NOTHING else first
+        tells[i] = any(abs(fall) > _NOTHING for _, fall in points)
+        if not tells[i]:
+            seen.append((0.0, 0.0))
+            continue
+        if len(points) == 1:
+            points.append((0.5 * points[0][0], fallen(0.5, points[0][0])))
+        (a, at_a), (b, at_b) = points
+        half = (at_a / a - at_b / b) / (a - b)
+        slopes[i] = half * a - at_a / a
+        curved[i, i] = 2 * half if half > 0 else 1 / max(abs(a), abs(b)) ** 2
+        seen.append(min(points, key=lambda p: abs(p[1] - 0.5)))
+    for i, j in itertools.combinations(np.flatnonzero(tells).tolist(), 2):
+        (x, at_x), (y, at_y) = seen[i], seen[j]
+        both = value - function(u + x * units[i] + y * units[j])
+        curved[i, j] = curved[j, i] = (both - at_x - at_y) / (x * y)
+    # it is a maximum that is looked for; the dials may be much alike
+    root = np.sqrt(np.diag(curved))
+    sizes, axes = np.linalg.eigh(curved / np.outer(root, root))
+    return _Top(value, u, slopes, (axes * np.maximum(sizes, 0.01)) @ axes.T * np.outer(root, root), tells)
+
+
+def _move(slopes: np.ndarray, curved: np.ndarray, free: np.ndarray, u: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """(n,) to the top of a parabola, of some coordinates; one that would leave its bounds stays at them."""
+    move, free = np.zeros(len(u)), free.copy()
+    while free.any():
+        held = slopes - curved[:, ~free] @ move[~free]
+        move[free] = np.linalg.solve(curved[np.ix_(free, free)], held[free])
+        inside = np.clip(u + move, *ends) - u
+        out = free & (np.abs(inside - move) > _TINY)
+        move = inside
+        if not out.any():
+            break
+        free &= ~out
+    return move
+
+
+def _topped(
+    function: Callable[[np.ndarray], float],
+    u: np.ndarray,
+    scales: np.ndarray,
+    ends: np.ndarray,
+    most: float = math.inf,
+) -> _Top | None:
+    """The maximum of a function: by parabolas, and where it is none by a simplex. None: it may be higher by `most`."""
+    value = function(u)
+    for _ in range(8):
+        top = _parabola(function, u, value, scales, ends)
+        some = top.tells
+        move = _move(top.slopes, top.curved, some, u, ends)
+        if 0.5 * top.slopes @ move > most:
+            return None
+        # far away it is no parabola
+        move *= min(1.0, 4.0 / max(float(np.max(np.abs(move) / np.maximum(scales, top.spreads))), 1e-9))
+        there = u + move
+        hoped = float(top.slopes @ move - 0.5 * move @ top.curved @ move)
+        gained = (function(there) if np.any(move) else value) - value
+        if gained > 0:
+            value, u = value + gained, there
+        if gained < 0.5 * hoped and hoped > 0.02:
+            higher, rest = _climbed(_some(function, u, some), u[some], top.spreads[some], ends[:, some])
+            gained = higher - value
+            if gained > 0:
+                value, u = higher, u.copy()
+                u[some] = rest
+        elif hoped < 0.05:
+            break
+        scales = np.where(some, np.maximum(top.spreads, _TINY), scales)
+        if gained < 0.01:
+            break
+    return replace(top, value=value, u=u)
+
+
+def _some(function: Callable[[np.ndarray], float], u: np.ndarray, some: np.ndarray) -> Callable[[np.ndarray], float]:
+    """A function of some coordinates, the others staying."""
+
+    def of(rest: np.ndarray) -> float:
+        there = u.copy()
+        there[some] = rest
+        return function(there)
+
+    return of
 
 
 def _profile(
-    function: Callable[[np.ndarray], float],
-    best: float,
-    u: np.ndarray,
-    i: int,
-    sign: int,
-    fall: float,
-    scales: np.ndarray,
-    ends: np.ndarray,
+    function: Callable[[np.ndarray], float], top: _Top, i: int, sign: int, fall: float, ends: np.ndarray
 ) -> float:
     """Coordinate at which twice the logarithm has fallen by so much, all others maximised anew; at most the bound."""
-    others = np.arange(len(u)) != i
-    state = {"u": u.copy()}
+    u, curved = top.u, top.curved
+    others = top.tells & (np.arange(len(u)) != i)
+    steps = 0.4 * np.minimum(top.spreads, ends[1] - ends[0])
+    # how the others follow, so far as is known
+    ridge = -np.linalg.solve(curved[np.ix_(others, others)], curved[others, i])
+    wide = 1 / math.sqrt(curved[i, i] + curved[i, others] @ ridge)
 
-    def root(x: float) -> float:
-        """Of the fall, less that of the wanted one."""
+    def fallen(x: float) -> float:
+        nonlocal ridge
+        there = u.copy()
+        there[i] += sign * x
+        there[others] = np.clip(u[others] + sign * x * ridge, *ends[:, others])
+        value = function(there)
+        for _ in range(3):
+            slopes = np.zeros(len(u))
+            for j in np.flatnonzero(others):
+                step = steps[j] if there[j] + steps[j] <= ends[1, j] else -steps[j]
+                beside = there.copy()
+                beside[j] += step
+                slopes[j] = (function(beside) - value) / step + 0.5 * curved[j, j] * step
+            move = _move(slopes, curved, others, there, ends)
+            next_ = there + move
+            hoped = float(slopes @ move - 0.5 * move @ curved @ move)
+            if hoped < 0.01:
+                break
+            gained = function(next_) - value
+            if gained > 0:
+                value, there = value + gained, next_
+            if gained < 0.5 * hoped and hoped > 0.04:
+                some = _some(function, there, others)
+                value, there[others] = _climbed(some, there[others], 0.3 * top.spreads[others], ends[:, others])
+                break
+            if hoped < 0.1:
+                break
+        ridge = sign * (there - u)[others] / x
+        return top.value - value
 
-        def free(rest: np.ndarray) -> float:
-            there = np.full(len(u), x)
-            there[others] = rest
-            return function(there)
-
-        value, rest = _climbed(free, state["u"][others], 0.3 * scales[others], ends[:, others])
-        state["u"][others] = rest
-        return math.sqrt(max(2 * (best - value), 0.0)) - math.sqrt(fall)
-
-    inside, bound = float(u[i]), float(ends[(sign + 1) // 2, i])
-    reach = 2 * float(scales[i])
-    while True:
-        outside = u[i] + sign * reach
-        if sign * (outside - bound) >= 0:
-            outside = bound
-        if root(outside) >= 0:
-            break
-        if outside == bound:
-            return bound
-        inside, reach = outside, 2 * reach
-    at_inside = {inside: -math.sqrt(fall)} if inside == u[i] else {}
-    return float(
-        optimize.brentq(lambda x: at_inside[x] if x in at_inside else root(x), inside, outside, xtol=0.02 * scales[i])
-    )
+    room = abs(float(ends[(sign + 1) // 2, i] - u[i]))
+    if room < _TINY:
+        return float(u[i] + sign * room)
+    return float(u[i] + sign * _reached(fallen, 0.5 * fall, wide * math.sqrt(fall), room, 0.08)[2])
 
 
-def settled(sensor: Sensor, data: Sequence[Recording], changes: Sequence[Change]) -> Exact | str:
-    """What some changes' numbers are, by the likelihood of these recordings; in a word what stands in the way of it."""
+def settled(
+    sensor: Sensor,
+    data: Sequence[Recording],
+    changes: Sequence[Change],
+    *,
+    start: Mapping[Key, float] | None = None,
+    errors: Mapping[Key, float] | None = None,
+) -> Exact | str:
+    """What some changes' numbers are, by the likelihood of these recordings; in a word what stands in the way of it.
+
+    start: values of their dials that are nearly right; without them places are tried. errors: of coordinates of dials,
+    about (1 sigma). A dial that nothing follows has the interval in which it is looked for.
+    """
     dials = tuple(d for change in changes for d in change.dials)
     fixed = {key: value for change in changes for key, value in change.fixed}
     if not dials or any(change.carrier or change.phases or not change.dials for change in changes):
@@ -513,27 +745,41 @@ def settled(sensor: Sensor, data: Sequence[Recording], changes: Sequence[Change]
                 return word
     function = Likelihood(sensor, data, dials, fixed)
     ends = np.array([d.ends for d in dials]).T
-    u = np.array([d.coordinate(float(values[d.key])) for d in dials])
-    function.begin(u)
-    for change in changes:
-        if change.kind == "add":
-            places = []
-            for template in templates(change):
-                there = {**{d.key: d.value(x) for d, x in zip(dials, u, strict=True)}, **template}
-                places.append(np.array([d.coordinate(float(there[d.key])) for d in dials]))
-            u = max(places, key=function)
-    scales = np.where([d.log for d in dials], 0.3, 0.1 * (ends[1] - ends[0]))
-    best, u = _climbed(function, u, scales, ends)
-    for _ in range(5):
-        scales = np.maximum(_spreads(function, u, best, ends), 1e-9)
-        higher, u = _climbed(function, u, scales, ends)
-        gained, best = higher - best, max(higher, best)
-        if gained < 0.01:
+    given = {d.key: float(values[d.key]) for d in dials}
+    widths = {d.key: 0.3 if d.log else 0.1 * (d.ends[1] - d.ends[0]) for d in dials}
+
+    def placed(there: Mapping[Key, float]) -> np.ndarray:
+        return np.clip([d.coordinate(there[d.key]) for d in dials], *ends)
+
+    top = None
+    if start is not None:
+        u, scales = placed({**given, **start}), {**widths, **(errors or {})}
+        function.begin(u)
+        top = _topped(function, u, np.array([scales[d.key] for d in dials]), ends, _FAR)
+    if top is None:
+        u, scale = placed(given), np.array([widths[d.key] for d in dials])
+        function.begin(u)
+        for change in changes:
+            if change.kind == "add":
+                there = {d.key: d.value(x) for d, x in zip(dials, u, strict=True)}
+                u = max((placed({**there, **template}) for template in templates(change)), key=function)
+        _, u = _climbed(function, u, scale, ends, _ROUGH)
+        top = _topped(function, u, scale, ends)
+        assert top is not None
+    for _ in range(3):
+        profiles = [
+            [_profile(function, top, i, sign, function.fall(i, top.u), ends) for sign in (-1, 1)]
+            if top.tells[i]
+            else list(map(float, ends[:, i]))
+            for i in range(len(dials))
+        ]
+        if function.highest[0] < top.value + _HIGHER:
             break
-    intervals = {}
-    for i, dial in enumerate(dials):
-        low, high = (_profile(function, best, u, i, sign, function.fall(i, u), scales, ends) for sign in (-1, 1))
-        intervals[dial.key] = dial.value(low), dial.value(high)
+        # that was not the top
+        top = _topped(function, function.highest[1], top.spreads, ends)
+        assert top is not None
+    best, u = top.value, top.u
+    intervals = {d.key: d.interval(*profile) for d, profile in zip(dials, profiles, strict=True)}
     found = {d.key: d.value(float(x)) for d, x in zip(dials, u, strict=True)}
     gains = []
     for change in changes:

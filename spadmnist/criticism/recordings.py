@@ -29,6 +29,7 @@ from .nulls import Null, learn
 REPLICATES = 96
 SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
 LEAST_SPREAD = 0.01
+_MOST_CHANCE = 0.7  # of a logarithm, by which a level may seem another by chance
 _EVENTS_AT_ONCE = 4_000_000
 _CLOSED = 5e-4  # relative error of the closed forms, at most
 
@@ -209,6 +210,22 @@ def reduced(statistic: Statistic, recording: Recording) -> Summary | None:
         raise plugins.blame(statistic, error) from error
 
 
+def levels_about(
+    expected: Callable[[float], float], total: float, stated: float | None, capture: Capture
+) -> tuple[float, float]:
+    """(level about which a capture is simulated, how far to both sides, of its logarithm).
+
+    expected: level -> detections; total: of the measurement, which shall lie inside: nothing is extrapolated.
+    """
+    centre = level_for(expected, total, stated)
+    half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
+    if stated is not None:
+        chance = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_CHANCE)
+        if total == 0 or abs(math.log(centre / stated)) < half + chance:
+            return stated, half + chance  # the same recordings then serve every measurement of this model
+    return centre, half
+
+
 def model_of(
     sensor: Sensor,
     capture: Capture,
@@ -229,11 +246,7 @@ def model_of(
         stated = twin.photons_at(capture, sensor.layout)
     usual = still(sensor)
     expected = closed_form(InTheDark.of(usual) if capture.light.dark else usual, capture)
-    centre = level_for(expected, total, stated)
-    uncertainty = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
-    half = max(LEAST_SPREAD, SPREAD * uncertainty)
-    if stated is not None and (total == 0 or abs(math.log(centre / stated)) < half + 4 / math.sqrt(max(total, 1.0))):
-        centre = stated  # the same recordings then serve every measurement of this model
+    centre, half = levels_about(expected, total, stated, capture)
     entry = memory.name_of(sensor, capture, centre, half, seed, replicates) if centre == stated else ""
     known = memory.recall(entry) if entry else None
     if known is not None:

@@ -39,7 +39,8 @@ _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
-_PROPORTIONAL = 0.85  # power with which a trace grows at least, that may be simulated at another strength
+_POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
+_LEAST_BOOST = 1.5  # worth it
 _SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
@@ -49,6 +50,7 @@ _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more i
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 _LEAST_P = 1e-300
+_SURER, _JOINED = 1.1, 1.6  # of a variance of squares: to be sure, and from where on values move together
 EACH = 9.0  # in chi square: what a further number must be worth
 
 
@@ -71,6 +73,7 @@ class Tried:
     settled: Settled | None = None
     maps: dict[Key, mapping.Map] | None = None
     residuals: dict[Cell, np.ndarray] | None = None
+    state: State | None = None  # of this model, where it was needed
     phases: Phases = field(default_factory=dict)
     chips: bool = False  # chance decides which pixels it hits
     faint: bool = False  # settled by what a stronger one does
@@ -121,10 +124,15 @@ class Search:
         """(gain in chi square, times the strength at which it is largest)."""
         now = self.square(state.residuals)
         best = 0.0, 1.0
-        for times in [*_TIMES, *([-t for t in _TIMES] if signed else [])]:
-            gain = now - self.square(self.bench.residuals(state, moved, times))
-            if gain > best[0]:
-                best = gain, times
+        tries = [*_TIMES, *([-t for t in _TIMES] if signed else [])]
+        for _ in range(2):
+            for times in tries:
+                gain = now - self.square(self.bench.residuals(state, moved, times))
+                if gain > best[0]:
+                    best = gain, times
+            if best[0] < _PROMISING:
+                break
+            tries = [best[1] * x for x in _NEAR if x != 1]
         return best
 
     def best_phases(
@@ -222,22 +230,17 @@ class Search:
         self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]], only: Sequence[str] = ()
     ) -> list[Tried]:
         out = []
-        still = [(change, tried) for change, tried in tries if not change.phases]
-        models, about = [], []
-        for change, tried in still:
-            try:
-                chips = change.kind == "add" and chancy(with_values(state.sensors.one, tried))
-                models.append(state.sensors.changed(tried, chips=chips))
-                about.append((change, tried, chips))
-            except SpadError:
+        still: list[Tried] = []
+        for change, tried in tries:
+            if change.phases:
                 continue
-        for (change, tried, chips), moved in zip(
-            about, self.bench.moved(state, models, _SCAN, only, True), strict=True
-        ):
-            if not isinstance(moved, str):
-                one = Tried(change, tried, moved, 0.0, 1.0, chips=chips)
-                one.gain, one.times = self.line_search(state, moved, one.signed)
-                out.append(one)
+            with contextlib.suppress(SpadError):
+                chips = change.kind == "add" and chancy(with_values(state.sensors.one, tried))
+                sensors = state.sensors.changed(tried, chips=chips)
+                still.append(Tried(change, tried, Moved({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
+        for one in self._simulated(state, still, _SCAN, only):
+            one.gain, one.times = self.line_search(state, one.moved, one.signed)
+            out.append(one)
         for change, tried in tries:
             if not change.phases:
                 continue
@@ -252,6 +255,24 @@ class Search:
                 f = float(tried[dial.key])
                 error = next((line.error for line in self.lines(state) if line.frequency == f), dial.high)
                 one.intervals[dial.key] = max(f - 1.96 * error, dial.low), min(f + 1.96 * error, dial.high)
+            out.append(one)
+        return out
+
+    def _simulated(self, state: State, tried: Sequence[Tried], few: int, only: Sequence[str] = ()) -> list[Tried]:
+        """Candidates with what they do, but for those that cannot be simulated.
+
+        What may be of either sign is simulated with both: some of it grows in proportion, some with the square.
+        """
+        down = {i: opposite for i, one in enumerate(tried) if (opposite := _opposite(state, one))}
+        models = [one.sensors for one in tried if one.sensors is not None]
+        made = self.bench.moved(state, [*models, *down.values()], few, only)
+        downs = dict(zip(down, made[len(tried) :], strict=True))
+        out = []
+        for i, (one, up) in enumerate(zip(tried, made, strict=False)):
+            other = downs.get(i)
+            if isinstance(up, str) or isinstance(other, str):
+                continue
+            one.moved = up if other is None else Moved.both(up, other)
             out.append(one)
         return out
 
@@ -366,46 +387,27 @@ class Search:
             if len(best) == _SECOND:
                 break
         out: list[Tried] = []
-        models: list[Sensors] = []
         for one in best:
             # a faint trace drowns in what is left of chance: a stronger one tells what it looks like
             size = self.size(state, one.moved)
             one.times = math.copysign(max(abs(one.times), min(_STRONG / max(size, 1e-9), 1.0)), one.times)
             given = one.scaled()
-            models.append(state.sensors.changed(given, one.phases))
             out.append(
-                Tried(
-                    one.change,
-                    given,
-                    one.moved,
-                    size,
-                    one.times,
-                    models[-1],
-                    phases=one.phases,
-                    intervals=one.intervals,
-                )
+                replace(one, values=given, gain=size, sensors=state.sensors.changed(given, one.phases, one.chips))
             )
-        for one in self.maps(state, values):
-            assert one.sensors is not None
-            models.append(one.sensors)
-            out.append(one)
         kept = []
-        for one, moved in zip(out, self.bench.moved(state, models, fit.FEW), strict=True):
-            if isinstance(moved, str):
-                continue
+        for one in self._simulated(state, [*out, *self.maps(state, values)], fit.FEW):
             if one.maps is None:
-                before, x = one.gain, abs(one.times)
-                size = self.size(state, moved)
-                if min(size, before) > 5 and not 0.7 < x < 1.4 and one.change.kind == "add":
-                    one.power = float(np.clip(math.log(size / before) / math.log(x), 1.0, 2.0))
-            one.moved = moved
-            if one.maps is None:
-                one.gain, one.times = self.line_search(state, moved, one.signed)
+                before, x, size = one.gain, abs(one.times), self.size(state, one.moved)
+                if min(size, before) > 5 and not 0.7 < x < 1.4 and one.change.kind == "add" and not one.moved.even:
+                    # in proportion or with the square: more cannot be said, for chance hides what is faint
+                    one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
+                one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 one.gain -= 2 * len(one.phases)
                 if one.chips and one.gain > _PROMISING:
                     one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
             else:
-                one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, moved))
+                one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, one.moved))
                 if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
                     one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, _LEAST_P) / 2)) ** 2)
             kept.append(one)
@@ -532,8 +534,7 @@ class Search:
         dials = [d for d in one.change.dials if d.key in given and not d.whole and d not in narrow]
         if one.change.phases:
             given = self.tuned(state, one, given)
-        size = self.size(state, one.moved) * abs(one.times)
-        boost = self._boost(state, one, given, size)
+        boost, power = self._boost(state, one, given)
         found = fit.settle(
             self.bench,
             state,
@@ -541,7 +542,7 @@ class Search:
             given,
             lambda v: state.sensors.changed(v, one.phases, one.chips),
             rounds,
-            stronger=(boost, one.power),
+            stronger=(boost, power),
             only=() if one.phases else self._showing(state, one.moved),
         )
         if isinstance(found, str):
@@ -553,8 +554,32 @@ class Search:
         one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
         one.gain = self.square(state.residuals) - found.square - 2 * len(one.phases)
         if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
-            one.gain = max(one.gain, self.beside(state, one.sensors))
+            one.gain = max(one.gain, self.square(state.residuals) - self.square(self.state_of(one).residuals))
         return one
+
+    def state_of(self, one: Tried) -> State:
+        """The model of a candidate beside the data, each cell judged by that model's own scatter."""
+        if one.state is None:
+            assert one.sensors is not None
+            one.state = self.bench.state({}, one.sensors)
+        return one.state
+
+    def preferred(self, refined: Sequence[Tried]) -> Tried:
+        """The best of some settled candidates.
+
+        Whether chance or a map says which pixels are odd is no matter of the squares, for a map has a number for each
+        pixel: what leaves fewer checks failing is better, and a map is where both leave as many, for what chance has
+        decided once and for all is a map.
+        """
+        best = refined[0] if is_pattern(refined[0]) else max(refined, key=lambda t: t.gain)
+        rivals = [t for t in refined if t.chips or (t.maps and t.change.per == "pixel")]
+        if best not in rivals or len({t.chips for t in rivals}) < 2:
+            return best
+        left = {}
+        for one in rivals:
+            state = self.state_of(one)
+            left[id(one)] = len(fit.failing(fit.blocks(self.bench, state, state.residuals)))
+        return min(rivals, key=lambda t: (left[id(t)], t.chips, -t.gain))
 
     def _showing(self, state: State, moved: Moved) -> list[str]:
         """The captures that show what a model does: all but those that have hardly any of its trace."""
@@ -565,15 +590,30 @@ class Search:
         least = _SHOWS * max(sum(share.values()), 1e-12)
         return [id for id, x in share.items() if x >= least]
 
-    def _boost(self, state: State, one: Tried, given: Mapping[Key, Any], size: float) -> float:
-        """How much stronger a faint effect is simulated; 1 where its trace does not grow in proportion: an edge."""
-        boost = max(1.0, (_STRONG / max(size, 1e-3)) ** (1 / one.power))
-        if boost == 1 or not any(_is_edge(d) for d in one.change.strengths):
-            return boost
-        up = {d.key: d.scaled(float(given[d.key]), boost) for d in one.change.strengths if d.key in given}
-        (far,) = self.bench.moved(state, [state.sensors.changed({**given, **up}, one.phases, one.chips)], fit.FEW)
-        grown = 0.0 if isinstance(far, str) else self.size(state, far)
-        return boost if grown > boost**_PROPORTIONAL * size else 1.0
+    def _boost(self, state: State, one: Tried, given: Mapping[Key, Any]) -> tuple[float, float]:
+        """(how much stronger a faint effect is simulated, the power with which its trace grows).
+
+        1 where that is no power: an edge moves, and much of it saturates.
+        """
+        size = self.size(state, one.moved.at(one.times))
+        strengths = [d for d in one.change.strengths if d.key in given]
+        if size > _STRONG or one.moved.even or not strengths:
+            return 1.0, 1.0
+        room = min(_room(d, float(given[d.key])) for d in strengths)
+        boost = min((_STRONG / max(size, 1e-3)) ** (1 / one.power), room)
+        if boost < _LEAST_BOOST:
+            return 1.0, 1.0
+        ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
+        models = [state.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
+        traces = []
+        for moved in self.bench.moved(state, models, 2 * fit.FEW):
+            if isinstance(moved, str):
+                return 1.0, 1.0
+            traces.append(stacked(self.bench.template(state, moved), list(state.residuals)))
+        far, near = traces
+        along = float(near @ far)  # of the same trace, lest it is chance that is compared
+        power = 2 * math.log(float(far @ far) / along) / math.log(boost) if along > 0 else 0.0
+        return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
 
     def _probed(self, state: State, one: Tried, found: Settled) -> Settled:
         """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge."""
@@ -698,7 +738,10 @@ def _gumbel_tail(largest: np.ndarray, mark: float) -> float:
 def _spread_chance(data: np.ndarray, usual: np.ndarray) -> float:
     """p-value of values that differ; usual: (recordings, values) those of the model itself."""
     square, squares = float(np.mean(data**2)), np.mean(usual**2, axis=1)
-    mean, variance = float(squares.mean()), float(squares.var(ddof=1)) * (1 + math.sqrt(5 / len(squares)))
+    mean, variance = float(squares.mean()), float(squares.var(ddof=1))
+    apart = 2 * mean**2 / data.size  # of values that have nothing to do with each other
+    # a few recordings tell a variance badly: where they do not contradict, it is that of such values
+    variance = _SURER * apart if variance < _JOINED * apart else variance * (1 + math.sqrt(5 / len(squares)))
     shape = mean**2 / max(variance, 1e-12)
     p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
     wide = max(1.0, float(np.sqrt(mean)))
@@ -718,6 +761,27 @@ def _stronger(one: Tried) -> dict[Key, Any] | None:
 def _same(one: Tried, change: Change, tried: Mapping[Key, Any]) -> bool:
     """Is it this change, at these shapes?"""
     return one.change.name == change.name and all(one.values.get(d.key) == tried.get(d.key) for d in change.shapes)
+
+
+def _opposite(state: State, one: Tried) -> Sensors | None:
+    """The model with a strength of the other sign; None where there is none."""
+    if one.maps is not None or one.change.kind != "add":
+        return None
+    turned = {
+        d.key: d.scaled(float(one.values[d.key]), -1.0)
+        for d in one.change.strengths
+        if d.low < 0 and d.key in one.values
+    }
+    if all(one.values[key] == x for key, x in turned.items()):
+        return None
+    return state.sensors.changed({**one.values, **turned}, one.phases, one.chips)
+
+
+def _room(dial: Dial, value: float) -> float:
+    """How much stronger a strength can be."""
+    off = dial.off or 0.0
+    bound = dial.high if value > off else dial.low
+    return (bound - off) / (value - off) if value != off else 1.0
 
 
 def _shape(one: Tried) -> tuple[Any, ...]:

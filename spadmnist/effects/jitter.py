@@ -31,7 +31,7 @@ class Jitter(Effect, stage="timing"):
         symbol="sigma_j",
         bounds=(0, None),
         off=0.0,
-        search=(5e-12, 1e-9),
+        search=(5e-12, 5e-9),
     )
     tail_weight = parameter(
         0.0,
@@ -49,6 +49,7 @@ class Jitter(Effect, stage="timing"):
         symbol="tau_j",
         bounds=(0, None),
         search=(50e-12, 5e-9),
+        needs="tail_weight",
     )
 
     def apply(self, events: Events, rng: Draws) -> Events:

@@ -92,7 +92,8 @@ def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pair
     drawn = n * (n - 1.0) / (places * max(1.0, places - 1.0))
     left = (places - n) * (places - n - 1.0) / (max(1.0, places - 2.0) * max(1.0, places - 3.0))
     variance = within * drawn * left
-    shape = (1.0 - 2.0 * p) ** 2 + 2.0 * (slots - 2.0) * p * (1.0 - p)
+    thirds = np.maximum(n - 2.0, 0.0) * np.maximum(places - n - 2.0, 0.0) / places**2  # p (1 - p), of what is left
+    shape = (1.0 - 2.0 * p) ** 2 + 2.0 * (slots - 2.0) * thirds
     return Pairs(all_pairs * (slots - 1.0) / max(1.0, places - 1.0), variance, variance * np.maximum(shape, 1e-3))
 
 
@@ -122,11 +123,25 @@ def number_at(score: float, scores: Callable[[float, float], float], mean: float
 
 
 def pooled_score(number: float, law: Pairs, share: float) -> float:
-    """Score of a pooled number of pairs: Poisson where few are expected and they do not come in clumps."""
+    """Score of a pooled number of pairs: Poisson where few are expected and they do not come in clumps.
+
+    Where they do, it is the gamma law's of whole numbers, and all of it that lies below 0 belongs to 0.
+    """
+    from scipy import special
+
     mean, variance, third = (float(part) for part in law)
     if mean < _SPARSE and third <= 1.2 * variance:
         return float(poisson_score(max(0.0, round(number)), mean, share))
-    return float(gamma_score(number + share - 0.5, law))
+    score = float(gamma_score(number + share - 0.5, law))
+    if mean >= _SPARSE:
+        return score
+    places = np.array([number - 0.5 if number > 0 else -np.inf, number + 0.5])
+    shape = 4.0 * variance**3 / third**2
+    steps = np.maximum(shape + (places - mean) * 2.0 * variance / third, 0.0)  # from where the law begins, in its scale
+    weights = np.array([1.0 - share, share])
+    lower, upper = (float(weights @ tail(shape, steps)) for tail in (special.gammainc, special.gammaincc))
+    exact = float(_from_tails(np.asarray(lower), np.asarray(upper)))
+    return exact if abs(exact) < 6.7 else math.copysign(max(abs(score), 6.7), exact)
 
 
 def pair_scores(

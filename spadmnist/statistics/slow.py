@@ -14,38 +14,48 @@ from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import per_cent, span
 from ._frames import add_pixels, bits, frame_sums
-from ._scores import minority, number_at, pair_scores, pairs_law, poisson_score, shares
+from ._scores import minority, number_at, pair_scores, pairs_law, poisson_score, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 from .maps import place_of
 
 _ALL = ("tr", "str", "qis", "counts")
 _BLOCKS = 32
+_LENGTHS = (128, 32, 8)  # blocks of the capture
+_HOTTEST = (0.02, 0.05, 0.1, 0.2)  # of the pixels
+_FEWEST = 10  # pixels
 
 
 @jit
-def block_counts(stamps, offsets, factor, blocks):
+def block_counts(stamps, offsets, factor, levels):
     """Pairs of events within a block and events within all blocks of each row, and events of all rows by block.
 
-    factor: blocks per unit of the stamps. Stamps behind the last block are left out. Returns (pairs (rows,),
-    inside (rows,), sums (blocks,)), int64.
+    Blocks of several lengths: each is four of the one before. factor: blocks of the shortest length per unit of the
+    stamps; of the longest there are 8. Stamps behind the last block are left out. Returns (pairs (levels, rows),
+    inside (rows,), sums (shortest blocks,)), int64.
     """
     rows = offsets.size - 1
-    pairs = np.zeros(rows, np.int64)
+    blocks = np.int64(2) << np.int64(2 * levels)
+    pairs = np.zeros((levels, rows), np.int64)
     inside = np.zeros(rows, np.int64)
     sums = np.zeros(blocks, np.int64)
-    own = np.zeros(blocks, np.int64)
+    own = np.empty(blocks, np.int64)
     for row in range(rows):
+        own[:] = 0
         for i in range(offsets[row], offsets[row + 1]):
             block = np.int64(stamps[i] * factor)
             if block < blocks:
-                pairs[row] += own[block]
-                inside[row] += 1
-                sums[block] += 1
                 own[block] += 1
-        for i in range(offsets[row], offsets[row + 1]):
-            block = np.int64(stamps[i] * factor)
-            if block < blocks:
-                own[block] = 0
+                inside[row] += 1
+        sums += own
+        size = blocks
+        for level in range(levels):
+            total = np.int64(0)
+            for k in range(size):
+                total += own[k] * (own[k] - 1)
+            pairs[level, row] = total // 2
+            size //= 4
+            for k in range(size):
+                own[k] = own[4 * k] + own[4 * k + 1] + own[4 * k + 2] + own[4 * k + 3]
     return pairs, inside, sums
 
 
@@ -56,15 +66,16 @@ def blocks_of(recording: Recording) -> int:
     return next((blocks for blocks in (_BLOCKS, _BLOCKS // 2) if recording.n_frames >= 4 * blocks), 0)
 
 
-def _of_events(recording: Recording, blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`block_counts` of a recording of times."""
-    known = recording._kept.get("block counts")
-    if known is None:
+def _of_events(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`block_counts` of a recording of times, in `_LENGTHS` blocks."""
+
+    def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert recording.events is not None
         found, unit = stamps(recording)
-        factor = unit * blocks / recording.conditions.exposure
-        known = recording._kept["block counts"] = block_counts(found, recording.events.offsets, factor, blocks)
-    return known  # type: ignore[return-value]
+        factor = unit * _LENGTHS[0] / recording.conditions.exposure
+        return block_counts(found, recording.events.offsets, factor, len(_LENGTHS))
+
+    return recording.kept("block counts", make)
 
 
 def _counts_by_block(recording: Recording, blocks: int) -> Iterator[np.ndarray]:
@@ -111,7 +122,7 @@ class Trend(Statistic):
         length = _block_time(recording, blocks)
         slots = np.inf
         if recording.events is not None:
-            sums = _of_events(recording, blocks)[2]
+            sums = _of_events(recording)[2].reshape(blocks, -1).sum(axis=1)
         else:
             size = recording.n_frames // blocks
             sums = frame_sums(recording)[: blocks * size].reshape(blocks, size).sum(axis=1)
@@ -163,7 +174,8 @@ class SlowSeries(Statistic):
         layout, length = recording.layout, _block_time(recording, blocks)
         slots = np.inf
         if recording.events is not None:
-            pairs, inside, _ = _of_events(recording, blocks)
+            by_length, inside, _ = _of_events(recording)
+            pairs = by_length[_LENGTHS.index(blocks)]
         else:
             slots = slots_of_frame(recording) * (recording.n_frames // blocks)
             pairs, inside = np.zeros(recording.pixels, np.int64), np.zeros(recording.pixels, np.int64)
@@ -201,7 +213,84 @@ class SlowSeries(Statistic):
         )
 
 
-def steady(detections: float, boxes: int, slots: float, excess: float) -> float:
-    """Variance over that of a steady rate, from pairs in excess of those that a steady rate has."""
-    squares = detections * (1.0 - detections / (boxes * slots)) * (1.0 - 1.0 / boxes)
+class HotSeries(Statistic):
+    """Of the pixels with the most detections, whether their rates are steady: the scatter of their counts in blocks.
+
+    The 2, 5, 10 and 20 % of the pixels with the most detections (two at least), together; 8, 32 and 128 blocks of the
+    capture, of 4 frames or more. `slow_series` has a cell for each pixel: if few of many pixels scatter a little too
+    much, all the others hide it.
+    Law: normal, as the score of the pairs of detections within a block, given every pixel's number of them, so that
+    the choice of the pixels changes nothing; Poisson where there are few pairs.
+    Shows: hot pixels that blink (telegraph noise of dark counts), where a map of steady dark counts has their mean.
+    Source: random telegraph signals in SPADs, Karami et al., IEEE Trans. Electron Devices 61 (2014); index of
+    dispersion, Fisher, Biometrics 6 (1950).
+    """
+
+    modalities = _ALL
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or not blocks_of(recording) or recording.pixels < _FEWEST:
+            return None
+        slots = np.inf
+        if recording.events is not None:
+            blocks: tuple[int, ...] = _LENGTHS
+            pairs, inside, _ = _of_events(recording)
+        else:
+            blocks = tuple(n for n in _LENGTHS if recording.n_frames >= 4 * n)
+            slots = slots_of_frame(recording) * (recording.n_frames // blocks[0])
+            pairs, inside = _of_frames(recording, blocks)
+        times = _block_time(recording, blocks[0]) * blocks[0] / np.array(blocks)
+        order = np.argsort(-inside, kind="stable")
+        groups = {max(2, round(part * recording.pixels)): part for part in _HOTTEST}
+        cells = [(size, level) for size in groups for level in range(len(blocks))]
+        share = shares(np.append(pairs, inside), len(cells))
+        scores, laws = [], []
+        for k, (size, level) in enumerate(cells):
+            hot, n = order[:size], blocks[level]
+            number, few = minority(pairs[level, hot], inside[hot], n, slots * blocks[0] / n)
+            laws.append(pairs_law(few, n, slots * blocks[0] / n).pooled(np.ones(size)))
+            scores.append(pooled_score(float(number.sum()), laws[-1], share[k]))
+
+        def fano(cell: int, score: float) -> float:
+            """Variance of the blocks' counts over what it is at steady rates."""
+            (size, level), law = cells[cell], laws[cell]
+            number = number_at(score, lambda count, part: pooled_score(count, law, part), float(law.mean))
+            n = blocks[level]
+            return steady(inside[order[:size]], n, slots * blocks[0] / n, number - float(law.mean))
+
+        def size_of(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            was, wanted = max(0.0, fano(cell, measured)), max(0.0, fano(cell, expected))
+            text = f"variance {was:.3g} times that of a steady rate, {wanted:.3g} expected"
+            size, level = cells[cell]
+            # as a fluctuation of the pixels' rates
+            change = (was - wanted) * blocks[level] * size / max(1.0, float(inside[order[:size]].sum()))
+            return text, float(np.copysign(np.sqrt(abs(change)), change))
+
+        def where(cell: int) -> str:
+            size, level = cells[cell]
+            part = per_cent(groups[size])
+            return f"the {part} of pixels with the most detections, in blocks of {show(times[level], 's')}"
+
+        return Summary(np.array(scores), "normal", where, size_of)
+
+
+def _of_frames(recording: Recording, blocks: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """As `block_counts`, of frames: (pairs (levels, pixels), inside (pixels,)), int64. blocks: of `_LENGTHS`."""
+    pairs = np.zeros((len(blocks), recording.pixels), np.int64)
+    inside = np.zeros(recording.pixels, np.int64)
+    held = np.zeros_like(pairs)  # the block of each length that is being filled
+    for number, counts in enumerate(_counts_by_block(recording, blocks[0]), 1):
+        inside += counts
+        held += counts
+        for level, n in enumerate(blocks):
+            if number % (blocks[0] // n) == 0:
+                pairs[level] += held[level] * (held[level] - 1) // 2
+                held[level] = 0
+    return pairs, inside
+
+
+def steady(detections: np.ndarray | float, boxes: int, slots: float, excess: float) -> float:
+    """Variance over that of a steady rate, from pairs in excess of those that steady rates have; of all pixels."""
+    squares = float(np.sum(detections * (1.0 - detections / (boxes * slots)))) * (1.0 - 1.0 / boxes)
     return 1.0 + 2.0 * excess / squares if squares > 0 else 1.0

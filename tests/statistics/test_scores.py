@@ -99,6 +99,27 @@ def test_scores_of_pairs_are_normal_far_out(detections: int, boxes: int, slots: 
         assert stats.poisson.sf((np.abs(wrong) > 4).sum() - 1, 3 * usual) < laws.FALSE_ALARM
 
 
+@pytest.mark.parametrize("slots", [math.inf, 65])
+@pytest.mark.parametrize("detections", [3, 5, 9, 20])
+def test_scores_of_few_pairs_of_few_pixels_are_normal(detections: int, slots: float) -> None:
+    """Pairs of two pixels in 8 boxes: the law of their scores, by drawing, over all random shares."""
+    draws = (20_000, 2)
+    if np.isfinite(slots):
+        counts = RNG.multivariate_hypergeometric([int(slots)] * 8, detections, size=draws)
+    else:
+        counts = RNG.multinomial(detections, np.full(8, 1 / 8), size=draws)
+    pairs, times = np.unique((counts * (counts - 1) // 2).sum(axis=(1, 2)), return_counts=True)
+    law = scores.pairs_law(np.array(detections), 8, slots).pooled(np.array(2))
+    shares = (np.arange(50) + 0.5) / 50
+    found = np.array([[scores.pooled_score(float(n), law, u) for u in shares] for n in pairs])
+    weight = np.repeat(times[:, None] / times.sum() / 50, 50, axis=1)
+    mean = (weight * found).sum()
+    assert abs(mean) < 0.06
+    assert abs((weight * (found - mean) ** 2).sum() - 1) < 0.15
+    assert weight[np.abs(found) > 4].sum() < 20 * 2 * stats.norm.sf(4)
+    assert (np.diff(found.ravel()) >= 0).all()
+
+
 @pytest.mark.parametrize("mean", [0.01, 0.7, 5.0, 28.0, 33.0, 1e4])
 def test_scores_of_counts_are_normal(mean: float) -> None:
     count = RNG.poisson(mean, 50_000)

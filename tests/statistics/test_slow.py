@@ -13,26 +13,29 @@ from simple_sensor import FRAME, counted, grid, many, one_of_each, qis, qis_of, 
 
 from spadmnist.recording import Recording
 from spadmnist.statistics import _scores as scores
-from spadmnist.statistics.slow import SlowSeries, Trend
+from spadmnist.statistics.slow import HotSeries, SlowSeries, Trend
 
 KINDS = ("tr", "tr without ticks", "qis", "str", "counts", "counter")
 
 
-def literal_counts(recording: Recording) -> tuple[np.ndarray, float]:
-    """((blocks, pixels) detections, slots of a pixel in a block)."""
+def literal_counts(recording: Recording, blocks: int | None = None, merged: int = 1) -> tuple[np.ndarray, float]:
+    """((blocks, pixels) detections, slots of a pixel in a block).
+
+    blocks: of equal length, by default 32, or 16 where there are few frames; then so many of them are merged to one.
+    """
     if recording.events is not None:
-        edges = np.linspace(0, recording.conditions.exposure, 33)
+        edges = np.linspace(0, recording.conditions.exposure, (blocks or 32) + 1)
         edges[-1] *= 1 + 1e-12
         rows = [np.histogram(recording.events.row(p), edges)[0] for p in range(recording.pixels)]
-        return np.array(rows).T, math.inf
+        return np.array(rows).T.reshape(-1, merged, recording.pixels).sum(axis=1), math.inf
     frames = np.asarray(recording.frames[:])  # type: ignore[index]
     if recording.modality == "qis":
         frames = np.unpackbits(frames, axis=2, count=recording.layout.columns)
     elif recording.modality == "str":
         frames = frames < round(FRAME / recording.tick)  # type: ignore[operator]
-    blocks = 32 if len(frames) >= 128 else 16
-    size = len(frames) // blocks
-    cut = [frames[b * size : (b + 1) * size].reshape(size, -1).sum(axis=0, dtype=int) for b in range(blocks)]
+    blocks = blocks or (32 if len(frames) >= 128 else 16)
+    size = len(frames) // blocks * merged
+    cut = [frames[b * size : (b + 1) * size].reshape(size, -1).sum(axis=0, dtype=int) for b in range(blocks // merged)]
     slots = {"counts": 15 * size, "qis": size, "str": size}[recording.modality]
     return np.array(cut), math.inf if recording.conditions.counting == "counter" else slots
 
@@ -159,8 +162,119 @@ def test_blinking_pixels_are_seen_and_no_others(kind: str) -> None:
     assert np.abs(found).max() < 5
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_hot_pixels_of_a_small_recording(kind: str) -> None:
+    recording = one_of_each()[kind]
+    summary = reduced(HotSeries, recording)
+    lengths = (128, 32, 8) if recording.events is not None else (32, 8)  # 403 frames or 130: no 128 blocks of 4
+    groups = {2: "2 %", 3: "5 %", 7: "10 %", 13: "20 %"}  # of 66 pixels; two at least
+    k = 0
+    for hot, part in groups.items():
+        for blocks in lengths:
+            counts, slots = literal_counts(recording, lengths[0], lengths[0] // blocks)
+            assert len(counts) == blocks
+            total = counts.sum(axis=0)
+            counts = counts[:, [p for _, p in sorted((-n, p) for p, n in enumerate(total))][:hot]]
+            pairs = sum(math.comb(int(n), 2) for n in counts.ravel())
+            law = scores.pairs_law(counts.sum(axis=0), blocks, slots).pooled(np.ones(hot))
+            # whatever the random share of the whole number is
+            low, high = (scores.pooled_score(pairs, law, share) for share in (0.0, 1.0))
+            assert low - 1e-9 < summary.values[k] < high + 1e-9, (hot, blocks)
+            assert summary.where(k).startswith(f"the {part} of pixels with the most detections, in blocks of ")
+            text, _ = summary.size(k, float(summary.values[k]), 0.0)
+            places = blocks * slots
+            taken = counts.sum(axis=0)
+            fano = (counts.var(axis=0, ddof=1) * blocks).sum() / (taken * (1 - taken / places)).sum()
+            assert math.isclose(float(text.split()[1]), fano, rel_tol=0.02, abs_tol=0.02)
+            k += 1
+    assert k == len(summary.values)
+    if recording.events is not None:
+        assert summary.where(1).endswith("of 93.75 us")  # 3 ms in 32 blocks
+
+
+HOT = np.random.default_rng(3).permutation(256)[:13]  # of 16 x 16 pixels: 5 %
+
+
+def uneven(cold: float, hot: float) -> np.ndarray:
+    """(256,) of unequal pixels, some of which are hot."""
+    out = cold * np.random.default_rng(2).uniform(0.6, 1.4, 256)
+    out[HOT] = hot
+    return out
+
+
+UNEVEN = {
+    "tr": partial(tr, layout=grid(16, 16), rates=uneven(1e5, 4e5), exposure=1e-3),
+    "tr, few": partial(tr, layout=grid(16, 16), rates=uneven(2e3, 8e3), exposure=1e-3),
+    "qis": partial(qis, shape=(520, 16, 16), share=uneven(0.2, 0.5).reshape(16, 16)),
+    "qis, hardly a gap": partial(qis, shape=(520, 16, 16), share=uneven(0.2, 0.998).reshape(16, 16)),
+    "qis, few of few pixels": partial(qis, shape=(520, 4, 4), share=0.012),
+    "counts": partial(counted, shape=(130, 16, 16), share=uneven(0.1, 0.4).reshape(16, 16)),
+}
+
+
+@pytest.mark.parametrize("kind", UNEVEN)
+def test_scores_of_steady_hot_pixels_are_normal(kind: str) -> None:
+    """Every cell has a mean of 0, a spread of 1 and the normal law; each with a false-alarm rate of 1e-6."""
+    recordings = 150
+    found = many(HotSeries, UNEVEN[kind], recordings)
+    assert found.shape[1] == {"counts": 8, "qis, few of few pixels": 6}.get(kind, 12)
+    for cell, z in enumerate(found.T):
+        laws.mean_is(z, 0.0, what=f"cell {cell}")
+        laws.distribution_is(z, stats.norm.cdf, what=f"cell {cell}")
+        assert abs(z.std(ddof=1) - 1) < laws.z_bound() / math.sqrt(2 * recordings), cell
+    assert np.abs(found).max() < laws.z_bound(laws.FALSE_ALARM / found.size)
+
+
+def blinking(of: str) -> Recording:
+    """Hot pixels whose rate is 35 % higher or lower, at random in each of 20 stretches; 200 detections each."""
+    on = np.random.default_rng(4).random((20, len(HOT))) < 0.5
+    if of == "tr":
+        exposure = 1e-3
+        whole = tr(3, grid(16, 16), uneven(1e5, 2e5), exposure)
+        rows = [whole.events.row(p) for p in range(256)]  # type: ignore[union-attr]
+        for k, p in enumerate(HOT):
+            kept = np.where(on[:, k], 1.0, 0.65 / 1.35)
+            one = tr(
+                9 + k, grid(1, 1), 2.7e5, exposure, change=lambda t, kept=kept: kept[(t / exposure * 20).astype(int)]
+            )
+            rows[p] = one.events.row(0)  # type: ignore[union-attr]
+        return tr_of(rows, grid(16, 16), exposure)
+    share = np.tile(uneven(0.1, 0.2), (1000, 1))
+    share[:, HOT] = np.repeat(np.where(on, 0.27, 0.13), 50, axis=0)
+    return qis(3, (1000, 16, 16), share.reshape(1000, 16, 16))
+
+
+@pytest.mark.parametrize("kind", ["tr", "qis"])
+def test_hot_pixels_that_blink_are_seen_where_all_pixels_hide_them(kind: str) -> None:
+    steady = {
+        "tr": partial(tr, layout=grid(16, 16), rates=uneven(1e5, 2e5), exposure=1e-3),
+        "qis": partial(qis, shape=(1000, 16, 16), share=uneven(0.1, 0.2).reshape(16, 16)),
+    }[kind]
+    recording = blinking(kind)
+    found = sigmas(HotSeries, recording, steady)
+    assert len(found) == 12 and found[4] > 5.5  # the 5 % that are hot, in 32 blocks
+    null = (many(SlowSeries, steady, 60) ** 2).sum(axis=1)
+    square = float((reduced(SlowSeries, recording).values ** 2).sum())
+    assert (square - null.mean()) / null.std() < 4
+    assert np.abs(sigmas(HotSeries, steady(3), steady)).max() < 5
+
+
+def test_times_and_frames_of_the_same_detections_agree() -> None:
+    """Frames so short that hardly one has two detections of a pixel."""
+    whole = blinking("tr")
+    bits = np.zeros((25600, 256), bool)
+    for p in range(256):
+        bits[(whole.events.row(p) / 1e-3 * 25600).astype(int), p] = True  # type: ignore[union-attr]
+    times, frames = reduced(HotSeries, whole), reduced(HotSeries, qis_of(bits.reshape(-1, 16, 16)))
+    assert times.values.max() > 5
+    assert np.abs(times.values - frames.values).max() < 0.5
+    # 1 ms, and 25,600 frames of 10 us
+    assert times.where(4) == "the 5 % of pixels with the most detections, in blocks of 31.25 us"
+    assert frames.where(4) == "the 5 % of pixels with the most detections, in blocks of 8 ms"
+
+
 @pytest.mark.parametrize("kind", ["qis", "str", "counts", "counter"])
-@pytest.mark.parametrize("statistic", [Trend, SlowSeries])
+@pytest.mark.parametrize("statistic", [Trend, SlowSeries, HotSeries])
 def test_pieces_make_no_difference(statistic: type, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = reduced(statistic, one_of_each()[kind]).values
     monkeypatch.setattr("spadmnist.recording._CHUNK", 100)
@@ -175,3 +289,14 @@ def test_the_cells_do_not_depend_on_the_data(statistic: type) -> None:
     for value in (False, True):
         reduced(statistic, qis_of(np.full((100, 4, 4), value)))
     assert statistic().reduce(qis(1, (40, 4, 4), 0.5)) is None
+
+
+def test_the_cells_of_hot_pixels_depend_on_the_capture_alone() -> None:
+    for layout, cells in ((grid(2, 5), 3), (grid(5, 8), 9), (grid(16, 16), 12)):  # 2; 2, 4 and 8; 5, 13, 26 and 51
+        for rate in (0.0, 1e3, 1e6):
+            assert len(reduced(HotSeries, tr(1, layout, rate, 1e-3, 50e-9)).values) == cells
+    for frames, lengths in ((512, 3), (511, 2), (128, 2), (127, 1), (64, 1)):
+        for value in (False, True):
+            assert len(reduced(HotSeries, qis_of(np.full((frames, 4, 4), value))).values) == 2 * lengths  # 2 and 3
+    assert HotSeries().reduce(qis(1, (63, 4, 4), 0.5)) is None
+    assert HotSeries().reduce(tr(1, grid(3, 3), 1e5, 1e-3)) is None
