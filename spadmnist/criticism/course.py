@@ -23,6 +23,7 @@ LEAST_GAIN = 12.0  # in chi square, of a step
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
+_EXCLUDED = 6.0  # in chi square: what costs more is no value of a number
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -188,6 +189,24 @@ def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, fl
         spread = np.sqrt(np.maximum(np.diag(settled.covariance), 0.0))
         out |= {d.key: float(x) for d, x in zip(settled.dials, spread, strict=True) if d.off is not None}
     return out
+
+
+def open_ends(course: Course) -> None:
+    """Where the data do not exclude an end of a shape's range, its interval goes that far: slopes do not see it."""
+    tests = []
+    for step in course.steps:
+        for dial in step.dials:
+            v = step.values[dial.parameter]
+            if dial in step.change.shapes and v.low is not None and v.high is not None and not v.method:
+                tests += [(step, dial, end) for end in (dial.low, dial.high) if not v.low <= end <= v.high]
+    state, bench = course.state, course.bench
+    models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
+    now = course.search.square(state.residuals)
+    for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW), strict=True):
+        if not isinstance(moved, str) and course.search.square(bench.residuals(state, moved)) < now + _EXCLUDED:
+            v = step.values[dial.parameter]
+            assert v.low is not None and v.high is not None
+            step.values[dial.parameter] = replace(v, low=min(v.low, end), high=max(v.high, end))
 
 
 def settle_exactly(course: Course, measurement: Measurement) -> None:

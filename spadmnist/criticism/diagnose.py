@@ -19,7 +19,7 @@ from ..sensor import Sensor
 from . import compare as comparing
 from . import fit, outlook, recordings, setups
 from .answer import Diagnosis, Step, Value, plain, title
-from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, settle_exactly
+from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
 from .findings import nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
@@ -123,6 +123,7 @@ def _diagnosed(
         drop_mimics(course, start)
     if course.steps and not short:
         settle_exactly(course, measurement)
+    open_ends(course)
     left = course.failed
     if left and explained and all(b.cell[0] == "" for b in left):
         left = []

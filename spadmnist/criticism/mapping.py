@@ -214,9 +214,10 @@ def settle_maps(
             if noise >= _TELLING**2:
                 # by how much their counts scatter beyond chance: where each says little, so would its own best value
                 told = np.maximum(np.bincount(groups[i], normal[:, i, i], sizes[i]), 1e-9)
-                ratio = np.bincount(groups[i], score[:, i], sizes[i]) / told + apart
-                beyond = (ratio**2 - 1 / told)[~odd] * told[~odd] ** 2
-                relative = float(beyond.sum() / (told[~odd] ** 2).sum())  # of ratios; of logarithms it is less
+                counted = told + np.bincount(groups[i], score[:, i], sizes[i])
+                usual = told * np.exp(-apart)  # what the middle would have, lest what is seen weighs itself
+                beyond = ((counted - usual) ** 2 - usual)[~odd]
+                relative = float(beyond.sum() / (usual[~odd] ** 2).sum())  # of ratios; of logarithms it is less
                 sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), _LEAST_WIDTH**2))
             precision[i] = np.where(
                 odd,

@@ -27,6 +27,7 @@ Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
+_NEARLY = 0.8  # of the largest gain
 _REFINED = 3  # of these, that are settled
 _TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 _NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
@@ -34,7 +35,7 @@ _TURNS = 8  # phases that are tried first
 _NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _SHOWS = 0.01  # of the square of a trace, in a capture that tells it
-_MAP = "pixel_map"
+_MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
@@ -366,7 +367,14 @@ class Search:
         count = np.sqrt(np.bincount(groups))
         data = np.bincount(groups, z) / count
         usual = np.stack([np.bincount(groups, row) / count for row in own])
-        return _spread_chance(data, usual)
+        chance = _spread_chance(data, usual)
+        if change.per != "pixel":
+            return chance
+        # few detections in most pixels: then the law of their numbers tells more than the scores of each
+        best = max(tells, key=lambda id: tells[id])
+        laws = [(best, name) for name in _LAWS if (best, name) in state.residuals]
+        others = [state.nulls[cell].chance(state.residuals[cell])[0] for cell in laws]
+        return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
 
     def telling(self, state: State) -> list[str]:
         """Up to three captures that show best what is wrong: a dark one, and those of the largest misfit."""
@@ -383,7 +391,9 @@ class Search:
         best: list[Tried] = []
         for one in tried:
             if one.gain > 9 and all(b.change is not one.change for b in best):
-                best.append(one)
+                # of what does nearly as well, what was simulated nearest to where it does so
+                alike = [t for t in tried if t.change is one.change and t.gain > _NEARLY * one.gain]
+                best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
             if len(best) == _SECOND:
                 break
         out: list[Tried] = []
