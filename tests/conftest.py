@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import tinylab
 
 from spadmnist import plugins
 
@@ -20,3 +22,8 @@ def no_plugins_of_other_tests() -> Iterator[None]:
         registry.classes.update(classes)
     plugins._loaded.clear()
     plugins._loaded.update(loaded)
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> tinylab.Lab:
+    return tinylab.labs(tmp_path)

@@ -18,6 +18,7 @@ from .ladder import errors_of, row
 from .search import Search, Tried
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
+_SAME = 0.35  # of a coordinate: so far slopes hold
 _WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
 LEAST_GAIN = 12.0  # in chi square, of a step
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
@@ -136,14 +137,16 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
             sensors, maps = _model(course)
             state = bench.state(course.values, sensors)
     # from where it nearly is right: the scatter of the cells is that of the model with the effect
+    near: Settled | None = None
     for turn in range(_AGAIN + 1 if dials else 0):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes)
+        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
         if isinstance(closer, str):
             break
         settled = closer
         if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
             break
+        near = closer if np.all(np.abs(closer.point - fit.point_of(dials, here)) < _SAME) else None
         before = course.values, sensors, maps, state
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)

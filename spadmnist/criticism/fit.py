@@ -823,21 +823,55 @@ def follow(
     few: int = FEW,
     errors: Mapping[Key, float] | None = None,
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
+    before: Settled | None = None,
 ) -> Settled | str:
     """One step of Gauss and Newton from a state that has these values: as many recordings tell it as the state has.
 
     Only how the cells follow the numbers is found from a few recordings more. errors: standard deviations of
     coordinates, as far as they are known: about an edge a slope holds no further than it is known. known: slopes of
     which only the size is not known for certain: what chance leaves in the cells of a faint effect hides the rest.
+    before: what was settled from a state near by, whose slopes still hold.
     """
     dials = tuple(dials)
     keys = list(state.residuals)
     z, u = stacked(state.residuals, keys), point_of(dials, values)
     own = np.concatenate([state.own[k] for k in keys], axis=1)
+    slopes: np.ndarray | str
+    if before is not None and before.dials == dials:
+        slopes = np.stack([_stacked_slope(state, _of_dial(before, i), keys) for i in range(len(dials))], axis=1)
+    else:
+        slopes = _slopes_about(bench, state, dials, u, values, sensors_of, few, errors or {}, known or {})
+    if isinstance(slopes, str):
+        return slopes
+    covariance = covariance_of(slopes, own)
+    error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
+    step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
+    step = np.clip(step, -5 * error, 5 * error)
+    point = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u + step, strict=True)])
+    left = z + slopes @ (point - u)
+    new = {**values, **{d.key: d.value(float(x)) for d, x in zip(dials, point, strict=True)}}
+    return Settled(
+        dials, point, covariance, _split(left, state, keys), _split(slopes, state, keys), float(left @ left), new
+    )
+
+
+def _slopes_about(
+    bench: Bench,
+    state: State,
+    dials: Sequence[Dial],
+    u: np.ndarray,
+    values: Mapping[Key, Any],
+    sensors_of: Callable[[Mapping[Key, Any]], Sensors],
+    few: int,
+    errors: Mapping[Key, float],
+    known: Mapping[Key, Mapping[Cell, np.ndarray]],
+) -> np.ndarray | str:
+    """(cells, dials) how the residuals of a state follow its numbers; arguments as of `follow`."""
+    keys = list(state.residuals)
+    cells = sum(len(state.residuals[key]) for key in keys)
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
-    near = np.array([(errors or {}).get(d.key, math.inf) for d in dials])
+    near = np.array([errors.get(d.key, math.inf) for d in dials])
     h = np.minimum(h, np.maximum(8 * near, _CLOSE))
-    known = known or {}
     told = {i: _stacked_slope(state, known[d.key], keys) for i, d in enumerate(dials) if d.key in known}
     for i, slope in told.items():  # so far that it is seen
         h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_TOLD_ASIDE) * (h[i] / _ASIDE)
@@ -851,20 +885,15 @@ def follow(
             if isinstance(m, str):
                 return m
             ends[k] = stacked(bench.residuals(state, m), keys)
-    slopes = _slopes(ends, points, z.size)
+    slopes = _slopes(ends, points, cells)
     for i, slope in told.items():
         size = float(slopes[:, i] @ slope) / max(float(slope @ slope), 1e-12)
         slopes[:, i] = slope * np.clip(size, 1 / _TOLD_SIZE, _TOLD_SIZE)
-    covariance = covariance_of(slopes, own)
-    error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
-    step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
-    step = np.clip(step, -5 * error, 5 * error)
-    point = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u + step, strict=True)])
-    left = z + slopes @ (point - u)
-    new = {**values, **{d.key: d.value(float(x)) for d, x in zip(dials, point, strict=True)}}
-    return Settled(
-        dials, point, covariance, _split(left, state, keys), _split(slopes, state, keys), float(left @ left), new
-    )
+    return slopes
+
+
+def _of_dial(settled: Settled, i: int) -> dict[Cell, np.ndarray]:
+    return {cell: slopes[:, i] for cell, slopes in settled.slopes.items()}
 
 
 def _stacked_slope(state: State, slope: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:

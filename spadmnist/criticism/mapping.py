@@ -216,8 +216,9 @@ def settle_maps(
                 told = np.maximum(np.bincount(groups[i], normal[:, i, i], sizes[i]), 1e-9)
                 counted = told + np.bincount(groups[i], score[:, i], sizes[i])
                 usual = told * np.exp(-apart)  # what the middle would have, lest what is seen weighs itself
-                beyond = ((counted - usual) ** 2 - usual)[~odd]
-                relative = float(beyond.sum() / (usual[~odd] ** 2).sum())  # of ratios; of logarithms it is less
+                counted, usual = counted[~odd], usual[~odd]
+                usual = usual * max(float(counted.sum()), 1e-9) / float(usual.sum())  # about their mean, not the middle
+                relative = float(((counted - usual) ** 2 - usual).sum() / (usual**2).sum())  # of logarithms it is less
                 sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), _LEAST_WIDTH**2))
             precision[i] = np.where(
                 odd,

@@ -21,8 +21,10 @@ from .search import Search, Tried
 from .setups import Explanation
 
 _RECORDINGS = 16  # of a capture that nobody has taken yet
-_MOST_EVENTS = 2e6  # of it
+_MOST_EVENTS = 6e5  # of it
 _LONG = 100.0  # s of a long dark capture
+_LONGER = 10.0  # times a capture that is taken again, at most
+_MOST_FRAMES = 4.0  # the same of frames, which cost whether they hold anything or not
 _ONE_SIDED = 1.645  # 95 %
 
 
@@ -75,13 +77,13 @@ def _menu(bench: Bench, state: State) -> Iterator[tuple[str, Capture, str]]:
 
 def _longer(capture: Capture, rate: float, words: str, like: str) -> Iterator[tuple[str, Capture, str]]:
     c = capture.conditions
-    most = min(_LONG if capture.light.dark else 10 * c.exposure, _MOST_EVENTS / rate)
+    most = min(_LONG if capture.light.dark else _LONGER * c.exposure, _MOST_EVENTS / rate)
     if most < 1.5 * c.exposure:
         return
     if capture.modality == "tr":
         yield f"{words}, {units.show(most, 's', 3)}", replace(capture, conditions=replace(c, exposure=most)), like
         return
-    frames = int(most / c.frame_period)
+    frames = int(min(most, _MOST_FRAMES * c.exposure) / c.frame_period)
     longer = replace(c, frames=frames, exposure=frames * c.frame_period)
     yield f"{words}, {frames} frames", replace(capture, conditions=longer), like
 

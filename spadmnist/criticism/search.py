@@ -49,6 +49,7 @@ _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: 
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
+_LIKE = 0.4  # of a cosine between traces: others do not look alike
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 _LEAST_P = 1e-300
 _SURER, _JOINED = 1.1, 1.6  # of a variance of squares: to be sure, and from where on values move together
@@ -509,6 +510,9 @@ class Search:
                 continue
             best: Tried | None = None
             about, sigmas = 0.0, np.array(_SIGMAS)
+            (wide,) = self.bench.moved(state, [_scattered(state.sensors, change, _SIGMAS[-2])])
+            if isinstance(wide, str) or self._likeness(state, wide, like.moved) < _LIKE:
+                continue
             for _ in range(3):  # ever closer to the width that suits
                 models = [_scattered(state.sensors, change, float(sigma)) for sigma in sigmas]
                 for sigma, sensors, moved in zip(sigmas, models, self.bench.moved(state, models), strict=True):
@@ -525,6 +529,12 @@ class Search:
             if best is not None and best.gain > like.gain - alike(like.gain):
                 out.append(best)
         return out
+
+    def _likeness(self, state: State, one: Moved, other: Moved) -> float:
+        """Cosine between two traces."""
+        keys = list(state.residuals)
+        a, b = (stacked(self.bench.template(state, moved), keys) for moved in (one, other))
+        return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
 
     # --- settling ------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,212 @@
+"""Search: what candidates are compared by, and how faint ones and those of either sign are settled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
+
+from spadmnist.criticism import course as course_of
+from spadmnist.criticism import fit, recordings, search
+from spadmnist.criticism.answer import Value
+from spadmnist.criticism.fit import Bench, Moved
+from spadmnist.criticism.search import Search, Tried
+from spadmnist.recording import Capture, Light
+
+CELL, OTHER = ("flat", "a"), ("flat", "b")
+
+
+# --- signs -------------------------------------------------------------------------------------------------------
+
+
+def test_what_both_signs_do_is_told_apart() -> None:
+    up = Moved({CELL: np.array([5.0, 1.0]), OTHER: np.array([2.0])}, {CELL: 0.1}, {"flat": 0.3})
+    down = Moved({CELL: np.array([-3.0, 1.0])}, {CELL: 0.3}, {"flat": -0.1})
+    both = Moved.both(up, down)
+    for times, one in ((1.0, up), (-1.0, down)):
+        there = both.at(times)
+        assert there.logs["flat"] == pytest.approx(one.logs["flat"])
+        for cell in (CELL, OTHER):
+            assert there.shifts[cell] == pytest.approx(one.shifts.get(cell, np.zeros(1)))
+    # half as strong: half of the odd part, a quarter of the even one
+    assert both.at(0.5).shifts[CELL] == pytest.approx([0.5 * 4 + 0.25 * 1, 0.25 * 1])
+
+
+def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
+    """Its trend has a sign, the variance of the counts has none."""
+    bench = bench_of(lab("    source_drift: {slope: -0.3}\n", light=900, side=8))
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add source_drift")
+    (one,) = look.looked_at(state, change, look.begun(state, change))
+    assert one.moved.even is not None and one.gain > 100
+    # so many detections in a ramp tell the slope to root(12 / n)
+    assert one.values["source_drift", "slope"] * one.times == pytest.approx(-0.3, abs=0.1)
+
+
+# --- faint effects -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "power"),
+    [
+        ("afterpulsing", {PROBABILITY: 0.004, LIFETIME: 40e-9}, 1.0),
+        ("crosstalk", {CROSSTALK: 0.002}, 1.0),
+        ("source_noise", {("source_noise", "contrast"): 0.03, ("source_noise", "coherence_time"): 1e-4}, 2.0),
+    ],
+)
+def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, Any], power: float) -> None:
+    """Probabilities in proportion, fluctuations with the square: whatever chance hides of a faint trace."""
+    bench = bench_of(lab(light=900, side=4))
+    state, look = bench.state({}), quiet(bench)
+    (moved,) = bench.moved(state, [state.sensors.changed(values)], 2)
+    assert isinstance(moved, Moved)
+    boost, found = look._boost(state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values)
+    assert boost > 2 and found == pytest.approx(power, abs=0.2)
+
+
+def test_a_faint_effect_is_settled_at_its_own_strength(lab) -> None:
+    """Afterpulsing of 0.4 % in 19,000 detections a second: what a stronger one does only says what it looks like."""
+    made = lab("    afterpulsing: {probability: 0.6 %, lifetime: 40 ns}\n", light=900, side=4)
+    course = course_of.begun(bench_of(made))
+    taken(course, "add afterpulsing", {PROBABILITY: 0.002, LIFETIME: 80e-9})
+    step = course.steps[0]
+    assert step.slopes  # it was faint
+    for name, truth in (("probability", 0.006), ("lifetime", 40e-9)):
+        value = step.values[name]
+        assert value.low is not None and value.high is not None
+        half = math.log(value.high / value.low) / 2 / 1.96
+        assert abs(math.log(value.value / truth)) < 4 * half < 2.0
+
+
+def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab) -> None:
+    """Neighbours light up within 0.3 ns or 0.05 ns: stamps of 100 ps hardly tell, those of 30 ns they do."""
+    delay = ("crosstalk", "delay")
+    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 2 %, delay: 20 ps}\n", side=4)))
+    taken(course, "add crosstalk", {CROSSTALK: 0.02, delay: 20e-12}, settle=False)
+    change = course.steps[0].change
+    course.steps[0].dials = tuple(d for d in change.dials if d.key in course.values)
+    course.steps[0].values = {
+        "probability": Value(0.02, 0.019, 0.021),
+        "delay": Value(20e-12, 19e-12, 21e-12, "s"),
+    }
+    course_of.open_ends(course)
+    dial = next(d for d in change.shapes if d.key == delay)
+    value = course.steps[0].values["delay"]
+    assert value.low == dial.low and value.high == 21e-12
+    assert course.steps[0].values["probability"] == Value(0.02, 0.019, 0.021)
+
+
+def test_numbers_that_have_a_likelihood_get_their_intervals_from_it(lab) -> None:
+    made = lab("    afterpulsing: {probability: 2 %, lifetime: 40 ns}\n", light=900)
+    course = course_of.begun(bench_of(made))
+    taken(course, "add afterpulsing", {PROBABILITY: 0.01, LIFETIME: 60e-9})
+    course_of.settle_exactly(course, made[1])
+    for name, truth in (("probability", 0.02), ("lifetime", 40e-9)):
+        value = course.steps[0].values[name]
+        assert value.method == "likelihood" and value.low is not None and value.high is not None
+        wide = (value.high - value.low) / 2  # twice the interval of 95 %: 1e-4
+        assert value.low - wide < truth < value.high + wide
+        assert course.values["afterpulsing", name] == value.value
+    # noise of the source has none
+    other = course_of.begun(bench_of(lab()))
+    taken(other, "add source_noise", {("source_noise", "contrast"): 0.1, ("source_noise", "coherence_time"): 1e-4})
+    before = dict(other.steps[0].values)
+    course_of.settle_exactly(other, lab()[1])
+    assert other.steps[0].values == before
+
+
+# --- levels ------------------------------------------------------------------------------------------------------
+
+
+def test_the_recordings_of_a_model_reach_as_far_as_the_data() -> None:
+    """Nothing is extrapolated, however few detections there are and wherever chance puts them."""
+    light = Light("flat", relative_uncertainty=0.02)
+    capture = Capture("flat", "tr", light, None)  # type: ignore[arg-type]
+    for mean in (30.0, 2000.0, 1e7):
+        for total in (mean * 0.9, mean, mean * 1.08, mean + 3.5 * math.sqrt(mean), mean * 3):
+            centre, half = recordings.levels_about(lambda level, m=mean: m * level, total, 1.0, capture)
+            assert abs(math.log(total / mean / centre)) <= half
+            assert half < 0.06 + 0.01 + 4 / math.sqrt(mean)
+    # what chance may do is a matter of the model: the same recordings serve every measurement of it
+    places = {recordings.levels_about(lambda level: 2000 * level, t, 1.0, capture) for t in (1900, 2000, 2100)}
+    assert len(places) == 1
+
+
+# --- patterns and chance -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_p_values_of_values_that_differ(joined: bool) -> None:
+    """Of 2000 right models: p < 1 % in at most 2 %, which is 6 sigma beyond 1 %; joined: all move together."""
+    rng = np.random.default_rng(3)
+    chances = []
+    for _ in range(2000):
+        values = rng.standard_normal((33, 16))
+        if joined:
+            values = values * np.exp(0.3 * rng.standard_normal((33, 1)))
+        chances.append(search._spread_chance(values[0], values[1:]))
+    assert np.mean(np.array(chances) < 0.01) < 0.02
+    # and columns of which an oracle sees 5.7 sigma are seen in most of 200 arrays
+    far = math.sqrt(5.7**2 / 16)
+    shifted = [
+        search._spread_chance(rng.standard_normal(16) + far * rng.choice([-1, 1], 16), rng.standard_normal((32, 16)))
+        for _ in range(200)
+    ]
+    assert np.mean(np.array(shifted) < 1e-2) > 0.6
+
+
+@dataclass
+class _Model:
+    """A state as far as `preferred` looks at it."""
+
+    left: int
+    residuals: dict[Any, Any] = field(default_factory=dict)
+
+
+def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
+    bench = bench_of(lab())
+    look = quiet(bench)
+    monkeypatch.setattr(fit, "blocks", lambda bench, state, residuals: [None] * state.left)
+    monkeypatch.setattr(fit, "failing", lambda checks: checks)
+    nothing = Moved({}, {}, {})
+    map_ = Tried(change_of(bench, "per_pixel dark_counts.rate"), {}, nothing, 90.0, 1.0, maps={})
+    map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
+    chance = Tried(change_of(bench, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True)
+    third = Tried(change_of(bench, "add crosstalk"), {}, nothing, 120.0, 1.0)
+
+    def better(left_by_map: int, left_by_chance: int, *more: Tried) -> str:
+        pair = [replace(map_, state=_Model(left_by_map)), replace(chance, state=_Model(left_by_chance))]  # type: ignore[arg-type]
+        return look.preferred([*pair, *more]).change.effect
+
+    assert better(0, 0) == "dark_counts"
+    assert better(1, 0) == "blinking_dark_counts"
+    assert better(0, 1) == "dark_counts"
+    assert better(0, 0, third) == "crosstalk"
+
+
+def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add crosstalk")
+    nothing = Moved({}, {}, {"flat": 1.0})
+    far, near = (
+        Tried(change, {CROSSTALK: x}, nothing, gain, t) for x, gain, t in ((0.1, 50.0, 0.03), (0.004, 45.0, 0.8))
+    )
+    seen: list[Tried] = []
+    monkeypatch.setattr(Search, "_simulated", lambda self, state, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr(Search, "maps", lambda self, state, values: [])
+    look.again(state, {}, [far, near])
+    assert [one.values[CROSSTALK] for one in seen] == [pytest.approx(0.004 * max(0.8, 1.0), rel=0.3)]
+
+
+def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> None:
+    bench: Bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    before = bench.simulations
+    change = change_of(bench, "add crosstalk")
+    (one,) = look.looked_at(state, change, [{CROSSTALK: 0.01}])
+    assert one.moved.even is None and bench.simulations - before == 2 * len(bench.seen)
