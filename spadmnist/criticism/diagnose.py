@@ -88,7 +88,7 @@ def _diagnosed(
         if failed:
             first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
             bench.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
-            tried = search.scan(course.state)
+            tried = search.scan(course.state, known=tried)
         # what a step has set is settled anew with every other one: no finding of its own
         tried = [t for t in tried if t.change.kind != "set" or course.values.keys().isdisjoint(t.values)]
         bench.say(f"step {number}: the best of them on all captures")

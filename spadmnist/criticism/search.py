@@ -81,6 +81,7 @@ class Tried:
     faint: bool = False  # settled by what a stronger one does
     more: tuple[Change, ...] = ()  # maps that only make sense together
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    seen: set[str] = field(default_factory=set)  # captures in which it was simulated
 
     @property
     def changes(self) -> list[Change]:
@@ -241,6 +242,7 @@ class Search:
                 sensors = state.sensors.changed(tried, chips=chips)
                 still.append(Tried(change, tried, Moved({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
         for one in self._simulated(state, still, _SCAN, only):
+            one.seen = set(only or state.made)
             one.gain, one.times = self.line_search(state, one.moved, one.signed)
             out.append(one)
         for change, tried in tries:
@@ -252,7 +254,7 @@ class Search:
             if any(isinstance(m, str) for m in turned):
                 continue
             gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
-            one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases)
+            one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases, seen=set(state.made))
             for dial in _lines_of(change):
                 f = float(tried[dial.key])
                 error = next((line.error for line in self.lines(state) if line.frequency == f), dial.high)
@@ -293,7 +295,8 @@ class Search:
                 tries += [(change, tried) for tried in self.begun(state, change)]
         if not only_rates:
             some = () if everywhere else self.telling(state)
-            old = self._still(state, tries, known)
+            seen = set.intersection(*(t.seen for t in known)) if known else set()
+            old = self._still(state, tries, known) if everywhere or set(some) <= seen else []
             tries = [t for t in tries if not any(_same(one, *t) for one in old)]
             out = self._looked_at(state, tries, some)
             # what leaves no trace yet may do so when it is stronger
