@@ -12,7 +12,7 @@ from joblib import Parallel
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
-from spadmnist.criticism import candidates, fit, fitted, mapping
+from spadmnist.criticism import candidates, fit, fitted, mapping, settling
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.recording import Capture, Light
@@ -79,7 +79,7 @@ def test_a_dead_time_is_settled_and_a_map_found(tmp_path, made):
         assert mapping.summary(found)["sigma"] == pytest.approx(0.1, rel=0.35)
         length = next(c for c in candidates.changes(sensor) if c.name == "set dead_time.duration")
         values = {("dead_time", "duration"): 55e-9}
-        settled = fit.settle(
+        settled = settling.settle(
             bench, state, length.dials, values, lambda v: fit.Sensors.same(candidates.with_values(sensor, v))
         )
     value, low, high = settled.interval(0)
@@ -113,10 +113,10 @@ class _Law:
 def profile_of(function, slopes, own, dials, point):
     cell = ("one", "cells")
     state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(len(slopes))}, {}, [])
-    covariance = fit.covariance_of(slopes, own)
+    covariance = settling.covariance_of(slopes, own)
     z = {cell: function(*point)}
-    settled = fit.Settled(dials, np.array(point), covariance, z, {cell: slopes}, 0.0, {})
-    return settled, fit.profiled(_Law(function), state, settled, lambda values: values)
+    settled = settling.Settled(dials, np.array(point), covariance, z, {cell: slopes}, 0.0, {})
+    return settled, settling.profiled(_Law(function), state, settled, lambda values: values)
 
 
 def test_a_profile_is_the_covariance_where_all_is_linear():

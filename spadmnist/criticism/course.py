@@ -10,12 +10,13 @@ import numpy as np
 from scipy import stats
 
 from ..measurement import Measurement
-from . import fit, likelihood, mapping, recordings
+from . import fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Key, with_values
-from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
+from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
 from .ladder import errors_of, row
 from .search import Search, Tried
+from .settling import Settled
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
 _SAME = 0.35  # of a coordinate: so far slopes hold
@@ -140,13 +141,13 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
     near: Settled | None = None
     for turn in range(_AGAIN + 1 if dials else 0):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = fit.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
+        closer = settling.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
         if isinstance(closer, str):
             break
         settled = closer
         if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
             break
-        near = closer if np.all(np.abs(closer.point - fit.point_of(dials, here)) < _SAME) else None
+        near = closer if np.all(np.abs(closer.point - settling.point_of(dials, here)) < _SAME) else None
         before = course.values, sensors, maps, state
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)
@@ -154,7 +155,7 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
         if search.square(state.residuals) > search.square(before[3].residuals):
             # a line or an edge: slopes do not lead further
             course.values, sensors, maps, state = before
-            settled = replace(settled, point=fit.point_of(dials, here))
+            settled = replace(settled, point=settling.point_of(dials, here))
             break
     course.state = state
     if settled is not None and dials:
@@ -339,7 +340,7 @@ def drop_needless(course: Course) -> None:
         if loss > 30 and not others:
             continue
         point = {d.key: rest[d.key] for d in others}
-        closer = fit.settle(bench, course.state, others, point, sensors.changed, 2) if others else None
+        closer = settling.settle(bench, course.state, others, point, sensors.changed, 2) if others else None
         if isinstance(closer, Settled):
             loss = closer.square - course.search.square(course.state.residuals)
         if loss < _NEEDLESS:

@@ -11,13 +11,14 @@ from joblib import Parallel
 from ..errors import InputError
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import fit, likelihood, recordings
+from . import fit, likelihood, recordings, settling
 from .answer import Diagnosis, Step, title
 from .candidates import Change, Key, changes
 from .course import Course, accept, begun, errors_known, material, settle_all
 from .findings import nuisances, remainder, traces
-from .fit import Bench, Moved, Settled
+from .fit import Bench, Moved
 from .search import Tried
+from .settling import Settled
 
 
 def fitted(
@@ -116,10 +117,10 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
         # the state's own numbers, from which the settled ones are one step away
         here = {d.key: course.state.values.get(d.key, course.values[d.key]) for d in dials}
         sensors, few = course.state.sensors.changed, 2 * fit.FEW
-        settled = fit.follow(bench, course.state, dials, here, sensors, few, errors_known(course))
+        settled = settling.follow(bench, course.state, dials, here, sensors, few, errors_known(course))
         if isinstance(settled, Settled):
-            settled = replace(settled, point=fit.point_of(dials, course.values))
-            ends = fit.profiled(bench, course.state, settled, sensors, few)
+            settled = replace(settled, point=settling.point_of(dials, course.values))
+            ends = settling.profiled(bench, course.state, settled, sensors, few)
     for step in course.steps:
         for name, value in step.values.items():
             low, high = ends.get((step.change.effect, name), (value.low, value.high))

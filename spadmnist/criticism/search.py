@@ -18,10 +18,11 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
-from . import fit, mapping
+from . import fit, mapping, settling
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
-from .fit import RATES, Bench, Cell, Moved, Sensors, Settled, State, stacked
+from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
+from .settling import Settled
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
 
@@ -558,7 +559,7 @@ class Search:
         if one.change.phases:
             given = self.tuned(state, one, given)
         boost, power = self._boost(state, one, given)
-        found = fit.settle(
+        found = settling.settle(
             self.bench,
             state,
             dials,
@@ -669,7 +670,7 @@ class Search:
             if self.square(residuals) < best:
                 best = self.square(residuals)
                 found = replace(
-                    found, point=fit.point_of(found.dials, tried), residuals=residuals, square=best, values=tried
+                    found, point=settling.point_of(found.dials, tried), residuals=residuals, square=best, values=tried
                 )
                 i = found.dials.index(dial)
                 # no slope told it, so that its neighbours must
