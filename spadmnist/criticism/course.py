@@ -22,6 +22,7 @@ _AGAIN = 2  # times that the numbers are settled anew beside the model with the 
 _SAME = 0.35  # of a coordinate: so far slopes hold
 _WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
 LEAST_GAIN = 12.0  # in chi square, of a step
+_PLAIN = 1000.0  # in chi square, of what no total says
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
@@ -393,6 +394,6 @@ def _left_of_own(step: Step, state: State) -> float:
         if cell != RATES:
             shape, shapes = shape + float(old @ old - z @ z), shapes + float(w.sum())
     # of totals alone, whatever remains may be the cause
-    if weight <= 0 or shape < LEAST_GAIN or shapes < 0.5 * weight:
+    if weight <= 0 or shape < LEAST_GAIN or (shapes < 0.5 * weight and shape < _PLAIN):
         return math.inf
     return after / weight / max(4.0, _LEFT * before / weight)

@@ -27,6 +27,7 @@ from .search import Tried, alike
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself
+_LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 
 
@@ -74,7 +75,8 @@ def _diagnosed(
             # no check fails by itself: does any candidate's whole trace stand out?
             bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
             tried = search.scan(course.state, everywhere=True, known=tried)
-            if search.chance(course.state, tried, course.values) > _TRACE:
+            trace = _TRACE if not course.steps else _LATER_TRACE
+            if search.chance(course.state, tried, course.values) > trace:
                 break
         if failed and all(b.cell[0] == "" for b in failed):
             found, others, wanted = _by_setup(course)
@@ -114,7 +116,8 @@ def _diagnosed(
         if not failed and course.failed:
             course.back_to(earlier)  # nothing was wrong before, now something is
             break
-        if failed and fell - course.misfit < 0.05 * (fell - 1):
+        # totals are no part of the misfit: what leaves nothing failing is a step, whatever chance makes of the rest
+        if course.failed and fell - course.misfit < 0.05 * (fell - 1):
             if course.misfit > fell:
                 course.back_to(earlier)
             break
@@ -132,10 +135,10 @@ def _diagnosed(
         course.state, course.judged, course.values = start, None, {}
         course.ladder = course.ladder[:1] if verdict != "unexplained" else course.ladder
     if verdict == "explained":
-        near = [a for a in course.steps[-1].alternatives if a.get("confused")]
+        near = [(s.change, a["tried"]) for s in course.steps for a in s.alternatives if a.get("confused")]
         if near:
             verdict = "confused"
-            advice += outlook.advice(course.search, course.state, course.steps[-1].change, near[0]["tried"])
+            advice += outlook.advice(course.search, course.state, *near[-1])
     if rival is not None:
         step = _rival_step(course, rival)
         course.steps.append(step)

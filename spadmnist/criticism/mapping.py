@@ -217,7 +217,8 @@ def settle_maps(
                 counted = told + np.bincount(groups[i], score[:, i], sizes[i])
                 usual = told * np.exp(-apart)  # what the middle would have, lest what is seen weighs itself
                 counted, usual = counted[~odd], usual[~odd]
-                usual = usual * max(float(counted.sum()), 1e-9) / float(usual.sum())  # about their mean, not the middle
+                # about their mean, not the middle
+                usual = np.maximum(usual * max(float(counted.sum()), 1e-9) / max(float(usual.sum()), 1e-9), 1e-9)
                 relative = float(((counted - usual) ** 2 - usual).sum() / (usual**2).sum())  # of logarithms it is less
                 sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), _LEAST_WIDTH**2))
             precision[i] = np.where(

@@ -382,11 +382,12 @@ class Search:
         return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
 
     def telling(self, state: State) -> list[str]:
-        """Up to three captures that show best what is wrong: a dark one, and those of the largest misfit."""
-        own = fit.misfits(state, state.residuals)
-        worst: dict[str, float] = {}
-        for (id, _), value in own.items():
-            worst[id] = worst.get(id, 0.0) + math.log(max(value, 1.0))
+        """Up to three captures that show best what is wrong: a dark one, and those with the least likely checks."""
+        worst = dict.fromkeys(state.made, 0.0)
+        for block in fit.blocks(self.bench, state, state.residuals):
+            if block.cell[0] in worst:  # what one check in a hundred is by chance says little, but more than nothing
+                surprise = -math.log10(max(block.p, _LEAST_P))
+                worst[block.cell[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
         ids = sorted(worst, key=lambda id: -worst[id])
         dark = [id for id in ids if self.bench.seen[id].capture.light.dark][:1]
         return list(dict.fromkeys([*ids[: 3 - len(dark)], *dark]))
@@ -617,11 +618,11 @@ class Search:
     def _boost(self, state: State, one: Tried, given: Mapping[Key, Any]) -> tuple[float, float]:
         """(how much stronger a faint effect is simulated, the power with which its trace grows).
 
-        1 where that is no power: an edge moves, and much of it saturates.
+        1 where that is no power: an edge moves, and much of anything saturates.
         """
         size = self.size(state, one.moved.at(one.times))
         strengths = [d for d in one.change.strengths if d.key in given]
-        if size > _STRONG or one.moved.even or not strengths:
+        if size > _STRONG or one.moved.even or not strengths or any(_is_edge(d) for d in strengths):
             return 1.0, 1.0
         room = min(_room(d, float(given[d.key])) for d in strengths)
         boost = min((_STRONG / max(size, 1e-3)) ** (1 / one.power), room)
