@@ -128,6 +128,11 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     assert course.failed
     course_of.drop_mimics(course, start)
     assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
+    # what is left is kept if it explains nearly all, whatever its own cells have
+    foul = with_residuals(end, {"neighbours": 5.0})
+    course.state = foul
+    course_of.drop_mimics(course, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}))
+    assert names(course) == ["add crosstalk"]
     # and nothing is left of steps that made all of it worse
     course.state = with_residuals(end, {"intervals": 30.0})
     course_of.drop_mimics(course, start)

@@ -22,7 +22,7 @@ _AGAIN = 2  # times that the numbers are settled anew beside the model with the 
 _SAME = 0.35  # of a coordinate: so far slopes hold
 _WORTH = 6.0  # in chi square: beyond it a settled model is simulated anew
 LEAST_GAIN = 12.0  # in chi square, of a step
-_PLAIN = 1000.0  # in chi square, of what no total says
+_MOSTLY = 0.95  # of what was wrong: what explains so much is no look-alike, whatever its law leaves
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
@@ -368,8 +368,10 @@ def drop_mimics(course: Course, start: State) -> None:
         # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
         left = {id(s): _left_of_own(s, course.state) for s in course.steps}
         worst = max(course.steps, key=lambda s: left[id(s)])
-        kept = [s for s in course.steps if s is not worst or left[id(s)] < 1]
-        if fit.misfit(course.state, course.state.residuals) > fit.misfit(start, start.residuals):
+        now, then = (fit.misfit(state, state.residuals) for state in (course.state, start))
+        mostly = len(course.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
+        kept = [s for s in course.steps if s is not worst or left[id(s)] < 1 or mostly]
+        if now > then:
             kept = []
         if len(kept) == len(course.steps):
             return
@@ -394,6 +396,6 @@ def _left_of_own(step: Step, state: State) -> float:
         if cell != RATES:
             shape, shapes = shape + float(old @ old - z @ z), shapes + float(w.sum())
     # of totals alone, whatever remains may be the cause
-    if weight <= 0 or shape < LEAST_GAIN or (shapes < 0.5 * weight and shape < _PLAIN):
+    if weight <= 0 or shape < LEAST_GAIN or shapes < 0.5 * weight:
         return math.inf
     return after / weight / max(4.0, _LEFT * before / weight)
