@@ -29,7 +29,7 @@ from .nulls import Null, learn
 REPLICATES = 96
 SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
 LEAST_SPREAD = 0.01
-_MOST_CHANCE = 0.7  # of a logarithm, by which a level may seem another by chance
+_MUCH, _MOST_CHANCE = 0.05, 0.7  # of a logarithm, by which a level may seem another by chance
 _EVENTS_AT_ONCE = 4_000_000
 _CLOSED = 5e-4  # relative error of the closed forms, at most
 
@@ -222,7 +222,9 @@ def levels_about(
     if stated is not None:
         chance = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_CHANCE)
         if total == 0 or abs(math.log(centre / stated)) < half + chance:
-            return stated, half + chance  # the same recordings then serve every measurement of this model
+            # the same recordings then serve every measurement of this model. Of many detections their own scatter reaches
+            # as far as the data
+            return stated, half + chance if chance > _MUCH else half
     return centre, half
 
 

@@ -42,6 +42,7 @@ _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
 _POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
+_LINE = 0.25  # of the square of a trace, in one cell
 _LEAST_BOOST = 1.5  # worth it
 _SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
@@ -620,8 +621,11 @@ class Search:
 
         1 where that is no power: an edge moves, and much of anything saturates.
         """
-        size = self.size(state, one.moved.at(one.times))
+        trace = stacked(self.bench.template(state, one.moved.at(one.times)), list(state.residuals)) ** 2
+        size = math.sqrt(float(trace.sum()))
         strengths = [d for d in one.change.strengths if d.key in given]
+        if float(trace.max(initial=0.0)) > _LINE * size**2:
+            return 1.0, 1.0  # a line stands out by itself, and no slope says where
         if size > _STRONG or one.moved.even or not strengths or any(_is_edge(d) for d in strengths):
             return 1.0, 1.0
         room = min(_room(d, float(given[d.key])) for d in strengths)
