@@ -222,8 +222,8 @@ def levels_about(
     if stated is not None:
         chance = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_CHANCE)
         if total == 0 or abs(math.log(centre / stated)) < half + chance:
-            # the same recordings then serve every measurement of this model. Of many detections their own scatter reaches
-            # as far as the data
+            # the same recordings then serve every measurement of this model. Where detections are many, their own
+            # scatter reaches as far as the data
             return stated, half + chance if chance > _MUCH else half
     return centre, half
 
