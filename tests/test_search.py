@@ -127,7 +127,7 @@ def test_numbers_that_have_a_likelihood_get_their_intervals_from_it(lab) -> None
 
 
 def test_the_recordings_of_a_model_reach_as_far_as_the_data() -> None:
-    """Nothing is extrapolated, however few detections there are and wherever chance puts them."""
+    """Of few detections nothing is extrapolated, wherever chance puts them; of many, no farther than chance goes."""
     light = Light("flat", relative_uncertainty=0.02)
     capture = Capture("flat", "tr", light, None)  # type: ignore[arg-type]
     for mean in (30.0, 2000.0, 1e7):

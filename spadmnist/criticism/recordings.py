@@ -215,7 +215,8 @@ def levels_about(
 ) -> tuple[float, float]:
     """(level about which a capture is simulated, how far to both sides, of its logarithm).
 
-    expected: level -> detections; total: of the measurement, which shall lie inside: nothing is extrapolated.
+    expected: level -> detections; total: of the measurement.
+    It lies inside, or beside by no more than chance where detections are many.
     """
     centre = level_for(expected, total, stated)
     half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
