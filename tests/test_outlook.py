@@ -71,7 +71,7 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     found, hidden = outlook.upper_limits(look, state, tried)
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
-    return limit, [outlook._size(look, state, t.moved)[1] for t in tried]
+    return limit, [search.along(bench, state, t.moved)[1] for t in tried]
 
 
 def test_what_would_have_been_seen_is_seen(lab):

@@ -311,8 +311,8 @@ def _unseen(state: State, settled: Settled) -> dict[Cell, np.ndarray]:
         alone = bool(np.any(np.diag(rest) < 0.3 * np.diag(normal)))
         start = 0
         if not alone:
-            shift = -np.linalg.solve(rest + ridge, slopes[~mine].T @ z[~mine])
-        hat = np.einsum("ij,jk,ik->i", slopes, np.linalg.inv(normal + ridge), slopes)
+            shift = -np.linalg.pinv(rest + ridge) @ (slopes[~mine].T @ z[~mine])  # 0 where nothing follows any number
+        hat = np.einsum("ij,jk,ik->i", slopes, np.linalg.pinv(normal + ridge), slopes)
         for key in keys:
             size = len(state.residuals[key])
             part = slice(start, start + size)

@@ -32,6 +32,7 @@ Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
+_CHANCE_LINE, _LEAST_LINE = 1e-4, 100.0  # p-value of a line that is none; in variances, what is one at all
 FEW = 4  # recordings that tell the difference between two models
 
 
@@ -494,7 +495,8 @@ class Bench:
                 shift, left, beta = _difference(new, old, spread)
                 if not bare:
                     # where the recordings have nothing in common, the null's own chance is in the shift, too
-                    shift = _beyond_noise(shift, spread, left + 3.0 * (1 - beta) / null.recordings, null.law)
+                    chance = left + 3.0 * (1 - beta) / null.recordings
+                    shift = _beyond_noise(shift, spread, chance, null, len(other.totals))
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -579,13 +581,25 @@ def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[n
     return shift, left / n, beta
 
 
-def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, law: str) -> np.ndarray:
-    """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none."""
+def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, few: int) -> np.ndarray:
+    """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none.
+
+    noise: variance of what chance makes of it, relative to that of a recording; few: recordings that tell it.
+    """
     relative = (shift / spread) ** 2 / max(noise, 1e-12)
     n = len(shift)
-    if law != "exponential" and float(relative.mean()) > 1.2 * float(stats.chi2.isf(1e-4, n)) / n:
+    if null.law == "exponential":
+        return np.where(relative > _line_beyond(few, null.recordings, n), shift, 0.0)
+    if float(relative.mean()) > 1.2 * float(stats.chi2.isf(1e-4, n)) / n:
         return shift
-    return np.where(relative > (100.0 if law == "exponential" else 30.0), shift, 0.0)
+    return np.where(relative > 30.0, shift, 0.0)
+
+
+@functools.cache
+def _line_beyond(few: int, recordings: int, cells: int) -> float:
+    """Square, in variances, beyond which chance hardly lifts one of so many powers: a mean of few over one of many."""
+    far = float(stats.f.isf(_CHANCE_LINE / cells, 2 * few, 2 * recordings)) - 1
+    return max(far**2 / (1 / few + 1 / recordings), _LEAST_LINE)
 
 
 def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noise: float) -> np.ndarray:

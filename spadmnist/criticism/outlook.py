@@ -16,8 +16,8 @@ from ..recording import Capture, Light, Recording
 from . import fit, recordings
 from .answer import plain
 from .candidates import Change
-from .fit import Bench, Moved, Seen, Sensors, State
-from .search import Search, Tried
+from .fit import Bench, Seen, Sensors, State
+from .search import Search, Tried, along
 from .setups import Explanation
 
 _RECORDINGS = 16  # of a capture that nobody has taken yet
@@ -211,8 +211,8 @@ def upper_limits(
         change = one.change
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
-        size, along = _size(search, state, one.moved)
-        times = (max(along, 0.0) + _ONE_SIDED) / size if size > 0 else math.inf
+        size, had, _ = along(bench, state, one.moved)
+        times = (max(had, 0.0) + _ONE_SIDED) / size if size > 0 else math.inf
         if change.effect not in weakest or times > weakest[change.effect][0]:
             weakest[change.effect] = times, size, one
     hidden = [name for name, (times, _, one) in weakest.items() if _strength(one, times) is None]
@@ -226,7 +226,7 @@ def upper_limits(
         dial = one.change.strengths[0]
         if not isinstance(moved, str) and not 0.5 < times < 2:
             # how the trace grows with the strength: in proportion, or with its square
-            there, _ = _size(search, state, moved)
+            there, *_ = along(bench, state, moved)
             if there > 0.2:
                 power = float(np.clip(math.log(there / size) / math.log(times), 1.0, 2.0))
                 times = times ** (1 / power)
@@ -245,16 +245,3 @@ def _strength(one: Tried, times: float) -> float | None:
     value = off + (float(one.values[dial.key]) - off) * times
     inside = math.isfinite(value) and (value <= dial.high if dial.off != dial.high else value >= dial.low)
     return value if inside else None
-
-
-def _size(search: Search, state: State, moved: Moved) -> tuple[float, float]:
-    """(standard deviations of the trace of a model, those of it that the data have)."""
-    template = search.bench.template(state, moved)
-    norm = math.sqrt(sum(float(t @ t) for t in template.values()))
-    if norm <= 0:
-        return 0.0, 0.0
-    keys = list(template)
-    t = fit.stacked(template, keys)
-    own = np.concatenate([state.own[k] for k in keys], axis=1) @ t
-    spread = max(float(own.std()) / norm, 0.5)
-    return norm / spread, float(fit.stacked(state.residuals, keys) @ t) / norm / spread

@@ -42,7 +42,7 @@ _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
 _POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
-_LINE = 0.25  # of the square of a trace, in one cell
+_LINE = 0.25  # of the square of a trace, in one cell of a spectrum
 _LEAST_BOOST = 1.5  # worth it
 _SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
@@ -621,10 +621,11 @@ class Search:
 
         1 where that is no power: an edge moves, and much of anything saturates.
         """
-        trace = stacked(self.bench.template(state, one.moved.at(one.times)), list(state.residuals)) ** 2
-        size = math.sqrt(float(trace.sum()))
+        trace = self.bench.template(state, one.moved.at(one.times))
+        size = math.sqrt(sum(float(t @ t) for t in trace.values()))
         strengths = [d for d in one.change.strengths if d.key in given]
-        if float(trace.max(initial=0.0)) > _LINE * size**2:
+        spectra = [t for cell, t in trace.items() if cell in state.nulls and state.nulls[cell].law == "exponential"]
+        if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
             return 1.0, 1.0  # a line stands out by itself, and no slope says where
         if size > _STRONG or one.moved.even or not strengths or any(_is_edge(d) for d in strengths):
             return 1.0, 1.0
@@ -714,8 +715,8 @@ class Search:
         # what is far outside is no matter of the linear law: the gain itself, in the same measure
         keys = list(state.residuals)
         t = stacked(self.bench.template(state, best.moved), keys)
-        along = np.concatenate([state.own[k] for k in keys], axis=1) @ t
-        typical = float(np.mean(along**2) / max(float(t @ t), 1e-12))
+        own = np.concatenate([state.own[k] for k in keys], axis=1) @ t
+        typical = float(np.mean(own**2) / max(float(t @ t), 1e-12))
         score = max(float(marks[0]), math.sqrt(max(best.gain, 0.0) / max(typical, 0.5))) if t.any() else 0.0
         return score, max(_gumbel_tail(largest, score), _LEAST_P)
 
@@ -724,19 +725,31 @@ class Search:
 
         In standard deviations of the latter; 0 of a candidate without a trace.
         """
-        keys = list(state.residuals)
-        z = stacked(state.residuals, keys)
-        own = np.concatenate([state.own[k] for k in keys], axis=1)
-        marks, largest = np.zeros(len(tried)), np.zeros(len(own))
+        marks, largest = np.zeros(len(tried)), np.zeros(len(state.own[RATES]))
         for n, one in enumerate(tried):
-            t = stacked(self.bench.template(state, one.moved), keys)
-            if not t.any():
-                continue
-            along = own @ t
-            spread = max(float(along.std()), 0.5 * math.sqrt(float(t @ t)))
-            largest = np.maximum(largest, np.abs(along) / spread)
-            marks[n] = abs(float(z @ t)) / spread
+            _, data, own = along(self.bench, state, one.moved)
+            largest = np.maximum(largest, np.abs(own))
+            marks[n] = abs(data)
         return marks, largest
+
+
+def along(bench: Bench, state: State, moved: Moved) -> tuple[float, float, np.ndarray]:
+    """(size of a model's trace, how much of it the data have, (recordings,) the model's own), in standard deviations.
+
+    Of what the model's own recordings have of it. All 0 where there is no trace.
+    """
+    keys = list(state.residuals)
+    t = stacked(bench.template(state, moved), keys)
+    own = np.concatenate([state.own[k] for k in keys], axis=1)
+    norm = math.sqrt(float(t @ t))
+    if norm <= 0:
+        return 0.0, 0.0, np.zeros(len(own))
+    own = own @ t / norm
+    # many cells may scatter less together than they would by themselves; the score of a single one is what it is, even
+    # where chance fills it so seldom that it hardly scatters
+    cells = norm**4 / float(np.sum(t**4))
+    spread = max(float(own.std()), 0.5 + 0.5 / math.sqrt(cells))
+    return norm / spread, float(stacked(state.residuals, keys) @ t) / norm / spread, own / spread
 
 
 def alike(gain: float) -> float:
