@@ -26,7 +26,7 @@ from .ladder import placebo_row
 from .search import Tried, alike
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
-_TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself
+_TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 

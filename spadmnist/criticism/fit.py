@@ -26,13 +26,15 @@ from ..statistics import Summary
 from . import compare as comparing
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
-from .nulls import Null, _standardized, learn
+from .nulls import Null, _standardized, learn, poisson_scores
 
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
-_CHANCE_LINE, _LEAST_LINE = 1e-4, 100.0  # p-value of a line that is none; in variances, what is one at all
+_CHANCE, _CHANCE_CELL = 1e-4, 4e-8  # p-values of shifts that are none: of a block, of any of its cells by itself
+_FEW_COUNTS = 20.0  # of a cell in some recordings: normal enough
+_LEAST_LINE = 100.0  # in variances, of a line of a spectrum
 FEW = 4  # recordings that tell the difference between two models
 
 
@@ -489,14 +491,17 @@ class Bench:
                     return f"{id}: its {name} has other cells than the measurement's"
                 null = state.nulls[cell]
                 nothing = nothing and np.array_equal(values, base.values[name][some])
-                new = values - np.stack([null.expected(t)[0] for t in other.totals])
+                # chips with odd pixels may have many more detections; so far off no expectation was learnt
+                learnt = np.clip(other.totals, base.totals.min(), base.totals.max())
+                new = values - np.stack([null.expected(t)[0] for t in learnt])
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
                 shift, left, beta = _difference(new, old, spread)
                 if not bare:
                     # where the recordings have nothing in common, the null's own chance is in the shift, too
                     chance = left + 3.0 * (1 - beta) / null.recordings
-                    shift = _beyond_noise(shift, spread, chance, null, len(other.totals))
+                    usual_here = null.expected(float(base.totals.mean()))[0]
+                    shift = _beyond_noise(shift, spread, chance, null, usual_here, len(other.totals))
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -581,24 +586,49 @@ def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[n
     return shift, left / n, beta
 
 
-def _beyond_noise(shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, few: int) -> np.ndarray:
+def _beyond_noise(
+    shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, expected: np.ndarray, few: int
+) -> np.ndarray:
     """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none.
 
-    noise: variance of what chance makes of it, relative to that of a recording; few: recordings that tell it.
+    noise: variance of what chance makes of it, relative to that of a recording, as `few` recordings tell it: of small
+    blocks not well, so that either this or the scatter of whole recordings must be exceeded by what is hardly chance.
     """
-    relative = (shift / spread) ** 2 / max(noise, 1e-12)
     n = len(shift)
+    most = 1 / few + 3.0 / null.recordings  # as if the recordings had nothing in common
+    square = (shift / spread) ** 2
     if null.law == "exponential":
-        return np.where(relative > _line_beyond(few, null.recordings, n), shift, 0.0)
-    if float(relative.mean()) > 1.2 * float(stats.chi2.isf(1e-4, n)) / n:
+        return np.where(square > max(noise, 1e-12) * _line_beyond(few, null.recordings, n), shift, 0.0)
+    mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
+    together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # cells that move by themselves
+    by_own, by_null, one_by_own, one_by_null = _beyond(together, (few - 1) * together)
+    mean = float(square.mean())
+    if mean > max(noise, 1e-12) * by_own or mean > most * by_null:
         return shift
-    return np.where(relative > 30.0, shift, 0.0)
+    out = (square > max(noise, 1e-12) * one_by_own) | (square > most * one_by_null)
+    if null.law == "poisson":  # a count or two where there is usually none
+        usual = few * np.maximum(expected, 0.5 / null.recordings)
+        score = poisson_scores(np.maximum(usual + few * shift, 0.0), usual) / math.sqrt(1 + few / null.recordings)
+        out &= (usual > _FEW_COUNTS) | (np.abs(score) > -stats.norm.ppf(_CHANCE / n))
+    return np.where(out, shift, 0.0)
+
+
+@functools.cache
+def _beyond(cells: int, freedom: int) -> tuple[float, ...]:
+    """What chance hardly exceeds: mean squares and single ones; of a variance with such freedom, and of a known one."""
+    free = max(freedom, 1)
+    return (
+        1.2 * float(stats.f.isf(_CHANCE, cells, free)),
+        1.2 * float(stats.chi2.isf(_CHANCE, cells)) / cells,
+        float(stats.f.isf(_CHANCE_CELL, 1, free)),
+        float(stats.chi2.isf(_CHANCE_CELL, 1)),
+    )
 
 
 @functools.cache
 def _line_beyond(few: int, recordings: int, cells: int) -> float:
     """Square, in variances, beyond which chance hardly lifts one of so many powers: a mean of few over one of many."""
-    far = float(stats.f.isf(_CHANCE_LINE / cells, 2 * few, 2 * recordings)) - 1
+    far = float(stats.f.isf(_CHANCE / cells, 2 * few, 2 * recordings)) - 1
     return max(far**2 / (1 / few + 1 / recordings), _LEAST_LINE)
 
 

@@ -728,8 +728,10 @@ class Search:
         marks, largest = np.zeros(len(tried)), np.zeros(len(state.own[RATES]))
         for n, one in enumerate(tried):
             _, data, own = along(self.bench, state, one.moved)
-            largest = np.maximum(largest, np.abs(own))
-            marks[n] = abs(data)
+            if one.signed:
+                data, own = abs(data), np.abs(own)
+            largest = np.maximum(largest, own)
+            marks[n] = max(data, 0.0)  # less of it than nothing is none of what can only be there
         return marks, largest
 
 
