@@ -62,7 +62,7 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     """Probabilities in proportion, fluctuations with the square: whatever chance hides of a faint trace."""
     bench = bench_of(lab(light=900, side=4))
     state, look = bench.state({}), quiet(bench)
-    (moved,) = bench.moved(state, [state.sensors.changed(values)], 2)
+    (moved,) = bench.moved(state, [state.sensors.changed(values)], 2, kept="sure")
     assert isinstance(moved, Moved)
     boost, found = look._boost(state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values)
     assert boost > 2 and round(found) == power

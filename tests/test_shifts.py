@@ -40,7 +40,7 @@ def shift_of(null: Null, values: np.ndarray, base: np.ndarray, few: int) -> np.n
     spread = np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
     shift, left, beta = fit._difference(values - expected, base[:few] - expected, spread)
     chance = left + 3.0 * (1 - beta) / null.recordings
-    return fit._beyond_noise(shift, spread, chance, null, expected, few)
+    return fit._beyond_noise(shift, spread, chance, null, expected, few, True)
 
 
 @pytest.mark.parametrize("few", [2, 4])
@@ -82,7 +82,7 @@ def test_no_expectation_is_taken_from_where_none_was_learnt(lab) -> None:
     state = bench.state({})
     wanted = [(state.sensors, id, 3 * state.rates[id].level * state.factors[id][:4], np.arange(4)) for id in state.made]
     made = dict(zip(state.made, bench.simulate(wanted), strict=True))
-    moved = bench._moved(state, state.sensors, made, False)  # type: ignore[arg-type]
+    moved = bench._moved(state, state.sensors, made, "sure")  # type: ignore[arg-type]
     assert isinstance(moved, fit.Moved)
     null, most = state.nulls["dark", "intervals"], state.made["dark"].totals.max()
     (values, usual), few = (made["dark"].values["intervals"], state.made["dark"].values["intervals"]), slice(0, 4)  # type: ignore[union-attr]

@@ -82,7 +82,7 @@ def given(course: course_of.Course, name: str, values: dict[Key, Any], settle: b
     """A candidate at some values, or settled from there."""
     bench, state = course.bench, course.state
     change = next(c for c in candidates.changes(state.sensors.one) if c.name == name)
-    (moved,) = bench.moved(state, [state.sensors.changed(values)])
+    (moved,) = bench.moved(state, [state.sensors.changed(values)], kept="sure")
     assert isinstance(moved, Moved)
     one = Tried(change, values, moved, 0.0, 1.0)
     return course.search.refine(state, one) if settle else one

@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -36,6 +36,7 @@ _CHANCE, _CHANCE_CELL = 1e-4, 4e-8  # p-values of shifts that are none: of a blo
 _FEW_COUNTS = 20.0  # of a cell in some recordings: normal enough
 _LEAST_LINE = 100.0  # in variances, of a line of a spectrum
 FEW = 4  # recordings that tell the difference between two models
+Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
 
 @dataclass(frozen=True)
@@ -441,12 +442,13 @@ class Bench:
         few: int = FEW,
         only: Sequence[str] = (),
         hasty: bool = True,
-        bare: bool = False,
+        kept: Kept = "likely",
     ) -> list[Moved | str]:
         """What each of these models would change.
 
-        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much; bare: with
-        what is no more than chance.
+        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much; kept: of what
+        the recordings show, what is hardly ever chance (a trace), what is hardly all chance (a slope, which would be
+        too small without it), or all.
         """
         numbers = np.arange(few, dtype=np.uint64)
         ids = [id for id in state.made if not only or id in only]
@@ -461,10 +463,10 @@ class Bench:
             part = results[i * len(ids) : (i + 1) * len(ids)]
             wrong = [p for p in part if isinstance(p, str)]
             joined = dict(zip(ids, part, strict=True))
-            out.append(wrong[0] if wrong else self._moved(state, models[i], joined, bare))  # type: ignore[arg-type]
+            out.append(wrong[0] if wrong else self._moved(state, models[i], joined, kept))  # type: ignore[arg-type]
         return out
 
-    def _moved(self, state: State, sensors: Sensors, made: dict[str, Made], bare: bool) -> Moved | str:
+    def _moved(self, state: State, sensors: Sensors, made: dict[str, Made], kept: Kept) -> Moved | str:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
@@ -497,11 +499,11 @@ class Bench:
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
                 shift, left, beta = _difference(new, old, spread)
-                if not bare:
+                if kept != "all":
                     # where the recordings have nothing in common, the null's own chance is in the shift, too
                     chance = left + 3.0 * (1 - beta) / null.recordings
                     usual_here = null.expected(float(base.totals.mean()))[0]
-                    shift = _beyond_noise(shift, spread, chance, null, usual_here, len(other.totals))
+                    shift = _beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -587,25 +589,29 @@ def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[n
 
 
 def _beyond_noise(
-    shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, expected: np.ndarray, few: int
+    shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, expected: np.ndarray, few: int, sure: bool
 ) -> np.ndarray:
     """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none.
 
     noise: variance of what chance makes of it, relative to that of a recording, as `few` recordings tell it: of small
-    blocks not well, so that either this or the scatter of whole recordings must be exceeded by what is hardly chance.
+    blocks not well. sure: either this, with its freedom, or the scatter of whole recordings must then be exceeded.
     """
     n = len(shift)
     most = 1 / few + 3.0 / null.recordings  # as if the recordings had nothing in common
     square = (shift / spread) ** 2
+    noise = max(noise, 1e-12)
     if null.law == "exponential":
-        return np.where(square > max(noise, 1e-12) * _line_beyond(few, null.recordings, n), shift, 0.0)
+        return np.where(square > noise * _line_beyond(few, null.recordings, n), shift, 0.0)
+    if not sure:
+        by_own, one = float(stats.chi2.isf(_CHANCE, n)) / n, float(stats.chi2.isf(_CHANCE_CELL, 1))
+        return shift if float(square.mean()) > noise * 1.2 * by_own else np.where(square > noise * one, shift, 0.0)
     mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
     together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # cells that move by themselves
     by_own, by_null, one_by_own, one_by_null = _beyond(together, (few - 1) * together)
     mean = float(square.mean())
-    if mean > max(noise, 1e-12) * by_own or mean > most * by_null:
+    if mean > noise * by_own or mean > most * by_null:
         return shift
-    out = (square > max(noise, 1e-12) * one_by_own) | (square > most * one_by_null)
+    out = (square > noise * one_by_own) | (square > most * one_by_null)
     if null.law == "poisson":  # a count or two where there is usually none
         usual = few * np.maximum(expected, 0.5 / null.recordings)
         score = poisson_scores(np.maximum(usual + few * shift, 0.0), usual) / math.sqrt(1 + few / null.recordings)

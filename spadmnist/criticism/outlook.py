@@ -126,7 +126,7 @@ def _apart(bench: Bench, one: Sensors, other: Sensors, capture: Capture, like: s
             summaries[statistic.name] = summary
     new.seen = {capture.id: Seen(made.capture, float(counts.sum()), counts, summaries)}
     state = new.state({}, first, _RECORDINGS)
-    (moved,) = new.moved(state, [second], fit.FEW, hasty=False)
+    (moved,) = new.moved(state, [second], fit.FEW, hasty=False, kept="sure")
     if isinstance(moved, str):
         return 0.0
     return math.sqrt(sum(float(t @ t) for t in new.template(state, moved).values()))
@@ -222,7 +222,9 @@ def upper_limits(
         dial = one.change.strengths[0]
         models.append(state.sensors.changed({**one.values, dial.key: _strength(one, times)}))
     excluded = []
-    for (name, (times, size, one)), moved in zip(seen.items(), bench.moved(state, models, fit.FEW), strict=True):
+    for (name, (times, size, one)), moved in zip(
+        seen.items(), bench.moved(state, models, fit.FEW, kept="sure"), strict=True
+    ):
         dial = one.change.strengths[0]
         if not isinstance(moved, str) and not 0.5 < times < 2:
             # how the trace grows with the strength: in proportion, or with its square

@@ -271,7 +271,7 @@ class Search:
         """
         down = {i: opposite for i, one in enumerate(tried) if (opposite := _opposite(state, one))}
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = self.bench.moved(state, [*models, *down.values()], few, only)
+        made = self.bench.moved(state, [*models, *down.values()], few, only, kept="sure")
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):
@@ -636,7 +636,7 @@ class Search:
         ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
         models = [state.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
         traces = []
-        for moved in self.bench.moved(state, models, 2 * fit.FEW):
+        for moved in self.bench.moved(state, models, 2 * fit.FEW, kept="sure"):
             if isinstance(moved, str):
                 return 1.0, 1.0
             traces.append(stacked(self.bench.template(state, moved), list(state.residuals)))

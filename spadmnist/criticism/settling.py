@@ -197,7 +197,7 @@ def follow(
     covariance = covariance_of(slopes, own)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(slopes.T @ slopes, rcond=1e-10) @ (slopes.T @ z)
-    step = np.clip(step, -5 * error, 5 * error)
+    step = np.where(np.isfinite(np.diag(covariance)), np.clip(step, -5 * error, 5 * error), 0.0)  # blind: as it is
     point = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u + step, strict=True)])
     left = z + slopes @ (point - u)
     new = {**values, **{d.key: d.value(float(x)) for d, x in zip(dials, point, strict=True)}}
@@ -231,7 +231,7 @@ def _slopes_about(
     ends: list[np.ndarray | str] = [np.zeros(0)] * len(points)
     for bare in (False, True):
         some = [k for k in range(len(points)) if (k // 2 in told) == bare]
-        made = bench.moved(state, [sensors_of(values_there[k]) for k in some], few, bare=bare)
+        made = bench.moved(state, [sensors_of(values_there[k]) for k in some], few, kept="all" if bare else "likely")
         for k, m in zip(some, made, strict=True):
             if isinstance(m, str):
                 return m
