@@ -220,11 +220,7 @@ def _alternatives(
     """The other candidates, with the misfit that each leaves."""
     out: list[dict[str, Any]] = []
     for one in second:
-        if (
-            one is best
-            or one.change in best.changes
-            or any(o["effect"] == one.change.effect and o["parameter"] == one.change.parameter for o in out)
-        ):
+        if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
         checks = fit.blocks(bench, state, residuals)

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from ..effects import Effect
 from ..errors import SpadError
@@ -31,6 +31,7 @@ _MOST = 10.0  # of a logarithm
 _ODD, _WIDE = 3.5, 2.0  # standard deviations of a pixel that is odd; of a logarithm, how wide these lie
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
+_GRID, _ROUNDS = (-4.0, 6.0, 81), 100  # logarithms about the middle that pixels of few counts may have
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
 
 
@@ -51,12 +52,26 @@ class Map:
     sigma: float
     low: float = 0.0
     high: float = math.inf
+    likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) how likely each is
 
     def values(self, draw: np.ndarray | None = None) -> np.ndarray:
         """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
+        if self.likely is not None:
+            return self._one_of(draw)
         # a draw of the logarithm has the mean of the estimate in the value itself
         logs = self.estimate if draw is None else self.estimate + draw * self.error - self.error**2 / 2
         return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST)), self.low, self.high)
+
+    def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
+        assert self.likely is not None
+        grid, weights = self.likely
+        if draw is None:
+            relative = weights @ np.exp(grid)
+        else:
+            below = np.cumsum(weights, axis=1)
+            place = (below < special.ndtr(draw)[:, None]).sum(axis=1)
+            relative = np.exp(grid[np.minimum(place, grid.size - 1)])
+        return np.clip(self.base * relative, self.low, self.high)
 
 
 def groups_of(sensor: Sensor, per: str) -> np.ndarray:
@@ -84,6 +99,15 @@ class _Line:
         if not self.frames or (self.conditions.counting == "counter" and self.seen.capture.modality == "counts"):
             return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
         return np.maximum(self.conditions.frames * in_frames(sensor, light, self.conditions)[0], 1e-9)
+
+    def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
+        """(pixels,) of the counts that were measured."""
+        counts = self.seen.counts
+        assert counts is not None
+        if not self.frames:
+            return np.asarray(counts * np.log(expected) - expected)
+        share = np.clip(expected / self.conditions.frames, 1e-12, 1 - 1e-9)
+        return np.asarray(counts * np.log(share) + (self.conditions.frames - counts) * np.log1p(-share))
 
     def saturated(self, counts: np.ndarray) -> bool:
         """Have half of the pixels hardly a frame left?"""
@@ -231,10 +255,41 @@ def settle_maps(
         assert change.carrier is not None
         error = np.sqrt(np.maximum(post[i], 0))
         r, v = raw[i]
-        out[change.carrier] = Map(
-            change.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i]
-        )
+        map_ = Map(change.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i])
+        if not bench_light_only(start, change) and float(np.median(v)) >= _TELLING**2:
+
+            def at(log: float, i: int = i) -> Sensor:
+                return model([np.full(d.size, log) if j == i else d for j, d in enumerate(delta)])
+
+            map_ = _of_few_counts(map_, lines, at)
+        out[change.carrier] = map_
     return out
+
+
+def _of_few_counts(map_: Map, lines: Sequence[_Line], model: Callable[[float], Sensor]) -> Map:
+    """A map of pixels that say little each: all together tell the law of their values, without a form for it.
+
+    The nonparametric maximum of the likelihood, by expectation and maximization (Laird, JASA 73, 1978), stopped while
+    it is smooth; and each pixel's values by Bayes's law from there. model: with this logarithm in all pixels.
+    """
+    centre, size = float(np.median(map_.estimate)), map_.estimate.size
+    grid = centre + np.linspace(*_GRID)
+    likely = np.stack(
+        [
+            np.bincount(map_.group, sum(line.log_likelihood(line.expected(sensor)) for line in lines), size)
+            for sensor in map(model, grid.tolist())
+        ],
+        axis=1,
+    )
+    likely = np.exp(likely - likely.max(axis=1, keepdims=True))
+    prior = np.full(grid.size, 1 / grid.size)
+    for _ in range(_ROUNDS):
+        weights = likely * prior
+        weights /= weights.sum(axis=1, keepdims=True)
+        prior = weights.mean(axis=0)
+    mean = weights @ grid
+    error = np.sqrt(np.maximum(weights @ grid**2 - mean**2, 0.0))
+    return replace(map_, estimate=mean, error=error, likely=(grid, weights))
 
 
 def _odd(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
