@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import units
 from ..effects import Effect
-from ..statistics import Summary
+from ..statistics import Statistic, Summary
 from .candidates import Change, Dial, Key
 from .fit import Cell
 
@@ -145,30 +145,18 @@ def title(change: Change) -> str:
     return f"{change.effect}.{change.parameter}" + (" per pixel" if change.kind == "per_pixel" else "")
 
 
+_WHO = {
+    "far": "pixels far from each other share it",
+    "neighbours": "pixels that are close to each other share it",
+    "pixel": "it stays in its own pixel",
+    "array": "the whole array shares it",
+}
+
+
 def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
     """One sentence on what the remainder does."""
-    names = {str(r["statistic"]) for r in found}
-    same = {
-        "intervals",
-        "fine_intervals",
-        "edge_intervals",
-        "autocorrelation",
-        "rescaled",
-        "rescaled_lag",
-        "pixel_fano",
-        "slow_series",
-        "hot_series",
-    }
-    if "far_pairs" in names:
-        who = "pixels far from each other share it"
-    elif names & {"neighbours", "multiplicity"}:
-        who = "pixels that are close to each other share it"
-    elif names & same:
-        who = "it stays in its own pixel"
-    elif names & {"spacing", "array_fano", "spectrum", "trend"}:
-        who = "the whole array shares it"
-    else:
-        who = "it is a matter of rates and maps"
+    kinds = {Statistic.registry.find(str(r["statistic"])).among for r in found if r["statistic"] in Statistic.registry}
+    who = next((words for kind, words in _WHO.items() if kind in kinds), "it is a matter of rates and maps")
     in_dark = any(r["capture"] in dark for r in found)
     return f"{who}; {'it is there in the dark, too' if in_dark else 'it shows in light alone'}"
 

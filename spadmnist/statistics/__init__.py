@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -57,6 +57,8 @@ class Statistic(Plugin, abstract=True):
     modalities: ClassVar[tuple[str, ...]] = ()  # of "tr", "str", "qis", "counts"
     costly: ClassVar[bool] = False  # left out where very many models are looked at for the first time
     unit: ClassVar[str] = "1"  # of its values
+    # whose detections it sets beside each other: a pixel's own, those close by or far apart, all as one; "": it counts
+    among: ClassVar[Literal["", "pixel", "neighbours", "far", "array"]] = ""
 
     def reduce(self, recording: Recording) -> Summary | None:
         """The summary of a recording, or None where it has nothing to say of it. The number of cells depends on the

@@ -35,6 +35,7 @@ class Autocorrelation(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    among = "pixel"
     unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:

@@ -299,6 +299,7 @@ class PixelFano(Statistic):
     """
 
     modalities = _ALL
+    among = "pixel"
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -347,6 +348,7 @@ class ArrayFano(Statistic):
     """
 
     modalities = _ALL
+    among = "array"
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:

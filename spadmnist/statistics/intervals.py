@@ -52,6 +52,7 @@ class EdgeIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    among = "pixel"
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -90,6 +91,7 @@ class Intervals(Statistic):
     """
 
     modalities = ("tr",)
+    among = "pixel"
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -122,6 +124,7 @@ class FineIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    among = "pixel"
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -156,6 +159,7 @@ class Rescaled(Statistic):
     """
 
     modalities = ("tr",)
+    among = "pixel"
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -181,6 +185,7 @@ class RescaledLag(Statistic):
     """
 
     modalities = ("tr",)
+    among = "pixel"
     unit = "standard errors"
 
     def reduce(self, recording: Recording) -> Summary | None:

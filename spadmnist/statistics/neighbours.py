@@ -36,6 +36,7 @@ class Neighbours(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    among = "neighbours"
     unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -68,6 +69,7 @@ class FarPairs(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    among = "far"
     unit = "standard deviations"
     costly = True
 

@@ -113,6 +113,7 @@ class Trend(Statistic):
     """
 
     modalities = _ALL
+    among = "array"
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -165,6 +166,7 @@ class SlowSeries(Statistic):
     """
 
     modalities = _ALL
+    among = "pixel"
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -227,6 +229,7 @@ class HotSeries(Statistic):
     """
 
     modalities = _ALL
+    among = "pixel"
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:

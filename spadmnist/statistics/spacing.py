@@ -19,6 +19,7 @@ class Spacing(Statistic):
     """
 
     modalities = ("tr", "str")
+    among = "array"
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -50,6 +51,7 @@ class Multiplicity(Statistic):
     """
 
     modalities = ("tr", "str")
+    among = "neighbours"
     unit = "clusters"
 
     def reduce(self, recording: Recording) -> Summary | None:

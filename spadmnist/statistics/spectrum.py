@@ -32,6 +32,7 @@ class Spectrum(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    among = "array"
     unit = "mean power"
 
     def reduce(self, recording: Recording) -> Summary | None:
