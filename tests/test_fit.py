@@ -145,6 +145,24 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     assert high < 0.9 * wide
 
 
+def test_a_number_that_nothing_follows_stays_as_it_is():
+    """Of two numbers the cells follow one; the other, of a slope that is hardly one, is not thrown to its bound."""
+    rng = np.random.default_rng(8)
+    cell = ("one", "cells")
+    dials = tuple(candidates.Dial("any", name, "", 1e-4, 0.5, 0.0) for name in "ab")
+    slopes = np.stack([np.full(30, 2.0), np.linspace(-1e-3, 1e-3, 30)], axis=1)
+    z = 0.5 * slopes[:, 0] + rng.standard_normal(30)
+    own = {cell: rng.standard_normal((64, 30))}
+    state = fit.State({}, None, {}, {}, {}, {}, {cell: z}, own, [])
+    values = {dial.key: 0.01 for dial in dials}
+    before = settling.Settled(
+        dials, settling.point_of(dials, values), np.eye(2), {cell: z}, {cell: slopes}, 0.0, dict(values)
+    )
+    found = settling.follow(_Law(None), state, dials, values, lambda v: v, before=before)
+    assert found.values["any", "b"] == pytest.approx(0.01)
+    assert np.log(found.values["any", "a"] / 0.01) == pytest.approx(-0.5, abs=5 * 0.5 / np.sqrt(30))
+
+
 PLAN = """format: spadmnist-measurement/1
 name: lab
 layout: {rows: 8, columns: 8}

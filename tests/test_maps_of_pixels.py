@@ -56,6 +56,30 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     assert np.all(np.abs(expected[hot] - counts[hot]) < 0.25 * counts[hot])
 
 
+def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
+    """2 counts a pixel, of one in ten 12: drawn maps have as many of each kind as the data, whatever the law is."""
+    (tmp_path / "plan.yaml").write_text(CAPTURES.replace(str(FRAMES), "10000"))
+    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    rates = np.full(SIDE * SIDE, 200.0)
+    rates[::10] = 1200.0
+    truth = with_values(sensor, {("dark_counts", "rate"): rates})
+    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
+    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
+    change = next(c for c in changes(sensor) if c.name == "per_pixel dark_counts.rate")
+    map_ = mapping.settle_maps(bench, {}, [change], {"dark": 1.0})[("dark_counts", "rate")]
+    counts = bench.seen["dark"].counts
+    assert counts is not None and map_.likely is not None
+    rng = np.random.default_rng(6)
+    drawn = np.stack([rng.poisson(map_.values(rng.standard_normal(SIDE**2)) * 0.01) for _ in range(200)])
+    for least in (1, 5):  # within 4 here; a normal law with long tails has 19 and 17 too few and too many
+        seen, usual = int((counts >= least).sum()), float((drawn >= least).sum(axis=1).mean())
+        assert abs(seen - usual) < 12
+    hot = rates > 1000
+    assert float(map_.values()[hot].mean()) > 900 and float(map_.values()[~hot].mean()) < 260
+
+
 @pytest.mark.parametrize("fraction", [1.0, 0.6])
 def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_path: Path) -> None:
     (tmp_path / "sensor.yaml").write_text(SENSOR.replace("200 Hz", "100 kHz"))

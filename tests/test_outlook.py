@@ -159,8 +159,12 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
     many = diagnose._alternatives(bench, state, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
+    # another value and a map of it are two things
+    two = [replace(near, change=change_of(bench, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")]
+    assert [a["change"] for a in diagnose._alternatives(bench, state, best, [], [best, *two])] == ["set", "per_pixel"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("truth", "name", "values", "alike"),
     [

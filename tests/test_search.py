@@ -47,6 +47,23 @@ def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
     assert one.values["source_drift", "slope"] * one.times == pytest.approx(-0.3, abs=0.1)
 
 
+def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
+    """Crosstalk cannot be negative, a drift can."""
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    cell = ("flat", "fine_intervals")
+    moved = Moved({cell: np.full(len(state.residuals[cell]), 1.0)}, {}, {})
+    trace = bench.template(state, moved)[cell]
+    for name, signed in (("add crosstalk", False), ("add source_drift", True)):
+        change = change_of(bench, name)
+        one = Tried(change, {d.key: d.low for d in change.dials}, moved, 0.0, 1.0)
+        marks = []
+        for sign in (1, -1):
+            state.residuals[cell] = sign * 10.0 * trace / math.sqrt(float(trace @ trace))
+            marks.append(float(look._marks(state, [one])[0][0]))
+        assert marks[0] > 3 and marks[1] == (pytest.approx(marks[0]) if signed else 0.0)
+
+
 # --- faint effects -----------------------------------------------------------------------------------------------
 
 
