@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
-from spadmnist.criticism import candidates, compare, diagnose, fit, outlook, search
+from spadmnist.criticism import candidates, chance, compare, diagnose, fit, outlook, search
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import canonical
 from spadmnist.criticism.candidates import Key
 from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.search import Tried
+from spadmnist.criticism.tried import Tried
 
 # --- which capture would tell ------------------------------------------------------------------------------------
 
@@ -71,13 +71,13 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     found, hidden = outlook.upper_limits(look, state, tried)
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
-    return limit, [search.along(bench, state, t.moved)[1] for t in tried]
+    return limit, [chance.along(bench, state, t.moved)[1] for t in tried]
 
 
 def test_what_would_have_been_seen_is_seen(lab):
     """Twice the limit stands out beyond what a right model shows by chance, and the limit is no longer so low."""
-    usual, chance = limit_of(bench_of(lab()), "crosstalk")
-    assert 0 < usual < 0.05 and max(chance) < 4  # of six shapes of a trace
+    usual, along = limit_of(bench_of(lab()), "crosstalk")
+    assert 0 < usual < 0.05 and max(along) < 4  # of six shapes of a trace
     for seed in (1, 2):
         bench = bench_of(lab(f"    crosstalk: {{probability: {2 * usual}}}\n", seed=seed))
         limit, along = limit_of(bench, "crosstalk")
@@ -212,5 +212,5 @@ def test_no_chance_is_none_at_all(lab):
     assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
     course = course_of.begun(bench_of((sensor, data)))
     one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
-    significance, chance = course.search.calibrated(course.state, [one], replace(one, gain=1e12))
-    assert 0 < chance < 1e-100 and math.isfinite(significance)
+    significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e12))
+    assert 0 < p < 1e-100 and math.isfinite(significance)

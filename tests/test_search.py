@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
 
+from spadmnist.criticism import chance, fit, recordings
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import fit, recordings, search
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.search import Search, Tried
+from spadmnist.criticism.search import Search
+from spadmnist.criticism.tried import Tried
 from spadmnist.recording import Capture, Light
 
 CELL, OTHER = ("flat", "a"), ("flat", "b")
@@ -50,7 +51,7 @@ def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
 def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
     """Crosstalk cannot be negative, a drift can."""
     bench = bench_of(lab())
-    state, look = bench.state({}), quiet(bench)
+    state = bench.state({})
     cell = ("flat", "fine_intervals")
     moved = Moved({cell: np.full(len(state.residuals[cell]), 1.0)}, {}, {})
     trace = bench.template(state, moved)[cell]
@@ -60,7 +61,7 @@ def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
         marks = []
         for sign in (1, -1):
             state.residuals[cell] = sign * 10.0 * trace / math.sqrt(float(trace @ trace))
-            marks.append(float(look._marks(state, [one])[0][0]))
+            marks.append(float(chance.marks_of(bench, state, [one])[0][0]))
         assert marks[0] > 3 and marks[1] == (pytest.approx(marks[0]) if signed else 0.0)
 
 
@@ -170,12 +171,12 @@ def test_p_values_of_values_that_differ(joined: bool) -> None:
         values = rng.standard_normal((33, 16))
         if joined:
             values = values * np.exp(0.05 * rng.standard_normal((33, 1)))
-        chances.append(search._spread_chance(values[0], values[1:]))
+        chances.append(chance.of_spread(values[0], values[1:]))
     assert np.mean(np.array(chances) < 0.01) < 0.02
     # and columns of which an oracle sees 5.7 sigma are seen in most of 200 arrays
     far = math.sqrt(5.7**2 / 16)
     shifted = [
-        search._spread_chance(rng.standard_normal(16) + far * rng.choice([-1, 1], 16), rng.standard_normal((32, 16)))
+        chance.of_spread(rng.standard_normal(16) + far * rng.choice([-1, 1], 16), rng.standard_normal((32, 16)))
         for _ in range(200)
     ]
     assert np.mean(np.array(shifted) < 1e-2) > 0.6

@@ -14,7 +14,8 @@ from spadmnist.criticism import candidates
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.candidates import Change, Key
 from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.search import Search, Tried
+from spadmnist.criticism.search import Search
+from spadmnist.criticism.tried import Tried
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
 

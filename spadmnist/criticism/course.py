@@ -15,8 +15,9 @@ from .answer import Step, Value, title
 from .candidates import Change, Key, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
 from .ladder import errors_of, row
-from .search import Search, Tried
+from .search import Search
 from .settling import Settled
+from .tried import Tried
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
 _SAME = 0.35  # of a coordinate: so far slopes hold

@@ -16,14 +16,15 @@ from joblib import Parallel
 
 from ..measurement import Measurement
 from ..sensor import Sensor
+from . import chance, fit, outlook, recordings, setups
 from . import compare as comparing
-from . import fit, outlook, recordings, setups
 from .answer import Diagnosis, Step, Value, plain, title
 from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
 from .findings import nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
-from .search import Tried, alike
+from .search import alike
+from .tried import Tried
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself
@@ -76,7 +77,7 @@ def _diagnosed(
             bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
             tried = search.scan(course.state, everywhere=True, known=tried)
             trace = _TRACE if not course.steps else _LATER_TRACE
-            if search.chance(course.state, tried, course.values) > trace:
+            if chance.of_any(bench, course.state, tried, course.values, search.lines(course.state)) > trace:
                 break
         if failed and all(b.cell[0] == "" for b in failed):
             found, others, wanted = _by_setup(course)
@@ -101,7 +102,7 @@ def _diagnosed(
         bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
         refined = [search.refine(course.state, one) for one in worth]
         best = search.preferred(refined)
-        significance, p = search.calibrated(course.state, tried, best)
+        significance, p = chance.of_best(bench, course.state, tried, best)
         if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (LEAST_GAIN if failed else _TRACE_GAIN):
             break
         before, earlier = course.state, course.kept()

@@ -17,8 +17,8 @@ from .candidates import Change, Key, changes
 from .course import Course, accept, begun, errors_known, material, settle_all
 from .findings import nuisances, remainder, traces
 from .fit import Bench, Moved
-from .search import Tried
 from .settling import Settled
+from .tried import Tried
 
 
 def fitted(

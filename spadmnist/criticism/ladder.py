@@ -11,7 +11,7 @@ import numpy as np
 from . import fit
 from .answer import plain, title
 from .fit import RATES, Bench, Cell, Moved, State
-from .search import Tried
+from .tried import Tried
 
 _CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model
 

@@ -16,9 +16,11 @@ from ..recording import Capture, Light, Recording
 from . import fit, recordings
 from .answer import plain
 from .candidates import Change
+from .chance import along
 from .fit import Bench, Seen, Sensors, State
-from .search import Search, Tried, along
+from .search import Search
 from .setups import Explanation
+from .tried import Tried
 
 _RECORDINGS = 16  # of a capture that nobody has taken yet
 _MOST_EVENTS = 6e5  # of it

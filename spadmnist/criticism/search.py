@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,11 @@ from ..errors import SpadError
 from ..sensor import Sensor
 from . import fit, mapping, settling
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
+from .chance import LEAST_P, of_map
 from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
 from .settling import Settled
-
-Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
+from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
@@ -36,7 +36,6 @@ _TURNS = 8  # phases that are tried first
 _NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _SHOWS = 0.01  # of the square of a trace, in a capture that tells it
-_MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
@@ -44,7 +43,7 @@ _FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
 _POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
 _LINE = 0.25  # of the square of a trace, in one cell of a spectrum
 _LEAST_BOOST = 1.5  # worth it
-_SILENT, _RAISED = 6.0, 12.0  # standard deviations of a trace that is none; how much stronger is tried then
+_SILENT = 6.0  # standard deviations of a trace that is none
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
@@ -53,61 +52,6 @@ _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more i
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
-_LEAST_P = 1e-300
-_SURER, _JOINED = 1.1, 1.6  # of a variance of squares: to be sure, and from where on values move together
-EACH = 9.0  # in chi square: what a further number must be worth
-
-
-@dataclass
-class Tried:
-    """A candidate at some values: what it does, and by how much it brings the data nearer.
-
-    gain: in chi square; times: the strength, relative to that of `values`, at which it is largest; phases: of what
-    begins anew in every capture; intervals: 95 % of numbers that `settled` does not hold.
-    """
-
-    change: Change
-    values: dict[Key, Any]
-    moved: Moved
-    gain: float
-    times: float
-    sensors: Sensors | None = None
-    power: float = 1.0  # what it does grows with this power of its strength
-    chance: float | None = None  # p-value, where it is known by itself
-    settled: Settled | None = None
-    maps: dict[Key, mapping.Map] | None = None
-    residuals: dict[Cell, np.ndarray] | None = None
-    state: State | None = None  # of this model, where it was needed
-    phases: Phases = field(default_factory=dict)
-    chips: bool = False  # chance decides which pixels it hits
-    faint: bool = False  # settled by what a stronger one does
-    more: tuple[Change, ...] = ()  # maps that only make sense together
-    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
-    seen: set[str] = field(default_factory=set)  # captures in which it was simulated
-
-    @property
-    def changes(self) -> list[Change]:
-        return [self.change, *self.more]
-
-    def cost(self, state: State) -> float:
-        """What it leaves of the totals, and what a number costs."""
-        left = (self.residuals or state.residuals)[RATES]
-        return float(left @ left) + EACH
-
-    @property
-    def signed(self) -> bool:
-        return any(d.low < 0 or self.change.kind == "set" for d in self.change.strengths)
-
-    def scaled(self) -> dict[Key, Any]:
-        """The values at the strength that suits them."""
-        out = dict(self.values)
-        factor = math.copysign(abs(self.times) ** (1 / self.power), self.times)
-        for dial in self.change.strengths:
-            if dial.key in out:
-                out[dial.key] = dial.scaled(float(out[dial.key]), factor)
-        if len(self.change.strengths) > 1:  # directions side by side: the others' share comes from the fit
-            out = {**dict(self.change.fixed), **out}
-        return out
 
 
 class Search:
@@ -207,7 +151,7 @@ class Search:
     def begun(self, state: State, change: Change) -> list[dict[Key, Any]]:
         """The values at which a candidate is tried first."""
         tries = self._told_apart(change, templates(change))
-        narrow = _lines_of(change)
+        narrow = lines_of(change)
         if len(narrow) != 1:
             return tries
         dial = narrow[0]
@@ -257,7 +201,7 @@ class Search:
                 continue
             gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
             one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases, seen=set(state.made))
-            for dial in _lines_of(change):
+            for dial in lines_of(change):
                 f = float(tried[dial.key])
                 error = next((line.error for line in self.lines(state) if line.frequency == f), dial.high)
                 one.intervals[dial.key] = max(f - 1.96 * error, dial.low), min(f + 1.96 * error, dial.high)
@@ -299,14 +243,14 @@ class Search:
             some = () if everywhere else self.telling(state)
             seen = set.intersection(*(t.seen for t in known)) if known else set()
             old = self._still(state, tries, known) if everywhere or set(some) <= seen else []
-            tries = [t for t in tries if not any(_same(one, *t) for one in old)]
+            tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = self._looked_at(state, tries, some)
             # what leaves no trace yet may do so when it is stronger
             faint = [t for t in out if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
-            silent = [(t.change, up) for t in faint if (up := _stronger(t))]
+            silent = [(t.change, up) for t in faint if (up := stronger(t))]
             found = self._looked_at(state, silent, some) if silent else []
-            raised = {(one.change.name, _shape(one)) for one in found}
-            again = [t for t in faint if (t.change.name, _shape(t)) in raised]
+            raised = {(one.change.name, shape_of(one)) for one in found}
+            again = [t for t in faint if (t.change.name, shape_of(t)) in raised]
             out = old + [t for t in out if not any(t is one for one in again)] + found
         else:
             out = []
@@ -326,7 +270,7 @@ class Search:
         """Those of `known` that may be tried still and that the data do not resemble, at the strength that suits."""
         out = []
         for one in known:
-            if one.change.phases or not any(_same(one, *t) for t in tries):
+            if one.change.phases or not any(is_same(one, *t) for t in tries):
                 continue
             now = replace(one)
             now.gain, now.times = self.line_search(state, one.moved, one.signed)
@@ -339,55 +283,12 @@ class Search:
         failed = fit.failing(fit.blocks(self.bench, state, state.residuals))
         return bool(failed) and all(b.cell[0] == "" for b in failed)
 
-    def chance(self, state: State, tried: Sequence[Tried], values: dict[Key, Any]) -> float:
-        """p-value of what resembles the trace of any candidate most, maps among them, if the model is right."""
-        marks, largest = self._marks(state, tried)
-        p = _gumbel_tail(largest, float(marks.max())) if marks.any() else 1.0
-        levels = mapping.levels_of(self.bench, state)
-        maps = [self.map_chance(state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
-        swings = [line.p for line in self.lines(state)]
-        return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
-
-    def map_chance(self, state: State, change: Change, values: dict[Key, Any], levels: dict[str, float]) -> float:
-        """p-value of a map: pixels (rows, columns) that differ alike in all captures that could show it."""
-        try:
-            told = mapping.information(self.bench, values, change, levels)
-        except (SpadError, np.linalg.LinAlgError):
-            return 1.0
-        name = mapping.CODES if change.per == "code" else _MAP
-        tells = {id: float(x.sum()) for id, x in told.items()}
-        cells = [(id, name) for id in tells if tells[id] > 0 and (id, name) in state.residuals]
-        if cells:
-            size = max(len(state.residuals[cell]) for cell in cells)
-            cells = [cell for cell in cells if len(state.residuals[cell]) == size]
-        if not cells:
-            return 1.0
-        weight = np.sqrt([tells[id] for id, _ in cells])
-        weight /= math.sqrt(float(weight @ weight))
-        z = sum(w * state.residuals[cell] for w, cell in zip(weight, cells, strict=True))
-        own = sum(w * state.own[cell] for w, cell in zip(weight, cells, strict=True))
-        if change.per == "code":
-            parts = mapping.code_periods(size)
-            return min(1.0, len(parts) * min(_spread_chance(z[part], own[:, part]) for part in parts.values()))
-        groups = mapping.groups_of(state.sensors.one, change.per)
-        count = np.sqrt(np.bincount(groups))
-        data = np.bincount(groups, z) / count
-        usual = np.stack([np.bincount(groups, row) / count for row in own])
-        chance = _spread_chance(data, usual)
-        if change.per != "pixel":
-            return chance
-        # few detections in most pixels: then the law of their numbers tells more than the scores of each
-        best = max(tells, key=lambda id: tells[id])
-        laws = [(best, name) for name in _LAWS if (best, name) in state.residuals]
-        others = [state.nulls[cell].chance(state.residuals[cell])[0] for cell in laws]
-        return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
-
     def telling(self, state: State) -> list[str]:
         """Up to three captures that show best what is wrong: a dark one, and those with the least likely checks."""
         worst = dict.fromkeys(state.made, 0.0)
         for block in fit.blocks(self.bench, state, state.residuals):
             if block.cell[0] in worst:  # what one check in a hundred is by chance says little, but more than nothing
-                surprise = -math.log10(max(block.p, _LEAST_P))
+                surprise = -math.log10(max(block.p, LEAST_P))
                 worst[block.cell[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
         ids = sorted(worst, key=lambda id: -worst[id])
         dark = [id for id in ids if self.bench.seen[id].capture.light.dark][:1]
@@ -426,7 +327,7 @@ class Search:
             else:
                 one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, one.moved))
                 if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
-                    one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, _LEAST_P) / 2)) ** 2)
+                    one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, LEAST_P) / 2)) ** 2)
             kept.append(one)
         return sorted(kept, key=lambda t: -t.gain)
 
@@ -459,7 +360,7 @@ class Search:
             if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
                 continue
             sensors = sensors.changed({}, self.phases)
-            chance = min(self.map_chance(state, c, values, levels) for c in group)
+            chance = min(of_map(self.bench, state, c, values, levels) for c in group)
             if chance > _LEAST_CHANCE:
                 continue
             nothing = Moved({}, {}, {})
@@ -556,7 +457,7 @@ class Search:
             one.residuals = self.bench.residuals(state, one.moved, noisy=True)
             return one
         given = one.scaled()
-        narrow = _lines_of(one.change)
+        narrow = lines_of(one.change)
         dials = [d for d in one.change.dials if d.key in given and not d.whole and d not in narrow]
         if one.change.phases:
             given = self.tuned(state, one, given)
@@ -627,9 +528,9 @@ class Search:
         spectra = [t for cell, t in trace.items() if cell in state.nulls and state.nulls[cell].law == "exponential"]
         if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
             return 1.0, 1.0  # a line stands out by itself, and no slope says where
-        if size > _STRONG or one.moved.even or not strengths or any(_is_edge(d) for d in strengths):
+        if size > _STRONG or one.moved.even or not strengths or any(is_edge(d) for d in strengths):
             return 1.0, 1.0
-        room = min(_room(d, float(given[d.key])) for d in strengths)
+        room = min(room_of(d, float(given[d.key])) for d in strengths)
         boost = min((_STRONG / max(size, 1e-3)) ** (1 / one.power), room)
         if boost < _LEAST_BOOST:
             return 1.0, 1.0
@@ -652,7 +553,7 @@ class Search:
                 continue
             if dial in one.change.shapes:
                 found, _ = self._nearest(state, one, found, dial, _PROBES)
-            elif _is_edge(dial):
+            elif is_edge(dial):
                 for _ in range(_MOVES):  # a wall is not seen from afar: step by step, first long ones
                     found, moved = self._nearest(state, one, found, dial, _FAR)
                     if not moved:
@@ -707,52 +608,6 @@ class Search:
         lit = [id for id, seen in self.bench.seen.items() if not seen.capture.light.dark]
         return self.bench.moved(state, models, _SWINGING, lit)
 
-    def calibrated(self, state: State, tried: Sequence[Tried], best: Tried) -> tuple[float, float]:
-        """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
-        if best.chance is not None:
-            return float(stats.norm.isf(max(best.chance, _LEAST_P) / 2)), best.chance
-        marks, largest = self._marks(state, [best, *tried])
-        # what is far outside is no matter of the linear law: the gain itself, in the same measure
-        keys = list(state.residuals)
-        t = stacked(self.bench.template(state, best.moved), keys)
-        own = np.concatenate([state.own[k] for k in keys], axis=1) @ t
-        typical = float(np.mean(own**2) / max(float(t @ t), 1e-12))
-        score = max(float(marks[0]), math.sqrt(max(best.gain, 0.0) / max(typical, 0.5))) if t.any() else 0.0
-        return score, max(_gumbel_tail(largest, score), _LEAST_P)
-
-    def _marks(self, state: State, tried: Sequence[Tried]) -> tuple[np.ndarray, np.ndarray]:
-        """((candidates,) how much the data resemble the trace of each, (recordings,) the most that the model's own do).
-
-        In standard deviations of the latter; 0 of a candidate without a trace.
-        """
-        marks, largest = np.zeros(len(tried)), np.zeros(len(state.own[RATES]))
-        for n, one in enumerate(tried):
-            _, data, own = along(self.bench, state, one.moved)
-            if one.signed:
-                data, own = abs(data), np.abs(own)
-            largest = np.maximum(largest, own)
-            marks[n] = max(data, 0.0)  # less of it than nothing is none of what can only be there
-        return marks, largest
-
-
-def along(bench: Bench, state: State, moved: Moved) -> tuple[float, float, np.ndarray]:
-    """(size of a model's trace, how much of it the data have, (recordings,) the model's own), in standard deviations.
-
-    Of what the model's own recordings have of it. All 0 where there is no trace.
-    """
-    keys = list(state.residuals)
-    t = stacked(bench.template(state, moved), keys)
-    own = np.concatenate([state.own[k] for k in keys], axis=1)
-    norm = math.sqrt(float(t @ t))
-    if norm <= 0:
-        return 0.0, 0.0, np.zeros(len(own))
-    own = own @ t / norm
-    # many cells may scatter less together than they would by themselves; the score of a single one is what it is, even
-    # where chance fills it so seldom that it hardly scatters
-    cells = norm**4 / float(np.sum(t**4))
-    spread = max(float(own.std()), 0.5 + 0.5 / math.sqrt(cells))
-    return norm / spread, float(stacked(state.residuals, keys) @ t) / norm / spread, own / spread
-
 
 def alike(gain: float) -> float:
     """By how much less than the best another candidate may gain that is as good."""
@@ -773,40 +628,6 @@ def _scattered(sensors: Sensors, change: Change, sigma: float) -> Sensors:
     return Sensors(of, sensors.one, alike=False, typical=sensors.usual)
 
 
-def _gumbel_tail(largest: np.ndarray, mark: float) -> float:
-    """p-value of a mark as the largest of many; largest: (recordings,) those of the model itself."""
-    location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
-    return float(stats.gumbel_r.sf(mark, location, max(scale, 0.25)))
-
-
-def _spread_chance(data: np.ndarray, usual: np.ndarray) -> float:
-    """p-value of values that differ; usual: (recordings, values) those of the model itself."""
-    square, squares = float(np.mean(data**2)), np.mean(usual**2, axis=1)
-    mean, variance = float(squares.mean()), float(squares.var(ddof=1))
-    apart = 2 * mean**2 / data.size  # of values that have nothing to do with each other
-    # a few recordings tell a variance badly: where they do not contradict, it is that of such values
-    variance = _SURER * apart if variance < _JOINED * apart else variance * (1 + math.sqrt(5 / len(squares)))
-    shape = mean**2 / max(variance, 1e-12)
-    p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
-    wide = max(1.0, float(np.sqrt(mean)))
-    p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
-    return min(1.0, 2 * min(p_sum, p_cell))
-
-
-def _stronger(one: Tried) -> dict[Key, Any] | None:
-    """The values of a candidate at several times its strength, or nothing where it cannot be stronger."""
-    out = dict(one.values)
-    for dial in one.change.strengths:
-        if dial.key in out and one.change.kind == "add" and out[dial.key] != dial.off and not dial.lacks:
-            out[dial.key] = dial.scaled(float(out[dial.key]), _RAISED)
-    return out if out != one.values else None
-
-
-def _same(one: Tried, change: Change, tried: Mapping[Key, Any]) -> bool:
-    """Is it this change, at these shapes?"""
-    return one.change.name == change.name and all(one.values.get(d.key) == tried.get(d.key) for d in change.shapes)
-
-
 def _opposite(state: State, one: Tried) -> Sensors | None:
     """The model with a strength of the other sign; None where there is none."""
     if one.maps is not None or one.change.kind != "add":
@@ -819,36 +640,6 @@ def _opposite(state: State, one: Tried) -> Sensors | None:
     if all(one.values[key] == x for key, x in turned.items()):
         return None
     return state.sensors.changed({**one.values, **turned}, one.phases, one.chips)
-
-
-def _room(dial: Dial, value: float) -> float:
-    """How much stronger a strength can be."""
-    off = dial.off or 0.0
-    bound = dial.high if value > off else dial.low
-    return (bound - off) / (value - off) if value != off else 1.0
-
-
-def _shape(one: Tried) -> tuple[Any, ...]:
-    """What tells a candidate's templates apart, but for their strength."""
-    return tuple(one.values.get(dial.key) for dial in one.change.shapes)
-
-
-def _is_edge(dial: Dial) -> bool:
-    """A strength that is a time, or what lacks of one: nothing grows with it in proportion, an edge moves."""
-    return dial.lacks or (dial.unit == "s" and dial.off is not None)
-
-
-def _lines_of(change: Change) -> list[Dial]:
-    """Frequencies of what swings: known to a fraction of one over the exposure, or not at all."""
-    return [d for d in change.shapes if d.unit == "Hz"] if change.phases else []
-
-
-def is_pattern(one: Tried) -> bool:
-    """Rows, columns, or a shape of the light over the array?"""
-    change = one.change
-    if change.kind != "add":
-        return False
-    return change.per in ("row", "column") or getattr(Effect.registry.find(change.effect), "stage", "") == "light"
 
 
 def _indicators(groups: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ from .answer import plain
 from .candidates import changes, templates
 from .compare import FALSE_ALARM
 from .fit import RATES, Bench, Moved, State
-from .search import EACH, Search, Tried
+from .search import Search
+from .tried import EACH, Tried
 
 ALIKE = 6.0  # explanations so near each other cannot be told apart
 _VERIFIED = 3  # rivals that are simulated

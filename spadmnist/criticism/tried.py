@@ -1,0 +1,117 @@
+"""A candidate at some values: what it does to a model, and by how much it brings the data nearer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..effects import Effect
+from . import mapping
+from .candidates import Change, Dial, Key
+from .fit import RATES, Cell, Moved, Sensors, State
+from .settling import Settled
+
+Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
+
+EACH = 9.0  # in chi square: what a further number must be worth
+_RAISED = 12.0  # times as strong is what is tried where a trace is none
+
+
+@dataclass
+class Tried:
+    """A candidate at some values: what it does, and by how much it brings the data nearer.
+
+    gain: in chi square; times: the strength, relative to that of `values`, at which it is largest; phases: of what
+    begins anew in every capture; intervals: 95 % of numbers that `settled` does not hold.
+    """
+
+    change: Change
+    values: dict[Key, Any]
+    moved: Moved
+    gain: float
+    times: float
+    sensors: Sensors | None = None
+    power: float = 1.0  # what it does grows with this power of its strength
+    chance: float | None = None  # p-value, where it is known by itself
+    settled: Settled | None = None
+    maps: dict[Key, mapping.Map] | None = None
+    residuals: dict[Cell, np.ndarray] | None = None
+    state: State | None = None  # of this model, where it was needed
+    phases: Phases = field(default_factory=dict)
+    chips: bool = False  # chance decides which pixels it hits
+    faint: bool = False  # settled by what a stronger one does
+    more: tuple[Change, ...] = ()  # maps that only make sense together
+    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    seen: set[str] = field(default_factory=set)  # captures in which it was simulated
+
+    @property
+    def changes(self) -> list[Change]:
+        return [self.change, *self.more]
+
+    def cost(self, state: State) -> float:
+        """What it leaves of the totals, and what a number costs."""
+        left = (self.residuals or state.residuals)[RATES]
+        return float(left @ left) + EACH
+
+    @property
+    def signed(self) -> bool:
+        return any(d.low < 0 or self.change.kind == "set" for d in self.change.strengths)
+
+    def scaled(self) -> dict[Key, Any]:
+        """The values at the strength that suits them."""
+        out = dict(self.values)
+        factor = math.copysign(abs(self.times) ** (1 / self.power), self.times)
+        for dial in self.change.strengths:
+            if dial.key in out:
+                out[dial.key] = dial.scaled(float(out[dial.key]), factor)
+        if len(self.change.strengths) > 1:  # directions side by side: the others' share comes from the fit
+            out = {**dict(self.change.fixed), **out}
+        return out
+
+
+def is_same(one: Tried, change: Change, tried: Mapping[Key, Any]) -> bool:
+    """Is it this change, at these shapes?"""
+    return one.change.name == change.name and all(one.values.get(d.key) == tried.get(d.key) for d in change.shapes)
+
+
+def shape_of(one: Tried) -> tuple[Any, ...]:
+    """What tells a candidate's templates apart, but for their strength."""
+    return tuple(one.values.get(dial.key) for dial in one.change.shapes)
+
+
+def stronger(one: Tried) -> dict[Key, Any] | None:
+    """The values of a candidate at several times its strength, or nothing where it cannot be stronger."""
+    out = dict(one.values)
+    for dial in one.change.strengths:
+        if dial.key in out and one.change.kind == "add" and out[dial.key] != dial.off and not dial.lacks:
+            out[dial.key] = dial.scaled(float(out[dial.key]), _RAISED)
+    return out if out != one.values else None
+
+
+def room_of(dial: Dial, value: float) -> float:
+    """How much stronger a strength can be."""
+    off = dial.off or 0.0
+    bound = dial.high if value > off else dial.low
+    return (bound - off) / (value - off) if value != off else 1.0
+
+
+def is_edge(dial: Dial) -> bool:
+    """A strength that is a time, or what lacks of one: nothing grows with it in proportion, an edge moves."""
+    return dial.lacks or (dial.unit == "s" and dial.off is not None)
+
+
+def lines_of(change: Change) -> list[Dial]:
+    """Frequencies of what swings: known to a fraction of one over the exposure, or not at all."""
+    return [d for d in change.shapes if d.unit == "Hz"] if change.phases else []
+
+
+def is_pattern(one: Tried) -> bool:
+    """Rows, columns, or a shape of the light over the array?"""
+    change = one.change
+    if change.kind != "add":
+        return False
+    return change.per in ("row", "column") or getattr(Effect.registry.find(change.effect), "stage", "") == "light"
