@@ -12,7 +12,7 @@ import pytest
 from scipy import integrate, stats
 
 from spadmnist import config
-from spadmnist.criticism import candidates, likelihood
+from spadmnist.criticism import candidates, likelihood, maxima
 from spadmnist.effects import Conditions
 from spadmnist.light import photons_from_irradiance
 from spadmnist.recording import Capture, Light, Recording
@@ -198,7 +198,7 @@ def test_a_start_saves_time_and_changes_nothing(sensor: Sensor, monkeypatch: pyt
 def test_a_number_that_nothing_follows_is_left_alone(sensor: Sensor) -> None:
     """A tail without weight."""
     bounds = np.array([[-5.0, -5.0], [5.0, 5.0]])
-    top = likelihood._topped(lambda u: -(u[0] ** 2), np.array([1.0, 1.0]), np.ones(2), bounds)
+    top = maxima.topped(lambda u: -(u[0] ** 2), np.array([1.0, 1.0]), np.ones(2), bounds)
     assert top is not None
     assert top.tells.tolist() == [True, False]
     assert top.u == pytest.approx([0.0, 1.0], abs=1e-6)
@@ -230,7 +230,7 @@ def test_where_a_fall_comes_to_so_much(fallen: Callable[[float], float], where: 
         asked.append(x)
         return fallen(x)
 
-    assert likelihood._reached(of, 2.0, first, 50.0, 0.01)[2] == pytest.approx(where, rel=0.02)
+    assert maxima.reached(of, 2.0, first, 50.0, 0.01)[2] == pytest.approx(where, rel=0.02)
     assert len(asked) < 25
 
 
