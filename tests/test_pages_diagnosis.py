@@ -259,6 +259,16 @@ def test_a_misfit_that_rises_does_not_fall(tmp_path: Path) -> None:
     assert "The misfit went from 61.2 to 70" in parts.text
 
 
+def test_where_the_totals_alone_were_wrong_their_error_falls(tmp_path: Path) -> None:
+    ladder = [rung("start", 1.01), rung("+ background_light", 1.03)]
+    ladder[0]["errors"] |= {"linearity": 0.0142, "map": 0.002}
+    ladder[1]["errors"] |= {"linearity": 0.0006, "map": 0.003}
+    _, parts = written(answer_of(before=1.01, after=1.03, ladder=ladder), tmp_path)
+    assert "for it knows no totals: the error of the linearity fell from 1.42 % to 0.06 %." in parts.text
+    _, parts = written(answer_of(ladder=ladder), tmp_path)
+    assert "totals:" not in parts.text
+
+
 def test_the_effect_of_a_plug_in_that_is_not_at_hand(tmp_path: Path) -> None:
     step = Step(change_of("add", "of_a_plug_in"), {"strength": Value(0.25, 0.2, 0.3)}, 1.0, 8.0, "mean rate +1%")
     limits = [{"effect": "of_a_plug_in", "parameter": "strength", "upper_limit_95": 0.5}]
