@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from test_pages import EVIL, Parts, decoded, marks, near, needs_a_browser, screenshot, summary_of
 
 from spadmnist import cli, measurement, pages
+from spadmnist.criticism import answer
 from spadmnist.criticism import diagnose as criticism
 from spadmnist.criticism.answer import Diagnosis, Step, Trace, Value
 from spadmnist.criticism.candidates import Change
@@ -267,6 +268,15 @@ def test_where_the_totals_alone_were_wrong_their_error_falls(tmp_path: Path) -> 
     assert "for it knows no totals: the error of the linearity fell from 1.42 % to 0.06 %." in parts.text
     _, parts = written(answer_of(ladder=ladder), tmp_path)
     assert "totals:" not in parts.text
+
+
+def test_what_would_look_the_same_is_said(tmp_path: Path) -> None:
+    said = "But: a dead time that differs from event to event"
+    for name, there in (("jitter", True), ("crosstalk", False)):
+        step = Step(change_of("add", name), {}, 1.0, 8.0, "mean rate +0%")
+        found = answer_of(steps=[step])
+        assert (said in answer.table(found)) == there
+        assert (said in written(found, tmp_path)[1].text) == there
 
 
 def test_the_effect_of_a_plug_in_that_is_not_at_hand(tmp_path: Path) -> None:

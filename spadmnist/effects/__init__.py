@@ -124,6 +124,8 @@ class Effect(Plugin, abstract=True):
     )
     # which statistics it moves, for the contract tests (`spadmnist.testing`); every other one stays as it is
     moves: ClassVar[tuple[str, ...]] = ()
+    # what no effect describes and yet does the same, and what would tell: said wherever a diagnosis names this one
+    mimic: ClassVar[str] = ""
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         if stage is not None:

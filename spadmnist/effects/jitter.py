@@ -23,6 +23,10 @@ class Jitter(Effect, stage="timing"):
 
     counted = True
     moves = ("edge",)
+    mimic = (
+        "a dead time that differs from event to event blurs the edge of the intervals in the same way; "
+        "only a pulsed source tells them apart"
+    )
 
     sigma = parameter(
         50e-12,

@@ -162,6 +162,7 @@ def _step(step: Step) -> _Card:
     about = _about(step.change.effect)
     if step.change.parameter in declared:
         about = f"{step.change.parameter}: {declared[step.change.parameter]['about']}. {about}"
+    about += f" But: {answer.mimic(step.change)}." if answer.mimic(step.change) else ""
     return _Card(answer.title(step.change), step, _KINDS.get(step.change.kind, step.change.kind), about, numbers)
 
 
