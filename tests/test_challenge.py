@@ -669,6 +669,7 @@ def test_unseen_captures_are_others(made: Path) -> None:
         assert 0.2 < length[1] / length[0] < 0.6
 
 
+@pytest.mark.slow
 def test_the_right_sensor_removes_the_error_of_unseen_captures(small: Any, tmp_path: Path) -> None:
     """spadmnist itself, on the unseen captures of a sensor with crosstalk: without and with it."""
     folder = tmp_path / "out"

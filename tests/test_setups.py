@@ -142,6 +142,7 @@ def lab(folder: Path, extra: str = "", plan: str = LAB, seed: int = 0) -> Measur
     return measurements.open(twin.simulate(config.read_sensor(folder / "truth.yaml"), plan_, folder / "lab", seed))
 
 
+@pytest.mark.slow
 def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
     data = lab(tmp_path, plan=LAB.replace("400 ms", "360 ms"))
     text = (tmp_path / "lab" / "measurement.yaml").read_text()

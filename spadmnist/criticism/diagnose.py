@@ -117,8 +117,8 @@ def _diagnosed(
         if not failed and course.failed:
             course.back_to(earlier)  # nothing was wrong before, now something is
             break
-        # totals are no part of the misfit: what leaves nothing failing is a step, whatever chance makes of the rest
-        if course.failed and fell - course.misfit < 0.05 * (fell - 1):
+        # totals are no part of the misfit: where fewer checks fail it is a step, whatever chance makes of the rest
+        if len(course.failed) >= max(len(failed), 1) and fell - course.misfit < 0.05 * (fell - 1):
             if course.misfit > fell:
                 course.back_to(earlier)
             break

@@ -31,7 +31,7 @@ _MOST = 10.0  # of a logarithm
 _ODD, _WIDE = 3.5, 2.0  # standard deviations of a pixel that is odd; of a logarithm, how wide these lie
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
-_GRID, _ROUNDS = (-4.0, 6.0, 81), 100  # logarithms about the middle that pixels of few counts may have
+_GRID, _ROUNDS = (-4.0, 8.0, 97), 100  # logarithms about the middle that pixels of few counts may have
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
 
 
@@ -56,22 +56,20 @@ class Map:
 
     def values(self, draw: np.ndarray | None = None) -> np.ndarray:
         """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
-        if self.likely is not None:
-            return self._one_of(draw)
         # a draw of the logarithm has the mean of the estimate in the value itself
         logs = self.estimate if draw is None else self.estimate + draw * self.error - self.error**2 / 2
-        return np.clip(self.base * np.exp(np.clip(logs, -_MOST, _MOST)), self.low, self.high)
+        relative = np.exp(np.clip(logs, -_MOST, _MOST))
+        if self.likely is not None:  # a pixel that says much by itself is where it says
+            relative = np.where(self.raw_error < _TELLING, relative, self._one_of(draw))
+        return np.clip(self.base * relative, self.low, self.high)
 
     def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
         assert self.likely is not None
         grid, weights = self.likely
         if draw is None:
-            relative = weights @ np.exp(grid)
-        else:
-            below = np.cumsum(weights, axis=1)
-            place = (below < special.ndtr(draw)[:, None]).sum(axis=1)
-            relative = np.exp(grid[np.minimum(place, grid.size - 1)])
-        return np.clip(self.base * relative, self.low, self.high)
+            return np.asarray(weights @ np.exp(grid))
+        place = (np.cumsum(weights, axis=1) < special.ndtr(draw)[:, None]).sum(axis=1)
+        return np.asarray(np.exp(grid[np.minimum(place, grid.size - 1)]))
 
 
 def groups_of(sensor: Sensor, per: str) -> np.ndarray:
@@ -289,7 +287,9 @@ def _of_few_counts(map_: Map, lines: Sequence[_Line], model: Callable[[float], S
         prior = weights.mean(axis=0)
     mean = weights @ grid
     error = np.sqrt(np.maximum(weights @ grid**2 - mean**2, 0.0))
-    return replace(map_, estimate=mean, error=error, likely=(grid, weights))
+    told = map_.raw_error < _TELLING
+    estimate, error = np.where(told, map_.estimate, mean), np.where(told, map_.error, error)
+    return replace(map_, estimate=estimate, error=error, likely=(grid, weights))
 
 
 def _odd(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -467,7 +467,7 @@ def needed(
 def _spread_p(map_: Map) -> float:
     """p-value of pixels that are all alike."""
     told = map_.raw_error < 3.0  # elsewhere nothing is known
-    if told.sum() < 3:
+    if told.sum() < 3 or float(np.std(map_.estimate)) < _LEAST_WIDTH:  # all at a bound: they do not differ
         return 1.0
     r, weight = map_.raw[told], 1 / map_.raw_error[told] ** 2
     z = (r - float(np.average(r, weights=weight))) ** 2 * weight

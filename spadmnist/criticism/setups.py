@@ -151,18 +151,21 @@ def rivals(search: Search, state: State, cost: float) -> list[Tried]:
     for change in changes(state.sensors.one):
         if not change.strengths or change.phases or change.carrier:
             continue
-        best: Tried | None = None
+        # from each of its places: from the nearest by proportion it may not lead to where it fits
+        best: tuple[float, Tried] | None = None
         for tried in templates(change):
             sensors = state.sensors.changed(tried)
             one = Tried(change, tried, bench.told(state, sensors), 0.0, 1.0, sensors)
             one.gain, one.times = search.line_search(state, one.moved, one.signed)
-            if best is None or one.gain > best.gain:
-                best = one
-        if best is None or best.gain < EACH:
+            if one.gain < EACH:
+                continue
+            one = _settled(search, state, one)
+            left = one.residuals[RATES] if one.residuals else state.residuals[RATES]
+            if best is None or float(left @ left) < best[0]:
+                best = float(left @ left), one
+        if best is None:
             continue
-        settled = _settled(search, state, best)
-        left = settled.residuals[RATES] if settled.residuals else state.residuals[RATES]
-        square = float(left @ left)
+        square, settled = best
         if square + EACH < cost + ALIKE and stats.chi2.sf(square, max(1, freedom - 1)) > FALSE_ALARM:
             settled.gain = search.square(state.residuals) - square
             out.append(settled)

@@ -37,7 +37,7 @@ class ShortGate(Effect, stage="gate"):
         "part of the nominal frame during which the pixel is live",
         bounds=(0, 1),
         off=1.0,
-        search=(0.5, 1),
+        search=(0.1, 1),
     )
     offset = parameter(
         0.0,
