@@ -29,6 +29,7 @@ class ShortGate(Effect, stage="gate"):
         "far_pairs",
         "neighbours",
         "frames_lag",
+        "linearity",  # where little of a frame is left, the dead time is a larger part of it
     )
 
     fraction = parameter(
