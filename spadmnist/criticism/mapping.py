@@ -241,7 +241,8 @@ def settle_maps(
                 counted, usual = counted[~odd], usual[~odd]
                 # about their mean, not the middle
                 usual = np.maximum(usual * max(float(counted.sum()), 1e-9) / max(float(usual.sum()), 1e-9), 1e-9)
-                relative = float(((counted - usual) ** 2 - usual).sum() / (usual**2).sum())  # of logarithms it is less
+                square = max(float((usual**2).sum()), 1e-12)  # of one pixel that is odd nothing is left
+                relative = float(((counted - usual) ** 2 - usual).sum()) / square  # of logarithms it is less
                 sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), _LEAST_WIDTH**2))
             precision[i] = np.where(
                 odd,
