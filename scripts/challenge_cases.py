@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri_exp
 
 sys.path.insert(0, str(Path(__file__).parent))
 from challenge_generator import Capture, Traps, World, photon_rate
@@ -689,7 +690,13 @@ def bursts(lab: Lab, x: float) -> Hidden:
         chance = -math.expm1(-lab.rate(c) * window)  # that such a pixel fires by itself
         total += 2 * x * c.length * lab.world.burst_size * -math.log(chance)
     settings = {"rate": x, "size": lab.world.burst_size}
-    return Hidden(math.sqrt(total), "adjacent pixels at once, by chance or not", UNKNOWN, settings)
+    number = x * sum(c.length for c in lab.stated)
+    return Hidden(_if_any(math.sqrt(total), number), "adjacent pixels at once, by chance or not", UNKNOWN, settings)
+
+
+def _if_any(z: float, number: float) -> float:
+    """The significance of rare things, each of which says much: there may be none, and then nobody sees anything."""
+    return min(z, max(0.0, -float(ndtri_exp(-number))))
 
 
 @hides(OUTSIDE, "tr", 1e-8, 50e-6)
@@ -729,7 +736,8 @@ def copied_frames(lab: Lab, x: float) -> Hidden:
     for c in lab.stated:
         fires = -math.expm1(-lab.rate(c) * c.frame_time)
         total += 2 * x * c.frames * lab.pixels * -math.log(fires**2 + (1 - fires) ** 2)
-    return Hidden(math.sqrt(total), "frames equal to the one before", UNKNOWN, {"share": x})
+    copies = x * sum(c.frames for c in lab.stated)
+    return Hidden(_if_any(math.sqrt(total), copies), "frames equal to the one before", UNKNOWN, {"share": x})
 
 
 # ---- what is wrong in the laboratory ----------------------------------------------------------------------
