@@ -930,6 +930,8 @@ def _run(arguments: list[str] | None) -> int:
         _say(f"Error: {error.filename or 'the system'}: {error.strerror or error}")
         return 2
     except Exception as error:
+        if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):  # in the middle of compiled code
+            return 130 if isinstance(error.__cause__, KeyboardInterrupt) else 143
         if os.environ.get("SPADMNIST_DEBUG"):
             raise
         _say(f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}")

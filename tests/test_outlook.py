@@ -71,7 +71,7 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     found, hidden = outlook.upper_limits(look, state, tried)
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
-    return limit, [chance.along(bench, state, t.moved)[1] for t in tried]
+    return limit, [chance.along(bench, state, t.moved).data for t in tried]
 
 
 def test_what_would_have_been_seen_is_seen(lab):
@@ -213,4 +213,4 @@ def test_no_chance_is_none_at_all(lab):
     course = course_of.begun(bench_of((sensor, data)))
     one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
     significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e12))
-    assert 0 < p < 1e-100 and math.isfinite(significance)
+    assert 0 < p < 1e-50 and math.isfinite(significance)  # sixteen recordings know their scatter badly

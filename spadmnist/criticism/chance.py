@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,39 @@ from scipy import stats
 from ..errors import SpadError
 from . import mapping
 from .candidates import Change, Key, changes
-from .fit import RATES, Bench, Moved, State, stacked
+from .fit import RATES, Bench, Cell, Moved, State
 from .lines import Line
-from .tried import Tried
+from .tried import Tried, shape_of
 
 LEAST_P = 1e-300
 _MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
+_LITTLE = 0.1  # times as strong: what grows with the square is no matter there
+_HELD = 0.9  # of what directions of a candidate have in common, by few recordings
+_SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
+_LEAST_VARIANCE = 0.3  # of a cell
+_TOGETHER, _FEWEST = 1.25, 3.0  # standard deviations of a sum of cells that go together; degrees of freedom it has
 _SURER, _JOINED = 1.1, 1.6  # of a variance of squares: to be sure, and from where on values move together
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How much of a model's trace the data have, in standard deviations of what the model's own recordings have of it.
+
+    size: of the whole trace. own: (recordings,) theirs. spread: of these, if all cells were independent 1. freedom:
+    degrees, of the t distribution that they follow.
+    """
+
+    size: float
+    data: float
+    own: np.ndarray
+    spread: float
+    freedom: float
 
 
 def of_any(bench: Bench, state: State, tried: Sequence[Tried], values: dict[Key, Any], lines: Sequence[Line]) -> float:
     """p-value of what resembles the trace of any candidate most, maps among them, if the model is right."""
-    marks, largest = marks_of(bench, state, tried)
-    p = _gumbel_tail(largest, float(marks.max())) if marks.any() else 1.0
+    data, own = _of_traces(bench, state, tried)
+    p = _of_least(own, min(data, default=1.0))
     levels = mapping.levels_of(bench, state)
     maps = [of_map(bench, state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
     swings = [line.p for line in lines]
@@ -35,48 +56,131 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried) -> 
     """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
     if best.chance is not None:
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), best.chance
-    marks, largest = marks_of(bench, state, [best, *tried])
+    _, own = _of_traces(bench, state, [best, *tried])
+    found = along(bench, state, best.moved)
+    if found.size <= 0:
+        return 0.0, 1.0
     # what is far outside is no matter of the linear law: the gain itself, in the same measure
-    keys = list(state.residuals)
-    t = stacked(bench.template(state, best.moved), keys)
-    own = np.concatenate([state.own[k] for k in keys], axis=1) @ t
-    typical = float(np.mean(own**2) / max(float(t @ t), 1e-12))
-    score = max(float(marks[0]), math.sqrt(max(best.gain, 0.0) / max(typical, 0.5))) if t.any() else 0.0
-    return score, max(_gumbel_tail(largest, score), LEAST_P)
+    mark = abs(found.data) if best.signed else max(found.data, 0.0)
+    mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
+    sides = len(best.change.strengths) if _sided(best) else 0
+    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if best.signed else 2)
+    return mark, max(_of_least(own, one), LEAST_P)
 
 
-def marks_of(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[np.ndarray, np.ndarray]:
-    """((candidates,) how much the data resemble the trace of each, (recordings,) the most that the model's own do).
+def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list[float], np.ndarray]:
+    """(p-value of the trace of each candidate in the data, (recordings,) the least of them in the model's own).
 
-    In standard deviations of the latter; 0 of a candidate without a trace.
+    Directions of one candidate are judged together. 1 of a candidate without a trace.
     """
-    marks, largest = np.zeros(len(tried)), np.zeros(len(state.own[RATES]))
+    groups: dict[tuple[Any, ...], list[Tried]] = {}
     for n, one in enumerate(tried):
-        _, data, own = along(bench, state, one.moved)
-        if one.signed:
-            data, own = abs(data), np.abs(own)
-        largest = np.maximum(largest, own)
-        marks[n] = max(data, 0.0)  # less of it than nothing is none of what can only be there
-    return marks, largest
+        groups.setdefault((one.change.name, shape_of(one)) if _sided(one) else (n,), []).append(one)
+    data: list[float] = []
+    least = np.ones(len(state.own[RATES]))
+    for group in groups.values():
+        # where a sign matters and more of it looks otherwise: little, too
+        for times in (1.0, _LITTLE) if group[0].moved.even is not None else (1.0,):
+            found = [along(bench, state, one.moved.at(times)) for one in group]
+            found = [x for x in found if x.size > 0]
+            if not found:
+                continue
+            p, own = _together(found, group[0].signed)
+            data.append(p)
+            least = np.minimum(least, own)
+    return data, least
 
 
-def along(bench: Bench, state: State, moved: Moved) -> tuple[float, float, np.ndarray]:
-    """(size of a model's trace, how much of it the data have, (recordings,) the model's own), in standard deviations.
+def _sided(one: Tried) -> bool:
+    """Is it one of several directions?"""
+    return one.change.kind == "add" and one.signed and len(one.change.strengths) > 1
 
-    Of what the model's own recordings have of it. All 0 where there is no trace.
+
+def _together(found: Sequence[Likeness], signed: bool) -> tuple[float, np.ndarray]:
+    """(p-value of several directions' likenesses, (recordings,) of the model's own): Hotelling's."""
+    own = np.stack([x.own for x in found], axis=1)
+    alike = own.T @ own / len(own)
+    alike = _HELD * alike + (1 - _HELD) * np.diag(np.diag(alike))
+    np.fill_diagonal(alike, np.maximum(np.diag(alike), 1.0))
+    all_ = np.vstack([[x.data for x in found], own])
+    square = np.einsum("ri,ij,rj->r", all_, np.linalg.inv(alike), all_)
+    p = _chance_of(square, len(found), min(x.freedom for x in found))
+    if not signed:  # less of it than nothing is none of what can only be there
+        p = np.where(all_[:, 0] > 0, p / 2, 1.0)
+    return float(p[0]), p[1:]
+
+
+def _chance_of(square: np.ndarray | float, directions: int, freedom: float) -> np.ndarray:
+    """p-value of the square of a likeness: Hotelling's, of the t distribution for one direction."""
+    second = max(freedom - directions + 1, 1.0)
+    return np.asarray(stats.f.sf(np.asarray(square) * second / (directions * freedom), directions, second))
+
+
+def _of_least(own: np.ndarray, least: float) -> float:
+    """p-value of the least of many p-values; own: (recordings,) the least of those of the model itself."""
+    number = max(1 / max(float(own.mean()), 1e-6) - 1, 1.0)  # so many that have nothing to do with each other
+    return float(-np.expm1(number * np.log1p(-min(least, 1 - 1e-12))))
+
+
+def along(bench: Bench, state: State, moved: Moved) -> Likeness:
+    """How much the data resemble a model's trace. All 0 where there is no trace.
+
+    Cells that scatter together are weighed accordingly, as far as the model's recordings tell how they do.
     """
-    keys = list(state.residuals)
-    t = stacked(bench.template(state, moved), keys)
-    own = np.concatenate([state.own[k] for k in keys], axis=1)
-    norm = math.sqrt(float(t @ t))
-    if norm <= 0:
-        return 0.0, 0.0, np.zeros(len(own))
-    own = own @ t / norm
+    template = bench.template(state, moved)
+    keys = [k for k, t in template.items() if t.any()]
+    many = len(state.own[RATES])
+    usual = float(many - 1)
+    if not keys:
+        return Likeness(0.0, 0.0, np.zeros(many), 1.0, usual)
+    own = np.zeros(many)
+    size = data = norm = fourth = 0.0
+    for key in keys:
+        whole, *parts = _weights(state, key)
+        t, w = template[key], whole(template[key])
+        for part, weigh in zip(_folds(many), parts, strict=True):
+            own[part] += state.own[key][part] @ weigh(t)
+        size, data = size + float(t @ w), data + float(state.residuals[key] @ w)
+        norm, fourth = norm + float(w @ w), fourth + float(np.sum(w**4))
+    norm = math.sqrt(norm)
     # many cells may scatter less together than they would by themselves; the score of a single one is what it is, even
     # where chance fills it so seldom that it hardly scatters
-    cells = norm**4 / float(np.sum(t**4))
-    spread = max(float(own.std()), 0.5 + 0.5 / math.sqrt(cells))
-    return norm / spread, float(stacked(state.residuals, keys) @ t) / norm / spread, own / spread
+    cells = norm**4 / fourth
+    spread = max(float(own.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
+    # cells that go together may all be far out together: their tails are those of few
+    freedom = usual if spread < _TOGETHER else min(max(2 * cells / spread**2, _FEWEST), usual)
+    return Likeness(size / norm / spread, data / norm / spread, own / norm / spread, spread, freedom)
+
+
+_Weigh = Callable[[np.ndarray], np.ndarray]
+
+
+def _folds(recordings: int) -> list[slice]:
+    """Parts of the recordings, each of which is judged by what the others tell."""
+    return [slice(k, None, _FOLDS) for k in range(_FOLDS)]
+
+
+def _weights(state: State, key: Cell) -> list[_Weigh]:
+    """Trace -> weights of the cells of a statistic, by all of the model's recordings and by those outside each fold."""
+    if key not in state.weights:
+        own = state.own[key]
+        many, cells = own.shape
+        if key == RATES or not 1 < cells <= _SMALL:
+            state.weights[key] = [lambda t: t] * (_FOLDS + 1)
+        else:
+            rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
+            state.weights[key] = [_weighing(x, cells / many) for x in [own, *rests]]
+    return state.weights[key]
+
+
+def _weighing(own: np.ndarray, doubt: float) -> _Weigh:
+    """Trace -> weights. doubt: cells to a recording; of many cells few recordings hardly tell what they share."""
+    together = own.T @ own / len(own)
+    alone = np.maximum(np.diag(together), _LEAST_VARIANCE)
+    together /= 1 + doubt
+    np.fill_diagonal(together, alone)
+    inverse = np.linalg.inv(together)
+    return lambda t: np.asarray(inverse @ t)
 
 
 def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], levels: dict[str, float]) -> float:
@@ -112,12 +216,6 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
     laws = [(best, name) for name in _LAWS if (best, name) in state.residuals]
     others = [state.nulls[cell].chance(state.residuals[cell])[0] for cell in laws]
     return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
-
-
-def _gumbel_tail(largest: np.ndarray, mark: float) -> float:
-    """p-value of a mark as the largest of many; largest: (recordings,) those of the model itself."""
-    location, scale = stats.gumbel_r.fit(largest) if np.ptp(largest) > 0 else (3.0, 0.5)
-    return float(stats.gumbel_r.sf(mark, location, max(scale, 0.25)))
 
 
 def of_spread(data: np.ndarray, usual: np.ndarray) -> float:

@@ -327,7 +327,11 @@ def drop_needless(course: Course) -> None:
     """Steps that later ones made superfluous are taken out again."""
     bench = course.bench
     for step in list(course.steps[:-1]):
-        if step.change.carrier or len(course.steps) < 2 or step.phased:
+        if len(course.steps) < 2 or step.phased:
+            continue
+        if step.change.carrier:
+            if not course.steps[-1].change.carrier:  # which may be what makes the pixels differ
+                _drop_map(course, step)
             continue
         rest = {k: v for k, v in course.values.items() if k not in _keys_of(step.change, course)}
         sensors = Sensors.same(bench.start).changed(rest, course.search.phases)
@@ -352,6 +356,21 @@ def drop_needless(course: Course) -> None:
             course.values = rest
             settle_all(course)
             course.rung(f"- {title(step.change)}")
+
+
+def _drop_map(course: Course, step: Step) -> None:
+    """Take a map out again, unless some check fails without it that does not with it."""
+    before, failed = course.kept(), len(course.failed)
+    course.bench.say(f"is {title(step.change)} still needed?")
+    course.steps = [s for s in course.steps if s is not step]
+    course.search.accepted = [c for c in course.search.accepted if c is not step.change]
+    kept = set().union(*(_keys_of(s.change, course) for s in course.steps))
+    course.values = {k: x for k, x in course.values.items() if k in kept}
+    settle_all(course)
+    if len(course.failed) > failed:
+        course.back_to(before)
+    else:
+        course.rung(f"- {title(step.change)}")
 
 
 def _keys_of(change: Change, course: Course) -> set[Key]:

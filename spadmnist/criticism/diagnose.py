@@ -27,7 +27,9 @@ from .search import alike
 from .tried import Tried
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
-_TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself
+_TRACE = 1e-2  # p-value of a trace that is followed where no check fails by itself
+_MAYBE, _CLOSER = 100.0, 128  # times as likely by chance: worth so many recordings
+_PLAIN = 1e-6  # p-value of a check that needs no closer look
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 
@@ -69,15 +71,19 @@ def _diagnosed(
     explained = bool(short)  # is what fails in the totals the set-up's?
     placebo: dict[str, Any] | None = None
     tried: list[Tried] = []
+    model: State | None = None  # as it was before a closer look
     while len(course.steps) < max_steps:
         failed = course.failed
         number = len(course.steps) + 1
+        if failed and not course.steps and min(b.p for b in failed) > _PLAIN and bench.replicates < _CLOSER:
+            course.state = _closer(course)  # lest the scatter of few recordings decide
+            failed = course.failed
         if not failed:
             # no check fails by itself: does any candidate's whole trace stand out?
             bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
             tried = search.scan(course.state, everywhere=True, known=tried)
-            trace = _TRACE if not course.steps else _LATER_TRACE
-            if chance.of_any(bench, course.state, tried, course.values, search.lines(course.state)) > trace:
+            model = course.state
+            if not _stands_out(course, tried, _TRACE if not course.steps else _LATER_TRACE):
                 break
         if failed and all(b.cell[0] == "" for b in failed):
             found, others, wanted = _by_setup(course)
@@ -122,6 +128,8 @@ def _diagnosed(
             if course.misfit > fell:
                 course.back_to(earlier)
             break
+    if model is not None and len(course.state.own[RATES]) > len(model.own[RATES]):
+        course.state = model  # no check failed, and there is no step: so nothing is left
     if course.steps:
         drop_needless(course)
         drop_mimics(course, start)
@@ -176,6 +184,26 @@ def _diagnosed(
         bench.simulations,
         bench.dark,
     )
+
+
+def _stands_out(course: Course, tried: Sequence[Tried], trace: float) -> bool:
+    """Do the data resemble the trace of any candidate more than chance would have it?
+
+    Where they may, the model is simulated more often, lest too few recordings of it decide.
+    """
+    p = chance.of_any(course.bench, course.state, tried, course.values, course.search.lines(course.state))
+    if p >= min(_MAYBE * trace, 1.0):
+        return False
+    if len(course.state.own[RATES]) < _CLOSER:
+        course.state = _closer(course)
+        p = chance.of_any(course.bench, course.state, tried, course.values, course.search.lines(course.state))
+    return p <= trace
+
+
+def _closer(course: Course) -> State:
+    """The model as it is, simulated more often."""
+    course.bench.say("a closer look at what may be there")
+    return course.bench.state(course.values, course.state.sensors, _CLOSER)
 
 
 def _verdict(course: Course, left: Sequence[fit.Block], setup: bool, rival: Tried | None) -> str:

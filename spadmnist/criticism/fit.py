@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -80,6 +80,7 @@ class State:
     own: dict[Cell, np.ndarray]
     exact: list[Cell]
     space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `Bench.rate_space`
+    weights: dict[Cell, list[Callable[[np.ndarray], np.ndarray]]] = field(default_factory=dict)  # see `chance.along`
 
 
 @dataclass

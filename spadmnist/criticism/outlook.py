@@ -213,10 +213,10 @@ def upper_limits(
         change = one.change
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
-        size, had, _ = along(bench, state, one.moved)
-        times = (max(had, 0.0) + _ONE_SIDED) / size if size > 0 else math.inf
+        trace = along(bench, state, one.moved)
+        times = (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
         if change.effect not in weakest or times > weakest[change.effect][0]:
-            weakest[change.effect] = times, size, one
+            weakest[change.effect] = times, trace.size, one
     hidden = [name for name, (times, _, one) in weakest.items() if _strength(one, times) is None]
     seen = {name: entry for name, entry in weakest.items() if name not in hidden}
     models = []
@@ -230,7 +230,7 @@ def upper_limits(
         dial = one.change.strengths[0]
         if not isinstance(moved, str) and not 0.5 < times < 2:
             # how the trace grows with the strength: in proportion, or with its square
-            there, *_ = along(bench, state, moved)
+            there = along(bench, state, moved).size
             if there > 0.2:
                 power = float(np.clip(math.log(there / size) / math.log(times), 1.0, 2.0))
                 times = times ** (1 / power)

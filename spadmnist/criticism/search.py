@@ -306,9 +306,10 @@ class Search:
                 break
         out: list[Tried] = []
         for one in best:
-            # a faint trace drowns in what is left of chance: a stronger one tells what it looks like
+            # a faint trace drowns in what is left of chance: a stronger one tells what it looks like, but of an edge
             size = self.size(state, one.moved)
-            one.times = math.copysign(max(abs(one.times), min(_STRONG / max(size, 1e-9), 1.0)), one.times)
+            least = 0.0 if any(map(is_edge, one.change.strengths)) else min(_STRONG / max(size, 1e-9), 1.0)
+            one.times = math.copysign(max(abs(one.times), least), one.times)
             given = one.scaled()
             out.append(
                 replace(one, values=given, gain=size, sensors=state.sensors.changed(given, one.phases, one.chips))

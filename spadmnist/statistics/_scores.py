@@ -54,6 +54,23 @@ def poisson_score(count: np.ndarray | float, mean: np.ndarray | float, share: np
     return score
 
 
+def largest_score(largest: np.ndarray, mean: np.ndarray, number: int, share: np.ndarray) -> np.ndarray:
+    """Score of the largest of so many independent Poisson counts of the same mean."""
+    from scipy import special
+
+    k, m = np.asarray(largest, np.float64), np.asarray(mean, np.float64)
+
+    def beyond(count: np.ndarray) -> np.ndarray:
+        """Chance that one of them is larger."""
+        tail = np.where(count < 0, 1.0, special.pdtrc(np.maximum(count, 0.0), m))
+        return np.asarray(-np.expm1(number * np.log1p(-np.minimum(tail, 1.0 - 1e-16))))
+
+    upper, least = beyond(k), beyond(k - 1.0)
+    own = least - upper
+    tails = 1.0 - least + share * own, upper + (1.0 - share) * own
+    return _from_tails(np.maximum(tails[0], 1e-300), np.maximum(tails[1], 1e-300))
+
+
 def _from_tails(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Normal quantile from the probabilities below and above, the smaller of which is the more precise."""
     from scipy import special

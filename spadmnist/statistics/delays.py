@@ -1,0 +1,145 @@
+"""Detections of distant pixels that follow each other by a fixed time."""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the types from the calls; the docstrings give them.
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from ..kernels import jit
+from ..units import show
+from . import Recording, Statistic, Summary
+from ._counting import exposure_in, span, whole_ticks
+from ._scores import largest_score, shares
+from ._walk import REACH
+
+_STEP, _LONGEST = 1e-9, 300e-9  # s, between delays; the longest
+_MOST_STEPS = 4096  # from one pixel to another, of a grid
+_PAIRS = 1_500_000  # that are looked at, about
+_LEAST_CHANCE = 1e-6  # of pairs that chance makes
+
+
+class Delays(Statistic):
+    """Pairs of detections of distant pixels by the time between them: for each step from pixel to pixel, the most in
+    any ns.
+
+    Steps of more than 3 pitches from the earlier detection to the later one: as columns and rows to go, and as pixels
+    to go in the order of read-out, which begins anew behind the last one. Delays up to 300 ns, evenly in steps of 1 ns.
+    Of very many detections only the first of the capture are looked at (1.5 million pairs). Arrays of up to about
+    32 x 32 pixels on a grid.
+    Law: normal, as the score of the largest of so many Poisson counts, whose mean the pixels' totals tell.
+    Shows: what is detected a second time elsewhere: a reflection from pixel to pixel, wires and converters that two
+    pixels share, addresses that are mixed up. In `far_pairs`, of all steps and delays together, it drowns.
+    """
+
+    modalities = ("tr",)
+    among = "far"
+    unit = "standard deviations"
+    costly = True
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Scores, of each step."""
+        rows, columns = recording.layout.shape
+        if recording.layout.positions is not None or (2 * columns - 1) * (2 * rows - 1) > _MOST_STEPS:
+            return None
+        steps = _steps(rows, columns)
+        if not steps.names:
+            return None
+        assert recording.events is not None
+        ticks, tick = whole_ticks(recording)
+        step = max(1, round(_STEP / tick))
+        delays = max(1, round(_LONGEST / tick) // step)
+        offsets = recording.events.offsets
+        exposure = exposure_in(recording, tick)
+        looked_at = exposure
+        if len(ticks):
+            by_chance = len(ticks) ** 2 * step * delays / exposure
+            looked_at = math.ceil(exposure * min(1.0, _PAIRS / max(by_chance, 1.0)))
+        pixels = np.repeat(np.arange(recording.pixels, dtype=np.uint64), np.diff(offsets))
+        some = ticks < looked_at
+        order = np.sort((ticks[some].astype(np.uint64) << np.uint64(16)) | pixels[some])
+        counts = np.zeros((steps.number, delays), np.int32)
+        _count(order, columns, rows, step, counts)
+        counts = steps.joined(counts)
+        most = counts.max(axis=1)
+        n = np.bincount(pixels[some].astype(np.int64), minlength=recording.pixels).astype(np.float64)
+        chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
+        scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
+
+        def where(cell: int) -> str:
+            k = int(counts[cell].argmax())
+            return f"{steps.names[cell]}, {span(k * step * tick, (k + 1) * step * tick)} later"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, mean = int(most[cell]), float(chance[cell])
+            text = f"{found} pairs within {show(step * tick, 's')}, {mean:.3g} by chance"
+            return text, (found - mean) / max(1, int(some.sum()))
+
+        return Summary(scores, "normal", where, size, scale=np.ones(scores.size))
+
+
+@lru_cache(maxsize=4)
+def _steps(rows: int, columns: int) -> _Steps:
+    return _Steps(rows, columns)
+
+
+class _Steps:
+    """Steps from one pixel to another that is more than 3 pitches away: names of those over the grid, then of those in
+    the order of read-out. number: of all over the grid, those that are not so far among them.
+    """
+
+    def __init__(self, rows: int, columns: int):
+        width = 2 * columns - 1
+        self.number = width * (2 * rows - 1)
+        down, right = np.divmod(np.arange(self.number), width)
+        down, right = down - (rows - 1), right - (columns - 1)
+        self.far = np.flatnonzero(down**2 + right**2 > REACH**2)
+        down, right = down[self.far], right[self.far]
+        further, self.kind = np.unique((down * columns + right) % (rows * columns), return_inverse=True)
+        self.names = [_over_the_grid(int(x), int(y)) for x, y in zip(right, down, strict=True)]
+        self.names += [f"{int(x)} pixels further on in the order of read-out" for x in further]
+
+    def joined(self, counts: np.ndarray) -> np.ndarray:
+        """Of each step by name what `counts` (steps over the grid, ...) has of it."""
+        of_grid = counts[self.far]
+        of_order = np.zeros((len(self.names) - len(self.far), *counts.shape[1:]), counts.dtype)
+        np.add.at(of_order, self.kind, of_grid)
+        return np.concatenate([of_grid, of_order])
+
+
+def _over_the_grid(right: int, down: int) -> str:
+    ways = [f"{abs(x)} {name}" for x, name in ((right, _SIDES[right > 0]), (down, _ENDS[down > 0])) if x]
+    return f"a pixel {' and '.join(ways)}"
+
+
+_SIDES = ("to the left", "to the right")
+_ENDS = ("up", "down")
+
+
+@jit
+def _count(order, columns, rows, step, counts):
+    """Add pairs to counts (steps over the grid, delays). order: (detections,) tick << 16 | pixel, rising."""
+    delays = counts.shape[1]
+    width = 2 * columns - 1
+    longest = np.int64(step * delays)
+    for i in range(order.size):
+        at, pixel = np.int64(order[i] >> np.uint64(16)), np.int64(order[i] & np.uint64(0xFFFF))
+        row, column = pixel // columns, pixel % columns
+        for j in range(i + 1, order.size):
+            lag = np.int64(order[j] >> np.uint64(16)) - at
+            if lag >= longest:
+                break
+            other = np.int64(order[j] & np.uint64(0xFFFF))
+            down, right = other // columns - row, other % columns - column
+            counts[(down + rows - 1) * width + right + columns - 1, lag // step] += 1
+
+
+def _meeting(n: np.ndarray) -> np.ndarray:
+    """(2 rows - 1, 2 columns - 1) sums over pixels of n times n so many rows and columns on; n: (rows, columns)."""
+    from scipy import signal
+
+    return np.maximum(signal.correlate(n, n, method="fft"), 0.0)[::-1, ::-1]

@@ -1,0 +1,97 @@
+"""Is it chance? p-values of traces, of cells that scatter together, of several directions, of many candidates."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import laws
+import numpy as np
+from scipy import stats
+
+from spadmnist.criticism import chance
+from spadmnist.criticism.fit import RATES
+
+RECORDINGS, CELL = 32, ("flat", "windows")
+BENCH: Any = SimpleNamespace(template=lambda state, moved: moved)
+
+
+def model(rng: np.random.Generator, cells: int, common: float, recordings: int = RECORDINGS) -> Any:
+    """A state with one statistic of which all cells have something in common."""
+
+    def draw(n: int) -> np.ndarray:
+        return common * rng.standard_normal((n, 1)) + rng.standard_normal((n, cells))
+
+    own = draw(recordings)
+    own -= own.mean(axis=0)
+    own[:] *= np.sqrt(recordings / (recordings - 1))
+    return SimpleNamespace(
+        residuals={CELL: draw(1)[0], RATES: np.zeros(0)}, own={CELL: own, RATES: np.zeros((recordings, 0))}, weights={}
+    )
+
+
+def candidate(trace: np.ndarray, name: str, signed: bool = True, directions: int = 1) -> Any:
+    template = {CELL: trace, RATES: np.zeros(0)}
+    moved = type("Trace", (dict,), {"even": None, "at": lambda self, times: self})(template)
+    change = SimpleNamespace(name=name, kind="add", strengths=[None] * directions, shapes=())
+    return SimpleNamespace(change=change, moved=moved, signed=signed, values={})
+
+
+def p_of(state: Any, tried: list[Any]) -> float:
+    data, own = chance._of_traces(BENCH, state, tried)
+    return chance._of_least(own, min(data))
+
+
+def test_p_values_of_many_candidates_are_uniform() -> None:
+    """Of cells that scatter together and few recordings. More than so many below 0.05 and 0.01 once in a million."""
+    rng = np.random.default_rng(1)
+    found = []
+    for _ in range(600):
+        state = model(rng, 12, 1.0)
+        traces = [np.abs(rng.standard_normal(12)) + 0.3 for _ in range(8)]
+        found.append(p_of(state, [candidate(t, str(k), signed=bool(k % 2)) for k, t in enumerate(traces)]))
+    for level in (0.05, 0.01):
+        assert np.sum(np.array(found) < level) <= stats.binom.isf(laws.FALSE_ALARM, len(found), level)
+    assert np.sum(np.array(found) < 0.5) > 150  # and not all of them are large
+
+
+def test_cells_that_scatter_together_hide_less_than_they_seem_to() -> None:
+    """A trace across what they have in common stands out; by the cells alone it would drown in it."""
+    rng = np.random.default_rng(2)
+    trace = np.r_[np.full(4, 3.0), np.zeros(8)]
+    p, size = [], []
+    for _ in range(40):
+        state = model(rng, 12, 3.0, 128)
+        state.residuals[CELL] = state.residuals[CELL] + trace
+        found = chance.along(BENCH, state, candidate(trace, "one").moved)
+        p.append(p_of(state, [candidate(trace, "one")]))
+        size.append(found.size)
+    # 6 standard deviations of four cells, of which the part in common is known from the others; plainly 6 / 6.1
+    assert 3.0 < np.median(size) < 6.5 and np.median(p) < 1e-3
+
+
+def test_directions_are_judged_together() -> None:
+    """3 standard deviations along each of two directions are more than 3 along one, and two chances to be so."""
+    rng = np.random.default_rng(3)
+    state = model(rng, 40, 0.0, 128)
+    along = [np.eye(40)[0] * 10, np.eye(40)[1] * 10]
+    state.residuals[CELL] = np.r_[3.0, 3.0, np.zeros(38)]
+    one = p_of(state, [candidate(along[0], "one")])
+    both = p_of(state, [candidate(t, "two", directions=2) for t in along])
+    apart = p_of(state, [candidate(t, str(k)) for k, t in enumerate(along)])
+    assert both < one < apart < 0.05 and one > 1e-3
+
+
+def test_less_than_nothing_is_none_of_what_can_only_be_there() -> None:
+    rng = np.random.default_rng(4)
+    state = model(rng, 10, 0.0)
+    state.residuals[CELL] = np.full(10, -4.0)
+    assert p_of(state, [candidate(np.ones(10), "one", signed=False)]) > 0.99
+    assert p_of(state, [candidate(np.ones(10), "one", signed=True)]) < 1e-4
+
+
+def test_what_goes_together_has_the_tails_of_few() -> None:
+    state = model(np.random.default_rng(5), 14, 2.0, 32)
+    state.own[CELL] = np.repeat(state.own[CELL][:, :1], 14, axis=1) / 2
+    chance_of = chance.along(BENCH, state, candidate(np.ones(14), "one").moved)
+    assert chance_of.freedom < 31
