@@ -13,7 +13,7 @@ from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change
 
 from spadmnist.criticism import candidates, chance, compare, diagnose, fit, outlook, search
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism.answer import canonical
+from spadmnist.criticism.answer import Step, canonical
 from spadmnist.criticism.candidates import Key
 from spadmnist.criticism.fit import Bench, Moved
 from spadmnist.criticism.tried import Tried
@@ -105,6 +105,26 @@ def test_a_step_that_is_needed_stays(lab):
     course_of.drop_needless(course)
     assert names(course) == ["add afterpulsing", "add crosstalk"] and course.values == values
     assert len(course.ladder) == rungs
+
+
+STEADY = (
+    "    blinking_dark_counts: {amplitude: 100 Hz, fraction: 30 %, rate_on: 10 kHz, rate_off: 10 Hz}\n"  # hot pixels
+)
+
+
+@pytest.mark.parametrize(("extra", "stays"), [("", False), (STEADY, True)])
+def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, stays: bool):
+    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n" + extra, side=4)))
+    change = change_of(course.bench, "per_pixel dark_counts.rate")
+    course.search.accepted.append(change)
+    course.steps.append(Step(change, {}, 0.0, 9.0, ""))
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    assert not course.failed
+    course_of.drop_needless(course)
+    wanted = ["per_pixel dark_counts.rate", "add crosstalk"]
+    assert names(course) == (wanted if stays else wanted[1:]) and not course.failed
+    assert [c.name for c in course.search.accepted] == names(course)
+    assert (course.ladder[-1]["model"] == "- dark_counts.rate per pixel") is not stays
 
 
 def with_residuals(state: fit.State, sizes: dict[str, float]) -> fit.State:

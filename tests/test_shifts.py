@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tinylab import bench_of
 
-from spadmnist.criticism import fit
+from spadmnist.criticism import fit, shifts
 from spadmnist.criticism.nulls import Null, learn
 from spadmnist.statistics import Summary
 
@@ -38,9 +38,9 @@ def learnt(law: str, values: np.ndarray, totals: np.ndarray) -> Null:
 def shift_of(null: Null, values: np.ndarray, base: np.ndarray, few: int) -> np.ndarray:
     expected = null.expected(1000.0)[0]
     spread = np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
-    shift, left, beta = fit._difference(values - expected, base[:few] - expected, spread)
+    shift, left, beta = shifts.difference(values - expected, base[:few] - expected, spread)
     chance = left + 3.0 * (1 - beta) / null.recordings
-    return fit._beyond_noise(shift, spread, chance, null, expected, few, True)
+    return shifts.beyond_noise(shift, spread, chance, null, expected, few, True)
 
 
 @pytest.mark.parametrize("few", [2, 4])

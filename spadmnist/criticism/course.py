@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from ..measurement import Measurement
-from . import fit, likelihood, mapping, recordings, settling
+from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Key, with_values
 from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
@@ -44,14 +44,14 @@ class Course:
     judged: dict[Cell, np.ndarray] | None = None  # residuals of each capture by parameters settled without it
 
     @property
-    def failed(self) -> list[fit.Block]:
+    def failed(self) -> list[checks.Block]:
         """The checks that a right model would hardly fail."""
-        return fit.failing(fit.blocks(self.bench, self.state, self.state.residuals))
+        return checks.failing(checks.blocks(self.bench, self.state, self.state.residuals))
 
     @property
     def misfit(self) -> float:
         """On captures that the numbers were not settled with, as far as there are any; 1 is noise."""
-        return fit.misfit(self.state, self.judged or self.state.residuals)
+        return checks.misfit(self.state, self.judged or self.state.residuals)
 
     def kept(self) -> tuple[Any, ...]:
         """All that a step changes."""
@@ -388,7 +388,7 @@ def drop_mimics(course: Course, start: State) -> None:
         # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
         left = {id(s): _left_of_own(s, course.state) for s in course.steps}
         worst = max(course.steps, key=lambda s: left[id(s)])
-        now, then = (fit.misfit(state, state.residuals) for state in (course.state, start))
+        now, then = (checks.misfit(state, state.residuals) for state in (course.state, start))
         mostly = len(course.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
         kept = [s for s in course.steps if s is not worst or left[id(s)] < 1 or mostly]
         if now > then:

@@ -16,7 +16,7 @@ from joblib import Parallel
 
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import chance, fit, outlook, recordings, setups
+from . import chance, checks, outlook, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
 from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
@@ -167,9 +167,9 @@ def _diagnosed(
         bench.start.name,
         measurement.name,
         verdict,
-        fit.misfit(start, start.residuals),
+        checks.misfit(start, start.residuals),
         course.misfit,
-        fit.usual_misfit(start),
+        checks.usual_misfit(start),
         nuisances(bench, course.state),
         course.steps,
         setup,
@@ -206,7 +206,7 @@ def _closer(course: Course) -> State:
     return course.bench.state(course.values, course.state.sensors, _CLOSER)
 
 
-def _verdict(course: Course, left: Sequence[fit.Block], setup: bool, rival: Tried | None) -> str:
+def _verdict(course: Course, left: Sequence[checks.Block], setup: bool, rival: Tried | None) -> str:
     if rival is not None:
         return "confused"
     if left:
@@ -239,7 +239,7 @@ def _rival_step(course: Course, rival: Tried) -> Step:
     dial = rival.change.strengths[0]
     low, high = rival.intervals.get(dial.key, (None, None))
     value = Value(float(rival.values[dial.key]), low, high, dial.unit)
-    left = fit.misfit(course.state, rival.residuals or course.state.residuals)
+    left = checks.misfit(course.state, rival.residuals or course.state.residuals)
     return Step(rival.change, {dial.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike")
 
 
@@ -252,14 +252,14 @@ def _alternatives(
         if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
-        checks = fit.blocks(bench, state, residuals)
-        as_good = one.residuals is not None and best.gain - one.gain < alike(best.gain) and not fit.failing(checks)
+        failed = checks.failing(checks.blocks(bench, state, residuals))
+        as_good = one.residuals is not None and best.gain - one.gain < alike(best.gain) and not failed
         out.append(
             {
                 "change": one.change.kind,
                 "effect": one.change.effect,
                 "parameter": one.change.parameter,
-                "misfit": plain(fit.misfit(state, residuals)),
+                "misfit": plain(checks.misfit(state, residuals)),
                 "confused": as_good,
                 "tried": one,
             }

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from . import checks
 from . import compare as comparing
-from . import fit
 from .answer import Trace, plain
 from .fit import Bench, Cell, State
 
@@ -20,7 +20,7 @@ _LEAST_P = 1e-300
 def remainder(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> list[dict[str, Any]]:
     """What nothing explains: where, how large, and what kind of mechanism leaves such a trace."""
     out = []
-    for block in fit.failing(fit.blocks(bench, state, residuals))[:20]:
+    for block in checks.failing(checks.blocks(bench, state, residuals))[:20]:
         id, name = block.cell
         if id == "":
             ids, *_ = bench.rate_space(state)
@@ -44,7 +44,7 @@ def remainder(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) 
 def traces(bench: Bench, start: State, last: State) -> list[Trace]:
     """The clearest checks of the model as it was, as it was and as it is now."""
     out: list[Trace] = []
-    for block in fit.failing(fit.blocks(bench, start, start.residuals)):
+    for block in checks.failing(checks.blocks(bench, start, start.residuals)):
         id, name = block.cell
         if id == "" or block.cell not in last.nulls or start.nulls[block.cell].law == "exact":
             continue

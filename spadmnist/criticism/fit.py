@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy import stats
 
 from .. import twin
 from ..errors import SpadError
@@ -23,18 +22,15 @@ from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Summary
-from . import compare as comparing
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
-from .nulls import Null, _standardized, learn, poisson_scores
+from .nulls import Null, _standardized, learn
+from .shifts import beyond_noise, difference
 
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
-_CHANCE, _CHANCE_CELL = 1e-4, 4e-8  # p-values of shifts that are none: of a block, of any of its cells by itself
-_FEW_COUNTS = 20.0  # of a cell in some recordings: normal enough
-_LEAST_LINE = 100.0  # in variances, of a line of a spectrum
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
@@ -499,12 +495,12 @@ class Bench:
                 new = values - np.stack([null.expected(t)[0] for t in learnt])
                 old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
                 spread = _spread_of(null, base)
-                shift, left, beta = _difference(new, old, spread)
+                shift, left, beta = difference(new, old, spread)
                 if kept != "all":
                     # where the recordings have nothing in common, the null's own chance is in the shift, too
                     chance = left + 3.0 * (1 - beta) / null.recordings
                     usual_here = null.expected(float(base.totals.mean()))[0]
-                    shift = _beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
+                    shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
@@ -575,70 +571,6 @@ def _spread_of(null: Null, made: Made) -> np.ndarray:
     return np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
 
 
-def _difference(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """(mean of new less what chance made of it, as `old` tells; variance of that relative to a recording's; beta).
-
-    beta: how much of what chance did to `old` it did to `new`, from 0 to 1.
-    """
-    n = len(new)
-    a, b = (new - new.mean(axis=0)) / spread, (old - old.mean(axis=0)) / spread
-    square = float((b * b).sum())
-    beta = float(np.clip((a * b).sum() / square, 0.0, 1.0)) if square > 0 and n > 1 else 0.0
-    shift = new.mean(axis=0) - beta * old.mean(axis=0)
-    left = float(((a - beta * b) ** 2).sum()) / max(1, (n - 1) * a.shape[1]) if n > 1 else 2.0
-    return shift, left / n, beta
-
-
-def _beyond_noise(
-    shift: np.ndarray, spread: np.ndarray, noise: float, null: Null, expected: np.ndarray, few: int, sure: bool
-) -> np.ndarray:
-    """The shift where it is one: of the whole block, or of the cells that stand out by themselves, or none.
-
-    noise: variance of what chance makes of it, relative to that of a recording, as `few` recordings tell it: of small
-    blocks not well. sure: either this, with its freedom, or the scatter of whole recordings must then be exceeded.
-    """
-    n = len(shift)
-    most = 1 / few + 3.0 / null.recordings  # as if the recordings had nothing in common
-    square = (shift / spread) ** 2
-    noise = max(noise, 1e-12)
-    if null.law == "exponential":
-        return np.where(square > noise * _line_beyond(few, null.recordings, n), shift, 0.0)
-    if not sure:
-        by_own, one = float(stats.chi2.isf(_CHANCE, n)) / n, float(stats.chi2.isf(_CHANCE_CELL, 1))
-        return shift if float(square.mean()) > noise * 1.2 * by_own else np.where(square > noise * one, shift, 0.0)
-    mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
-    together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # cells that move by themselves
-    by_own, by_null, one_by_own, one_by_null = _beyond(together, (few - 1) * together)
-    mean = float(square.mean())
-    if mean > noise * by_own or mean > most * by_null:
-        return shift
-    out = (square > noise * one_by_own) | (square > most * one_by_null)
-    if null.law == "poisson":  # a count or two where there is usually none
-        usual = few * np.maximum(expected, 0.5 / null.recordings)
-        score = poisson_scores(np.maximum(usual + few * shift, 0.0), usual) / math.sqrt(1 + few / null.recordings)
-        out &= (usual > _FEW_COUNTS) | (np.abs(score) > -stats.norm.ppf(_CHANCE / n))
-    return np.where(out, shift, 0.0)
-
-
-@functools.cache
-def _beyond(cells: int, freedom: int) -> tuple[float, ...]:
-    """What chance hardly exceeds: mean squares and single ones; of a variance with such freedom, and of a known one."""
-    free = max(freedom, 1)
-    return (
-        1.2 * float(stats.f.isf(_CHANCE, cells, free)),
-        1.2 * float(stats.chi2.isf(_CHANCE, cells)) / cells,
-        float(stats.f.isf(_CHANCE_CELL, 1, free)),
-        float(stats.chi2.isf(_CHANCE_CELL, 1)),
-    )
-
-
-@functools.cache
-def _line_beyond(few: int, recordings: int, cells: int) -> float:
-    """Square, in variances, beyond which chance hardly lifts one of so many powers: a mean of few over one of many."""
-    far = float(stats.f.isf(_CHANCE / cells, 2 * few, 2 * recordings)) - 1
-    return max(far**2 / (1 / few + 1 / recordings), _LEAST_LINE)
-
-
 def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noise: float) -> np.ndarray:
     usual, leverage = null.expected(total)
     expected = usual + shift
@@ -653,62 +585,3 @@ def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noi
 def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:
     """All cells in one line."""
     return np.concatenate([blocks[k] for k in keys]) if keys else np.zeros(0)
-
-
-# --- misfit and verdict of a state ------------------------------------------------------------------------------
-
-
-def misfits(state: State, residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
-    """Mean squared residual of each block, 1 being the model's own."""
-    return {
-        cell: float(np.mean(z**2)) / max(float(np.mean(state.own[cell] ** 2)), 0.05)
-        for cell, z in residuals.items()
-        if cell != RATES and len(z)
-    }
-
-
-def misfit(state: State, residuals: Mapping[Cell, np.ndarray]) -> float:
-    """Mean over the blocks; where only means were measured, of their totals."""
-    all_ = list(misfits(state, residuals).values())
-    if not all_ and len(residuals[RATES]):
-        return float(np.mean(residuals[RATES] ** 2))
-    return float(np.mean(all_)) if all_ else 1.0
-
-
-def usual_misfit(state: State) -> float:
-    """Below it are 95 % of the model's own recordings."""
-    own = [np.mean(z**2, axis=1) for cell, z in state.own.items() if cell != RATES]
-    return float(np.quantile(np.mean([o / max(o.mean(), 1e-30) for o in own], axis=0), 0.95)) if own else 1.2
-
-
-@dataclass(frozen=True)
-class Block:
-    """A check: a block of cells, or the totals. p: two-sided, of its sum or its worst cell."""
-
-    cell: Cell
-    p: float
-    worst: int
-    z: float
-
-
-def blocks(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> list[Block]:
-    """The checks of a state, judged with these residuals of the data, the clearest first."""
-    out = []
-    for cell, z in residuals.items():
-        if cell == RATES:
-            out += [Block(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)]
-            continue
-        p, worst = state.nulls[cell].chance(z)
-        out.append(Block(cell, p, worst, float(z[worst])))
-    out += [Block(cell, 1e-12, 0, 40.0) for cell in state.exact]
-    return sorted(out, key=lambda b: (b.p, -abs(b.z)))
-
-
-def failing(checks: Sequence[Block], level: float = comparing.FALSE_ALARM) -> list[Block]:
-    """Those that a right model would show once in a hundred times (Holm)."""
-    out = []
-    for rank, block in enumerate(checks):
-        if block.p > level / (len(checks) - rank):
-            break
-        out.append(block)
-    return out

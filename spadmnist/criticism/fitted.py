@@ -11,7 +11,7 @@ from joblib import Parallel
 from ..errors import InputError
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import fit, likelihood, recordings, settling
+from . import checks, fit, likelihood, recordings, settling
 from .answer import Diagnosis, Step, title
 from .candidates import Change, Key, changes
 from .course import Course, accept, begun, errors_known, material, settle_all
@@ -64,7 +64,7 @@ def fitted(
             "partly_explained" if left else "explained",
             before,
             course.misfit,
-            fit.usual_misfit(start),
+            checks.usual_misfit(start),
             nuisances(bench, course.state),
             course.steps,
             [],

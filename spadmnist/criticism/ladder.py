@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from . import fit
+from . import checks
 from .answer import plain, title
 from .fit import RATES, Bench, Cell, Moved, State
 from .tried import Tried
@@ -85,4 +85,4 @@ def placebo_row(
     times = one.times if one.gain > 0 else 0.0
     residuals = bench.residuals(state, one.moved, times)
     errors = errors_of(bench, state, residuals, one.moved.at(times))
-    return row(f"placebo: {title(one.change)}", fit.misfit(state, residuals), errors, True)
+    return row(f"placebo: {title(one.change)}", checks.misfit(state, residuals), errors, True)

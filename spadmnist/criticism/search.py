@@ -18,7 +18,7 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
-from . import fit, mapping, settling
+from . import checks, fit, mapping, settling
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
 from .chance import LEAST_P, of_map
 from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
@@ -280,13 +280,13 @@ class Search:
 
     def only_rates(self, state: State) -> bool:
         """Is nothing wrong but the totals?"""
-        failed = fit.failing(fit.blocks(self.bench, state, state.residuals))
+        failed = checks.failing(checks.blocks(self.bench, state, state.residuals))
         return bool(failed) and all(b.cell[0] == "" for b in failed)
 
     def telling(self, state: State) -> list[str]:
         """Up to three captures that show best what is wrong: a dark one, and those with the least likely checks."""
         worst = dict.fromkeys(state.made, 0.0)
-        for block in fit.blocks(self.bench, state, state.residuals):
+        for block in checks.blocks(self.bench, state, state.residuals):
             if block.cell[0] in worst:  # what one check in a hundred is by chance says little, but more than nothing
                 surprise = -math.log10(max(block.p, LEAST_P))
                 worst[block.cell[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
@@ -475,7 +475,7 @@ class Search:
         )
         if isinstance(found, str):
             return one
-        if boost == 1 and fit.failing(fit.blocks(self.bench, state, found.residuals)):
+        if boost == 1 and checks.failing(checks.blocks(self.bench, state, found.residuals)):
             found = self._probed(state, one, found)
         one.faint = boost > 1
         one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
@@ -506,7 +506,7 @@ class Search:
         left = {}
         for one in rivals:
             state = self.state_of(one)
-            left[id(one)] = len(fit.failing(fit.blocks(self.bench, state, state.residuals)))
+            left[id(one)] = len(checks.failing(checks.blocks(self.bench, state, state.residuals)))
         return min(rivals, key=lambda t: (left[id(t)], t.chips, -t.gain))
 
     def _showing(self, state: State, moved: Moved) -> list[str]:

@@ -1,0 +1,68 @@
+"""Checks: does a model fail beside the data, and by how much?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from . import compare as comparing
+from .fit import RATES, Bench, Cell, State
+
+
+def misfits(state: State, residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+    """Mean squared residual of each block, 1 being the model's own."""
+    return {
+        cell: float(np.mean(z**2)) / max(float(np.mean(state.own[cell] ** 2)), 0.05)
+        for cell, z in residuals.items()
+        if cell != RATES and len(z)
+    }
+
+
+def misfit(state: State, residuals: Mapping[Cell, np.ndarray]) -> float:
+    """Mean over the blocks; where only means were measured, of their totals."""
+    all_ = list(misfits(state, residuals).values())
+    if not all_ and len(residuals[RATES]):
+        return float(np.mean(residuals[RATES] ** 2))
+    return float(np.mean(all_)) if all_ else 1.0
+
+
+def usual_misfit(state: State) -> float:
+    """Below it are 95 % of the model's own recordings."""
+    own = [np.mean(z**2, axis=1) for cell, z in state.own.items() if cell != RATES]
+    return float(np.quantile(np.mean([o / max(o.mean(), 1e-30) for o in own], axis=0), 0.95)) if own else 1.2
+
+
+@dataclass(frozen=True)
+class Block:
+    """A check: a block of cells, or the totals. p: two-sided, of its sum or its worst cell."""
+
+    cell: Cell
+    p: float
+    worst: int
+    z: float
+
+
+def blocks(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> list[Block]:
+    """The checks of a state, judged with these residuals of the data, the clearest first."""
+    out = []
+    for cell, z in residuals.items():
+        if cell == RATES:
+            out += [Block(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)]
+            continue
+        p, worst = state.nulls[cell].chance(z)
+        out.append(Block(cell, p, worst, float(z[worst])))
+    out += [Block(cell, 1e-12, 0, 40.0) for cell in state.exact]
+    return sorted(out, key=lambda b: (b.p, -abs(b.z)))
+
+
+def failing(checks: Sequence[Block], level: float = comparing.FALSE_ALARM) -> list[Block]:
+    """Those that a right model would show once in a hundred times (Holm)."""
+    out = []
+    for rank, block in enumerate(checks):
+        if block.p > level / (len(checks) - rank):
+            break
+        out.append(block)
+    return out
