@@ -85,6 +85,8 @@ def _diagnosed(
             model = course.state
             if not _stands_out(course, tried, _TRACE if not course.steps else _LATER_TRACE):
                 break
+            if course.state is not model:  # which may show lines that the few recordings did not
+                tried = search.scan(course.state, everywhere=True, known=tried)
         if failed and all(b.cell[0] == "" for b in failed):
             found, others, wanted = _by_setup(course)
             if found:
