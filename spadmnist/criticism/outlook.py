@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +28,9 @@ _LONG = 100.0  # s of a long dark capture
 _LONGER = 10.0  # times a capture that is taken again, at most
 _MOST_FRAMES = 4.0  # the same of frames, which cost whether they hold anything or not
 _ONE_SIDED = 1.645  # 95 %
+_CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a trace that chance does not hide, and of one that it does
+_SATURATED = 1000.0  # of a trace that hardly grows any more
+_LOOKS = 5  # at other strengths, until that is found
 
 
 # --- which capture would tell ------------------------------------------------------------------------------------
@@ -205,41 +208,89 @@ def upper_limits(
     """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here).
 
     tried: every candidate as it was looked at in all captures. The weakest limit of its shapes: whatever the shape,
-    more would have been seen. What each would do at its limit is simulated once more.
+    more would have been seen. How the trace of each grows with its strength is simulated once more.
     """
     bench = search.bench
-    weakest: dict[str, tuple[float, float, Tried]] = {}
+    shapes: dict[str, list[_Shape]] = {}
     for one in tried:
         change = one.change
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
         trace = along(bench, state, one.moved)
         times = (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
-        if change.effect not in weakest or times > weakest[change.effect][0]:
-            weakest[change.effect] = times, trace.size, one
-    hidden = [name for name, (times, _, one) in weakest.items() if _strength(one, times) is None]
-    seen = {name: entry for name, entry in weakest.items() if name not in hidden}
-    models = []
-    for times, _, one in seen.values():
-        dial = one.change.strengths[0]
-        models.append(state.sensors.changed({**one.values, dial.key: _strength(one, times)}))
-    excluded = []
-    for (name, (times, size, one)), moved in zip(
-        seen.items(), bench.moved(state, models, fit.FEW, kept="sure"), strict=True
-    ):
-        dial = one.change.strengths[0]
-        if not isinstance(moved, str) and not 0.5 < times < 2:
-            # how the trace grows with the strength: in proportion, or with its square
-            there = along(bench, state, moved).size
-            if there > 0.2:
-                power = float(np.clip(math.log(there / size) / math.log(times), 1.0, 2.0))
-                times = times ** (1 / power)
-        limit = _strength(one, times)
-        if limit is None:
+        shapes.setdefault(change.effect, []).append((times, trace.size, one))
+    # a template that saturates does not tell which shape is the weakest
+    asked = {
+        (name, n): shape
+        for name, all_ in shapes.items()
+        for n, shape in enumerate(all_)
+        if shape is max(all_, key=lambda s: s[0]) or min(s[1] for s in all_) > _SATURATED
+    }
+    times_of = _at_limit(search, state, asked)
+    excluded, hidden = [], []
+    for name in shapes:
+        limits = [_strength(shape[2], times_of[key]) for key, shape in asked.items() if key[0] == name]
+        dial = shapes[name][0][2].change.strengths[0]
+        if None in limits:
             hidden.append(name)
         else:
-            excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(limit)})
+            far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
+            excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
     return excluded, [{"effect": name} for name in sorted(hidden)]
+
+
+_Shape = tuple[
+    float, float, Tried
+]  # times its strength that would be seen if that grew in proportion, size, what it is
+
+
+def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _Shape]) -> dict[tuple[str, int], float]:
+    """Times the strength at which each would just be seen, its trace growing as stronger ones tell.
+
+    Where it stands out clearly, but not by far, the power is measured with which it grows.
+    """
+    bench = search.bench
+    out: dict[tuple[str, int], float] = {}
+    open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
+    needed = {name: times * size for name, (times, size, _) in weakest.items()}
+    for name, (times, size, one) in weakest.items():
+        out[name] = times
+        if size <= 0:
+            continue
+        if one.moved.even is not None and size > needed[name]:  # what both signs do tells all weaker ones
+            out[name] = _solved(lambda t, m=one.moved: along(bench, state, m.at(t)).size, needed[name])  # type: ignore[misc]
+        elif size > 2 * _CLEARLY:
+            open_[name] = 1.0, size, _CLEARLY / size
+    for _ in range(_LOOKS):
+        known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
+        if not known:
+            break
+        models = []
+        for name, (_, _, try_) in known.items():
+            one = weakest[name][2]
+            dial = one.change.strengths[0]
+            models.append(state.sensors.changed({**one.values, dial.key: _strength(one, try_)}))
+        open_ = {}
+        for (name, (strong, size, try_)), moved in zip(
+            known.items(), bench.moved(state, models, fit.FEW, kept="sure"), strict=True
+        ):
+            there = 0.0 if isinstance(moved, str) else along(bench, state, moved).size
+            power = math.log(max(there, _HARDLY) / size) / math.log(try_ / strong)
+            out[name] = try_ * (needed[name] / max(there, _HARDLY)) ** (1 / min(max(power, 0.5), 10.0))
+            if there < _CLEARLY / 3:  # it grows faster: a trace that chance hides tells no power
+                open_[name] = strong, size, math.sqrt(strong * try_)
+            elif there > 6 * _CLEARLY:
+                open_[name] = try_, there, try_ * _CLEARLY / there
+    return out
+
+
+def _solved(size: Callable[[float], float], needed: float) -> float:
+    """Where a size that grows reaches what is needed, below 1."""
+    low, high = 1e-6, 1.0
+    for _ in range(30):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if size(middle) < needed else (low, middle)
+    return high
 
 
 def _strength(one: Tried, times: float) -> float | None:
