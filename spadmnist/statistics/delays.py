@@ -142,4 +142,4 @@ def _meeting(n: np.ndarray) -> np.ndarray:
     """(2 rows - 1, 2 columns - 1) sums over pixels of n times n so many rows and columns on; n: (rows, columns)."""
     from scipy import signal
 
-    return np.maximum(signal.correlate(n, n, method="fft"), 0.0)[::-1, ::-1]
+    return np.maximum(signal.correlate(n, n, method="fft"), 0.0)
