@@ -84,6 +84,14 @@ def test_what_would_have_been_seen_is_seen(lab):
         assert max(along) > 4 and limit > usual
 
 
+def test_the_limit_of_a_drift_is_what_a_ramp_of_so_many_detections_tells(lab):
+    """A strong drift is told by its square, a weak one by its sign: to root(12 / n), and 1.6 times that is excluded."""
+    bench = bench_of(lab(light=800, side=4))
+    limit, _ = limit_of(bench, "source_drift")
+    error = math.sqrt(12 / bench.seen["flat"].total)
+    assert 1.2 * error < limit < 5 * error
+
+
 # --- steps that are none -----------------------------------------------------------------------------------------
 
 

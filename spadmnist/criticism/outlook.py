@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -239,9 +239,8 @@ def upper_limits(
     return excluded, [{"effect": name} for name in sorted(hidden)]
 
 
-_Shape = tuple[
-    float, float, Tried
-]  # times its strength that would be seen if that grew in proportion, size, what it is
+# times the strength at which it would be seen if it grew in proportion, the size of its trace, what it is
+_Shape = tuple[float, float, Tried]
 
 
 def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _Shape]) -> dict[tuple[str, int], float]:
@@ -253,13 +252,9 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
     out: dict[tuple[str, int], float] = {}
     open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
     needed = {name: times * size for name, (times, size, _) in weakest.items()}
-    for name, (times, size, one) in weakest.items():
+    for name, (times, size, _) in weakest.items():
         out[name] = times
-        if size <= 0:
-            continue
-        if one.moved.even is not None and size > needed[name]:  # what both signs do tells all weaker ones
-            out[name] = _solved(lambda t, m=one.moved: along(bench, state, m.at(t)).size, needed[name])  # type: ignore[misc]
-        elif size > 2 * _CLEARLY:
+        if size > 2 * _CLEARLY:
             open_[name] = 1.0, size, _CLEARLY / size
     for _ in range(_LOOKS):
         known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
@@ -282,15 +277,6 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
             elif there > 6 * _CLEARLY:
                 open_[name] = try_, there, try_ * _CLEARLY / there
     return out
-
-
-def _solved(size: Callable[[float], float], needed: float) -> float:
-    """Where a size that grows reaches what is needed, below 1."""
-    low, high = 1e-6, 1.0
-    for _ in range(30):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if size(middle) < needed else (low, middle)
-    return high
 
 
 def _strength(one: Tried, times: float) -> float | None:
