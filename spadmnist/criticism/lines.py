@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import ndimage, stats
 
 from .fit import RATES, Bench, State
+from .nulls import Null
 
 _CLEAR = 1e-3  # p-value of a line, all frequencies that were looked at taken into account
 _MOST = 2  # lines
 _APART = 2.5  # bins of the shortest capture between two lines
+_BESIDE, _OWN = 12, 3.0  # bins to each side that are alike; standard deviations of a line that the model has
 _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 
@@ -60,7 +62,7 @@ def lines(bench: Bench, state: State) -> list[Line]:
         if summary.axis is None or len(z) < 3:
             continue
         step = float(summary.axis[1] - summary.axis[0])
-        surprise = -stats.norm.logsf(z)
+        surprise = _surprise(state.nulls[id, name], np.asarray(summary.values, float), z, bench.seen[id].total)
         dark = bench.seen[id].capture.light.dark
         spectra.append(_Spectrum(np.asarray(summary.values, float), z, surprise, step, dark))
     groups = [[s] for s in spectra]
@@ -76,6 +78,16 @@ def lines(bench: Bench, state: State) -> list[Line]:
         if all(abs(line.frequency - other.frequency) > apart for other in kept):
             kept.append(line)
     return kept[:_MOST]
+
+
+def _surprise(null: Null, power: np.ndarray, z: np.ndarray, total: float) -> np.ndarray:
+    """-log p of each bin. What the model's few recordings have there is known better from the bins beside it, unless
+    they have a line of their own."""
+    expected, _ = null.expected(total)
+    beside = ndimage.uniform_filter1d(expected, 2 * _BESIDE + 1, mode="nearest")
+    own = expected > beside * (1 + _OWN / math.sqrt(null.recordings))
+    many = null.recordings * 2 * _BESIDE
+    return np.where(own, -stats.norm.logsf(z), many * np.log1p(power / np.maximum(beside, 1e-30) / many))
 
 
 def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
