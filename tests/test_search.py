@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import chance, fit, recordings
+from spadmnist.criticism import chance, checks, fit, recordings
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.fit import Bench, Moved
@@ -193,8 +193,8 @@ class _Model:
 def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
     bench = bench_of(lab())
     look = quiet(bench)
-    monkeypatch.setattr(fit, "blocks", lambda bench, state, residuals: [None] * state.left)
-    monkeypatch.setattr(fit, "failing", lambda checks: checks)
+    monkeypatch.setattr(checks, "blocks", lambda bench, state, residuals: [None] * state.left)
+    monkeypatch.setattr(checks, "failing", lambda checks: checks)
     nothing = Moved({}, {}, {})
     map_ = Tried(change_of(bench, "per_pixel dark_counts.rate"), {}, nothing, 90.0, 1.0, maps={})
     map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
