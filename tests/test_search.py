@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import chance, checks, fit, recordings
+from spadmnist.criticism import chance, checks, recordings
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.fit import Bench, Moved
