@@ -906,8 +906,7 @@ def _run(arguments: list[str] | None) -> int:
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
-        _say("\nInterrupted. What is complete is kept: the same command goes on from there.")
-        return 130
+        return _interrupted()
     except click.ClickException as error:
         with contextlib.suppress(OSError, ValueError):
             error.show()
@@ -930,13 +929,20 @@ def _run(arguments: list[str] | None) -> int:
         _say(f"Error: {error.filename or 'the system'}: {error.strerror or error}")
         return 2
     except Exception as error:
-        if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):  # in the middle of compiled code
-            return 130 if isinstance(error.__cause__, KeyboardInterrupt) else 143
+        if isinstance(error.__cause__, KeyboardInterrupt):  # in the middle of compiled code
+            return _interrupted()
+        if isinstance(error.__cause__, SystemExit):
+            return 143
         if os.environ.get("SPADMNIST_DEBUG"):
             raise
         _say(f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}")
         _say("SPADMNIST_DEBUG=1 shows where; please report it.")
         return 2
+
+
+def _interrupted() -> int:
+    _say("\nInterrupted. What is complete is kept: the same command goes on from there.")
+    return 130
 
 
 if __name__ == "__main__":

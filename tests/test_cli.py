@@ -567,3 +567,18 @@ def test_names_with_blanks_and_of_any_alphabet(made: tuple[Path, Path], tmp_path
     repaired = run("verify", "a b", "--repair", *plugin, cwd=home)
     assert repaired.returncode == 0, repaired
     assert_same(home / "a b", expected)
+
+
+@pytest.mark.parametrize(("cause", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
+def test_an_end_in_the_middle_of_compiled_code_is_no_fault(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cause: BaseException, code: int
+) -> None:
+    """Compiled code turns what a signal raises into a SystemError."""
+    from spadmnist import cli as command_line
+
+    def stopped(*given: object, **more: object) -> None:
+        raise SystemError("returned a result with an exception set") from cause
+
+    monkeypatch.setattr(command_line.cli, "main", stopped)
+    assert command_line._run([]) == code
+    assert "fault" not in capsys.readouterr().err

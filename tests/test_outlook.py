@@ -240,5 +240,5 @@ def test_no_chance_is_none_at_all(lab):
     assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
     course = course_of.begun(bench_of((sensor, data)))
     one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
-    significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e12))
-    assert 0 < p < 1e-50 and math.isfinite(significance)  # sixteen recordings know their scatter badly
+    significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e18))
+    assert 0 < p < 1e-100 and math.isfinite(significance)
