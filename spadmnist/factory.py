@@ -34,6 +34,7 @@ from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
+from .heap import keep_freed_memory
 from .images import Images
 from .reconstruct import median_of_nonzero
 from .store import ShardReader
@@ -134,17 +135,6 @@ def _start_worker(parent: int) -> None:
     if os.getppid() != parent:
         os._exit(1)
     keep_freed_memory()
-
-
-def keep_freed_memory() -> None:
-    """Ask the C library to keep what is freed for the next shard instead of returning it to the system.
-
-    Fresh pages cost more than the simulation that fills them. Only where the library is glibc.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 1 << 25)  # M_MMAP_THRESHOLD, at its largest
-        libc.mallopt(-1, 1 << 29)  # M_TRIM_THRESHOLD
 
 
 # --- running tasks ------------------------------------------------------------------------------------------------

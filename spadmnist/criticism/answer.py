@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import units
-from ..effects import Effect
+from ..effects import Effect, Mimic
 from ..statistics import Statistic, Summary
 from .candidates import Change, Dial, Key
 from .fit import Cell
@@ -161,10 +161,10 @@ def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
     return f"{who}; {'it is there in the dark, too' if in_dark else 'it shows in light alone'}"
 
 
-def mimic(change: Change) -> str:
-    """What is not in the catalogue and would look the same; nothing where nothing is known."""
+def mimic(change: Change) -> Mimic | None:
+    """What is not in the catalogue and would look the same; None where nothing is known."""
     known = change.effect in Effect.registry
-    return Effect.registry.find(change.effect).mimic if change.kind == "add" and known else ""
+    return Effect.registry.find(change.effect).mimic if change.kind == "add" and known else None
 
 
 def canonical(found: Diagnosis) -> str:
@@ -180,7 +180,8 @@ def table(found: Diagnosis) -> str:
         text = f"{number}. {title(step.change)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
         text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
         lines += textwrap.wrap(text, 100, subsequent_indent="   ")
-        lines += textwrap.wrap(mimic(step.change), 100, initial_indent="   But: ", subsequent_indent="   ")
+        but = mimic(step.change)
+        lines += textwrap.wrap(str(but or ""), 100, initial_indent="   But: ", subsequent_indent="   ")
     for entry in found.setup:
         f = entry["factor"]
         where = entry["capture"] or "all"

@@ -14,21 +14,22 @@ from typing import Any
 
 from joblib import Parallel
 
+from ..effects import Mimic
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import chance, checks, outlook, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
 from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
-from .findings import nuisances, remainder, traces
+from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
 from .search import alike
 from .tried import Tried
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
-_TRACE = 1e-2  # p-value of a trace that is followed where no check fails by itself
-_MAYBE, _CLOSER = 100.0, 128  # times as likely by chance: worth so many recordings
+_TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself: far less than what checks alarm by
+_MAYBE, _CLOSER = 100.0, recordings.REPLICATES  # times as likely by chance: worth so many recordings
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 _TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
@@ -150,6 +151,12 @@ def _diagnosed(
         if near:
             verdict = "confused"
             advice += outlook.advice(course.search, course.state, *near[-1])
+        for step in course.steps:
+            unlisted = mimicked(step)
+            if unlisted is not None:
+                verdict = "confused"
+                step.alternatives.insert(0, _outside(unlisted, course.misfit))
+                advice.append(outlook.advice_on_mimic(step, unlisted))
     if rival is not None:
         step = _rival_step(course, rival)
         course.steps.append(step)
@@ -205,7 +212,7 @@ def _stands_out(course: Course, tried: Sequence[Tried], trace: float) -> bool:
 def _closer(course: Course) -> State:
     """The model as it is, simulated more often."""
     course.bench.say("a closer look at what may be there")
-    return course.bench.state(course.values, course.state.sensors, _CLOSER)
+    return course.bench.state(course.values, course.state.sensors, _CLOSER, course.state)
 
 
 def _verdict(course: Course, left: Sequence[checks.Block], setup: bool, rival: Tried | None) -> str:
@@ -243,6 +250,11 @@ def _rival_step(course: Course, rival: Tried) -> Step:
     value = Value(float(rival.values[dial.key]), low, high, dial.unit)
     left = checks.misfit(course.state, rival.residuals or course.state.residuals)
     return Step(rival.change, {dial.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike")
+
+
+def _outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
+    """What is not in the catalogue, as an alternative."""
+    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": mimic.what}
 
 
 def _alternatives(

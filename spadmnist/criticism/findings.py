@@ -9,12 +9,31 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ..effects import Mimic
+from ..statistics import Statistic
 from . import checks
 from . import compare as comparing
-from .answer import Trace, plain
+from .answer import Step, Trace, mimic, plain
 from .fit import Bench, Cell, State
 
 _LEAST_P = 1e-300
+_TOLD_APART = 4.0  # standard deviations of a trace where what looks the same elsewhere would leave none
+
+
+def mimicked(step: Step) -> Mimic | None:
+    """What is not in the catalogue and does what this step does, in all that was measured; None where nothing is."""
+    other = mimic(step.change)
+    if other is None:
+        return None
+    apart = [t for (_, name), t in step.template.items() if name in _REGISTRY and _among(name) != other.among]
+    return other if sum(float(t @ t) for t in apart) < _TOLD_APART**2 else None
+
+
+_REGISTRY = Statistic.registry
+
+
+def _among(name: str) -> str:
+    return _REGISTRY.find(name).among
 
 
 def remainder(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> list[dict[str, Any]]:

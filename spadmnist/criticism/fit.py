@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from joblib import Parallel, delayed
 
 from .. import twin
 from ..errors import SpadError
+from ..heap import keep_freed_memory
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
@@ -30,6 +31,7 @@ from .shifts import beyond_noise, difference
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
+_GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point falls into the widest gap
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
@@ -92,6 +94,13 @@ class Moved:
     logs: dict[str, float]  # of the light that gives as many detections
     nothing: bool = False
     even: Moved | None = None
+
+    def only(self, ids: Collection[str]) -> Moved:
+        """The same, seen in some captures alone; of the others, the totals."""
+        shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
+        noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
+        even = None if self.even is None else self.even.only(ids)
+        return Moved(shifts, noise, self.logs, self.nothing, even)
 
     def at(self, times: float) -> Moved:
         """What it does at so many times its strength."""
@@ -177,6 +186,7 @@ def _task(
 
     hasty: without statistics that cost much.
     """
+    keep_freed_memory()
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
     known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
@@ -328,12 +338,23 @@ class Bench:
         centre, half = recordings.levels_about(expected, seen.total, stated, capture)
         return centre, stated, expected, half
 
-    def state(self, values: Values, sensors: Sensors | None = None, replicates: int | None = None) -> State:
-        """Learn what the model makes of every capture, and judge the data by it."""
+    def state(
+        self,
+        values: Values,
+        sensors: Sensors | None = None,
+        replicates: int | None = None,
+        known: State | None = None,
+    ) -> State:
+        """Learn what the model makes of every capture, and judge the data by it.
+
+        known: the same model, simulated less often: its recordings are the first of these.
+        """
         sensors = sensors or Sensors.same(with_values(self.start, values))
         n = replicates or self.replicates
-        order = np.random.Generator(np.random.SFC64(n)).permutation(n)
-        numbers = np.arange(n, dtype=np.uint64)
+        there = len(known.own[RATES]) if known else 0
+        # evenly spread however many they are, and so are the first of them, and every fourth
+        spread = 2 * np.modf((np.arange(n) + 0.5) * _GOLDEN)[0] - 1
+        numbers = np.arange(there, n, dtype=np.uint64)
         about, wanted = {}, []
         state = State(dict(values), sensors, {}, {}, {}, {}, {}, {}, [])
         for id, seen in self.seen.items():
@@ -341,13 +362,15 @@ class Bench:
                 state.rates[id], state.factors[id] = recordings.of_mean(sensors.usual(id), seen.capture, seen.total, n)
                 continue
             centre, stated, expected, half = self._centre(sensors.usual(id), seen)
-            factors = np.exp(half * np.linspace(-1, 1, n)[order])
+            factors = np.exp(half * spread)
             about[id] = centre, stated, expected, factors
-            wanted.append((sensors, id, centre * factors, numbers))
+            wanted.append((sensors, id, centre * factors[there:], numbers))
         results = self.simulate(wanted, pieces=4)
         for (id, (centre, stated, expected, factors)), made in zip(about.items(), results, strict=True):
             if isinstance(made, str):
                 raise SpadError(f"{id}: {made}")
+            if known:
+                made = _joined([known.made[id], made])
             state.made[id] = made
             law, scatter = recordings.law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
             state.rates[id] = recordings.CaptureNull(centre, stated, made.totals, expected, law, scatter, {})
@@ -440,27 +463,27 @@ class Bench:
         only: Sequence[str] = (),
         hasty: bool = True,
         kept: Kept = "likely",
+        only_of: Sequence[Collection[str]] | None = None,
     ) -> list[Moved | str]:
         """What each of these models would change.
 
         few: recordings of each capture; only: of some captures; hasty: without statistics that cost much; kept: of what
         the recordings show, what is hardly ever chance (a trace), what is hardly all chance (a slope, which would be
-        too small without it), or all.
+        too small without it), or all. only_of: captures of each model by itself.
         """
         numbers = np.arange(few, dtype=np.uint64)
-        ids = [id for id in state.made if not only or id in only]
+        ids_of = [[id for id in state.made if not some or id in some] for some in only_of or [only] * len(models)]
         wanted = []
-        for sensors in models:
+        for sensors, ids in zip(models, ids_of, strict=True):
             for id in ids:
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = self.simulate(wanted, pieces=1, hasty=hasty)
+        results = iter(self.simulate(wanted, pieces=1, hasty=hasty))
         out: list[Moved | str] = []
-        for i in range(len(models)):
-            part = results[i * len(ids) : (i + 1) * len(ids)]
-            wrong = [p for p in part if isinstance(p, str)]
-            joined = dict(zip(ids, part, strict=True))
-            out.append(wrong[0] if wrong else self._moved(state, models[i], joined, kept))  # type: ignore[arg-type]
+        for sensors, ids in zip(models, ids_of, strict=True):
+            made = {id: next(results) for id in ids}
+            wrong = [m for m in made.values() if isinstance(m, str)]
+            out.append(wrong[0] if wrong else self._moved(state, sensors, made, kept))  # type: ignore[arg-type]
         return out
 
     def _moved(self, state: State, sensors: Sensors, made: dict[str, Made], kept: Kept) -> Moved | str:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from .. import twin, units
-from ..effects import Conditions
+from ..effects import Conditions, Mimic
 from ..recording import Capture, Light, Recording
 from . import fit, recordings
-from .answer import plain
+from .answer import Step, plain
 from .candidates import Change
 from .chance import along
-from .fit import Bench, Seen, Sensors, State
+from .fit import Bench, Moved, Seen, Sensors, State
 from .search import Search
 from .setups import Explanation
 from .tried import Tried
@@ -29,6 +29,7 @@ _LONGER = 10.0  # times a capture that is taken again, at most
 _MOST_FRAMES = 4.0  # the same of frames, which cost whether they hold anything or not
 _ONE_SIDED = 1.645  # 95 %
 _CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a trace that chance does not hide, and of one that it does
+_MOST_OF = 0.9  # of the square of a trace, which so many captures show
 _SATURATED = 1000.0  # of a trace that hardly grows any more
 _LOOKS = 5  # at other strengths, until that is found
 
@@ -171,6 +172,11 @@ def advice_on_totals(search: Search, state: State, setup: Explanation, other: Tr
     return [_told(best[1], [setup.factors[0].quantity, other.change.effect], now, math.hypot(now, best[0]))]
 
 
+def advice_on_mimic(step: Step, other: Mimic) -> dict[str, Any]:
+    """What tells a finding from what looks the same in all that was measured: at least as clearly as it was found."""
+    return _told(other.capture, [step.change.effect, other.what], 0.0, step.significance)
+
+
 def _dark(conditions: Conditions) -> Conditions:
     return replace(conditions, wavelength=None)
 
@@ -251,11 +257,15 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
     bench = search.bench
     out: dict[tuple[str, int], float] = {}
     open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
-    needed = {name: times * size for name, (times, size, _) in weakest.items()}
-    for name, (times, size, _) in weakest.items():
+    needed: dict[tuple[str, int], float] = {}
+    where: dict[tuple[str, int], tuple[str, ...]] = {}
+    for name, (times, size, one) in weakest.items():
         out[name] = times
         if size > 2 * _CLEARLY:
-            open_[name] = 1.0, size, _CLEARLY / size
+            where[name] = _telling(bench, state, one.moved)
+            seen = along(bench, state, one.moved.only(where[name])).size
+            needed[name] = times * seen
+            open_[name] = 1.0, seen, _CLEARLY / seen
     for _ in range(_LOOKS):
         known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
         if not known:
@@ -266,10 +276,11 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
             dial = one.change.strengths[0]
             models.append(state.sensors.changed({**one.values, dial.key: _strength(one, try_)}))
         open_ = {}
+        only = [where[name] for name in known]
         for (name, (strong, size, try_)), moved in zip(
-            known.items(), bench.moved(state, models, fit.FEW, kept="sure"), strict=True
+            known.items(), bench.moved(state, models, fit.FEW, kept="sure", only_of=only), strict=True
         ):
-            there = 0.0 if isinstance(moved, str) else along(bench, state, moved).size
+            there = 0.0 if isinstance(moved, str) else along(bench, state, moved.only(where[name])).size
             power = math.log(max(there, _HARDLY) / size) / math.log(try_ / strong)
             out[name] = try_ * (needed[name] / max(there, _HARDLY)) ** (1 / min(max(power, 0.5), 10.0))
             if there < _CLEARLY / 3:  # it grows faster: a trace that chance hides tells no power
@@ -277,6 +288,17 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
             elif there > 6 * _CLEARLY:
                 open_[name] = try_, there, try_ * _CLEARLY / there
     return out
+
+
+def _telling(bench: Bench, state: State, moved: Moved) -> tuple[str, ...]:
+    """The captures that show most of what a model changes."""
+    told = dict.fromkeys(state.made, 0.0)
+    for cell, t in bench.template(state, moved).items():
+        if cell[0] in told:
+            told[cell[0]] += float(t @ t)
+    best = sorted(told, key=lambda id: -told[id])
+    so_far = np.cumsum([told[id] for id in best])
+    return tuple(best[: 1 + int(np.searchsorted(so_far, _MOST_OF * so_far[-1]))])
 
 
 def _strength(one: Tried, times: float) -> float | None:

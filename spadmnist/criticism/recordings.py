@@ -18,6 +18,7 @@ from scipy import stats
 
 from .. import plugins, twin
 from ..effects import Conditions
+from ..heap import keep_freed_memory
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Statistic, Summary
@@ -180,6 +181,7 @@ def _recordings_of(
     model: Packed, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
 ) -> tuple[list[int], dict[str, list[Summary]]]:
     """(totals, summaries by statistic) of some of the model's recordings: the task of a worker."""
+    keep_freed_memory()
     sensor = model.sensor
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}

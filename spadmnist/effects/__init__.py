@@ -110,6 +110,21 @@ class Chip:
         return np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
 
 
+@dataclass(frozen=True)
+class Mimic:
+    """What no effect describes and yet leaves the trace of one: said wherever a diagnosis names that one.
+
+    among: the `Statistic.among` of all statistics in which the two look the same; capture: what would tell.
+    """
+
+    what: str
+    among: str
+    capture: str
+
+    def __str__(self) -> str:
+        return f"{self.what} would look the same; only {self.capture} tells them apart"
+
+
 class Effect(Plugin, abstract=True):
     """Base of every effect; see the table of stages above."""
 
@@ -124,8 +139,7 @@ class Effect(Plugin, abstract=True):
     )
     # which statistics it moves, for the contract tests (`spadmnist.testing`); every other one stays as it is
     moves: ClassVar[tuple[str, ...]] = ()
-    # what no effect describes and yet does the same, and what would tell: said wherever a diagnosis names this one
-    mimic: ClassVar[str] = ""
+    mimic: ClassVar[Mimic | None] = None
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         if stage is not None:

@@ -7,7 +7,7 @@ import numpy as np
 from .. import kernels
 from ..events import Events
 from ..streams import Draws
-from . import Effect, parameter
+from . import Effect, Mimic, parameter
 
 
 class Jitter(Effect, stage="timing"):
@@ -23,10 +23,7 @@ class Jitter(Effect, stage="timing"):
 
     counted = True
     moves = ("edge",)
-    mimic = (
-        "a dead time that differs from event to event blurs the edge of the intervals in the same way; "
-        "only a pulsed source tells them apart"
-    )
+    mimic = Mimic("a dead time that differs from event to event", "pixel", "a pulsed source")
 
     sigma = parameter(
         50e-12,

@@ -148,6 +148,8 @@ def _name(entry: Mapping[str, Any]) -> str:
     """What people call an alternative, as `answer.title` does a change."""
     if entry["change"] == "add":
         return str(entry["effect"])
+    if entry["effect"] is None:
+        return f"{entry['what']}, which the catalogue does not have"
     return f"{entry['effect']}.{entry['parameter']}" + (" per pixel" if entry["change"] == "per_pixel" else "")
 
 
@@ -162,7 +164,8 @@ def _step(step: Step) -> _Card:
     about = _about(step.change.effect)
     if step.change.parameter in declared:
         about = f"{step.change.parameter}: {declared[step.change.parameter]['about']}. {about}"
-    about += f" But: {answer.mimic(step.change)}." if answer.mimic(step.change) else ""
+    but = answer.mimic(step.change)
+    about += f" But: {but}." if but else ""
     return _Card(answer.title(step.change), step, _KINDS.get(step.change.kind, step.change.kind), about, numbers)
 
 
@@ -381,7 +384,7 @@ in physical units.</p>
 <tr class="chosen"><td>{{ card.title }} (chosen)</td><td class="figure">{{ card.step.misfit | number }}</td></tr>
 {% for other in card.step.alternatives %}
 <tr><td>{{ name(other) }}\
-{% if about(other.effect) %}<br><span class="small">{{ about(other.effect) }}</span>{% endif %}</td>\
+{% if other.effect and about(other.effect) %}<br><span class="small">{{ about(other.effect) }}</span>{% endif %}</td>\
 <td class="figure">{{ other.misfit | number }}</td></tr>
 {% endfor %}
 </tbody></table></div>

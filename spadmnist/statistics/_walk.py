@@ -26,6 +26,8 @@ _GAPS = (1e-9, 10e-9)  # s
 _PER_DECADE = 10
 _AT_ONCE = 16384  # events that are sorted together: they fit into the cache
 _DEEP = 4  # stamps of a pixel that are held; what is earlier is looked up
+_FEW_BACK = 25.0  # detections of the array within the longest lag, up to which all of them are gone through
+_RANGES = 8  # of lags, at most: a number that the compiler knows
 _SHIFTS = 64  # steps between stamps up to which those of the whole array are compared in turn
 _NEVER = -(1 << 62)
 
@@ -244,9 +246,15 @@ def _through_exposure(
     times = np.empty(0, np.int64)
     heads = np.empty((2, 2049), np.int64)
     held = 0  # stamps of the slabs before that are near enough to matter
+    longest = lags[lags.size - 1]
+    back = stride > 0 and np.float64(total) * longest < _FEW_BACK * end
+    reach = REACH * (stride + 1)
+    entry_of = np.full(2 * reach + 2, step.size)  # of the way from one spot to another; nobody's are the last
+    for e in range(step.size if back else 0):
+        entry_of[step[e] + reach] = e
+    tail = 0  # of them, those that stand before the sorted ones
     runs = np.ones(gaps.size, np.int64)
     last = np.int64(-1)
-    longest = lags[lags.size - 1]
     for slab in range(slabs):
         stop = (slab + 1) * width if slab < slabs - 1 else top
         before = position.copy()
@@ -257,18 +265,24 @@ def _through_exposure(
             count = _gather(stamps, offsets, position, stop, spot, bits, raw)
         if spare.size < count:
             spare = np.empty(raw.size, np.int64)
-            ordered = np.empty(raw.size, np.int64)
+        if ordered.size < tail + count:
+            wider = np.empty(tail + raw.size, np.int64)
+            wider[:tail] = ordered[:tail]
+            ordered = wider
         if times.size < held + count:
             grown = np.empty(held + raw.size, np.int64)
             grown[:held] = times[:held]
             times = grown
-        sort_ticks(raw, count, (slab * width) << bits, width << bits, ordered, 0, spare, heads)
-        _near_pairs(
-            ordered[:count], bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
-            row_of, recent, latest_at, passed, found, later,
-        )  # fmt: skip
+        sort_ticks(raw, count, (slab * width) << bits, width << bits, ordered, tail, spare, heads)
+        if back:
+            _near_pairs_back(ordered, tail, tail + count, bits, lags, latest, entry_of, kind, second, found, later)
+        else:
+            _near_pairs(
+                ordered[:count], bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
+                row_of, recent, latest_at, passed, found, later,
+            )  # fmt: skip
         for i in range(count):
-            times[held + i] = ordered[i] >> bits
+            times[held + i] = ordered[tail + i] >> bits
         last = _follow(times, held, held + count, last, edges, start, gaps, kinds, runs, spacings, clusters)
         whole = held + count
         for k in range(lags.size):
@@ -276,6 +290,10 @@ def _through_exposure(
         oldest = _since(times, 0, whole, stop - longest)
         for i in range(oldest, whole):
             times[i - oldest] = times[i]
+        if back:  # as many of those that know their spots
+            for i in range(oldest, whole):
+                ordered[i - oldest] = ordered[i]
+            tail = whole - oldest
         held = whole - oldest
     _finish(kinds, runs, clusters)
 
@@ -298,6 +316,60 @@ def _gather(stamps, offsets, position, stop, spot, bits, raw):
 
 
 @jit
+def _ranges(lags, latest):
+    """(ranges of lags: up to each of these, then so far that nothing is; how many they are)."""
+    ranges = np.unique(np.append(lags, np.array([1, latest])))
+    limits = np.full(_RANGES, lags[lags.size - 1])
+    limits[: ranges.size] = ranges
+    return limits, ranges.size
+
+
+@jit
+def _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later):
+    """Add what was counted by entry and range of lags to the classes of near pixels."""
+    for e in range(kind.size):
+        b = 0
+        for k in range(ranges):
+            while lags[b] < limits[k]:
+                b += 1
+            found[kind[e], b] += counters[e, k]
+            if second[e] and 1 < limits[k] <= latest:
+                later[kind[e]] += counters[e, k]
+
+
+@jit
+def _near_pairs_back(ordered, begin, end, bits, lags, latest, entry_of, kind, second, found, later):
+    """As `_near_pairs`, where few stamps are near in time: all of these are gone through.
+
+    ordered: of the stamps before `begin` those that are near enough are there, too; entry_of: see `_through_exposure`.
+    """
+    mask = (np.int64(1) << bits) - 1
+    longest = lags[lags.size - 1]
+    limits, ranges = _ranges(lags, latest)
+    counters = np.zeros((kind.size + 1, _RANGES + 1), np.int64)
+    reach = np.int64(entry_of.size // 2 - 1)
+    most = np.uint64(entry_of.size - 1)
+    for i in range(begin, end):
+        now = ordered[i] >> bits
+        here = reach - (ordered[i] & mask)
+        j = i - 1
+        while j >= 0:
+            lag = now - (ordered[j] >> bits)
+            if lag >= longest:
+                break
+            # far ones, which are most, all go to the place behind the last
+            way = min(np.uint64(here + (ordered[j] & mask)), most)
+            e = entry_of[way]
+            if e < kind.size:
+                k = np.uint64(0)
+                for limit in range(_RANGES):
+                    k += np.uint64(lag >= limits[limit])
+                counters[e, k] += 1
+            j -= 1
+    _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
+
+
+@jit
 def _near_pairs(
     ordered, bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
     row_of, recent, latest_at, passed, found, later,
@@ -305,11 +377,8 @@ def _near_pairs(
     """Count the pairs that each stamp makes with earlier ones around it; moves `recent`, ..., `passed` on."""
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
-    # ranges of lags: up to each of these; those that are not used lie beyond what is looked at
-    ranges = np.unique(np.append(lags, np.array([1, latest])))
-    limits = np.full(8, longest)
-    limits[: ranges.size] = ranges
-    counters = np.zeros((step.size, limits.size + 1), np.int64)
+    limits, ranges = _ranges(lags, latest)
+    counters = np.zeros((step.size, _RANGES + 1), np.int64)
     hits = np.empty(step.size + 1, np.int64)
     begin, end, base = np.int64(0), np.int64(step.size), np.int64(0)
     for i in range(ordered.size):
@@ -331,7 +400,7 @@ def _near_pairs(
                 for h in range(some):
                     lag = now - recent[depth, np.uint64(base + step[hits[h]])]
                     k = np.uint64(0)
-                    for limit in range(limits.size):
+                    for limit in range(_RANGES):
                         k += np.uint64(lag >= limits[limit])
                     counters[np.uint64(hits[h]), k] += 1
                 depth += 1
@@ -354,14 +423,7 @@ def _near_pairs(
         recent[0, here] = now
         latest_at[0] = now
         passed[here] += 1
-    for e in range(step.size):
-        b = 0
-        for k in range(ranges.size):
-            while lags[b] < limits[k]:
-                b += 1
-            found[kind[e], b] += counters[e, k]
-            if second[e] and 1 < limits[k] <= latest:
-                later[kind[e]] += counters[e, k]
+    _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
 
 
 @jit

@@ -20,6 +20,7 @@ from ._walk import REACH
 _STEP, _LONGEST = 1e-9, 300e-9  # s, between delays; the longest
 _MOST_STEPS = 4096  # from one pixel to another, of a grid
 _PAIRS = 1_500_000  # that are looked at, about
+_PLACE, _HERE = 12, 4095  # bits of a place on the grid
 _LEAST_CHANCE = 1e-6  # of pairs that chance makes
 
 
@@ -59,14 +60,14 @@ class Delays(Statistic):
         if len(ticks):
             by_chance = len(ticks) ** 2 * step * delays / exposure
             looked_at = math.ceil(exposure * min(1.0, _PAIRS / max(by_chance, 1.0)))
-        pixels = np.repeat(np.arange(recording.pixels, dtype=np.uint64), np.diff(offsets))
         some = ticks < looked_at
-        order = np.sort((ticks[some].astype(np.uint64) << np.uint64(16)) | pixels[some])
+        pixels = np.repeat(np.arange(recording.pixels), np.diff(offsets))[some]
+        order = np.sort((ticks[some].astype(np.int64) << _PLACE) | steps.place[pixels])
         counts = np.zeros((steps.number, delays), np.int32)
-        _count(order, columns, rows, step, counts)
+        _count(order, step, counts)
         counts = steps.joined(counts)
         most = counts.max(axis=1)
-        n = np.bincount(pixels[some].astype(np.int64), minlength=recording.pixels).astype(np.float64)
+        n = np.bincount(pixels, minlength=recording.pixels).astype(np.float64)
         chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
         scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
 
@@ -89,12 +90,15 @@ def _steps(rows: int, columns: int) -> _Steps:
 
 class _Steps:
     """Steps from one pixel to another that is more than 3 pitches away: names of those over the grid, then of those in
-    the order of read-out. number: of all over the grid, those that are not so far among them.
+    the order of read-out. number: of all over the grid, those that are not so far among them. place: of each pixel, on
+    a grid so wide that the way from one to another is their difference.
     """
 
     def __init__(self, rows: int, columns: int):
         width = 2 * columns - 1
         self.number = width * (2 * rows - 1)
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        self.place = row * width + column
         down, right = np.divmod(np.arange(self.number), width)
         down, right = down - (rows - 1), right - (columns - 1)
         self.far = np.flatnonzero(down**2 + right**2 > REACH**2)
@@ -106,9 +110,9 @@ class _Steps:
     def joined(self, counts: np.ndarray) -> np.ndarray:
         """Of each step by name what `counts` (steps over the grid, ...) has of it."""
         of_grid = counts[self.far]
-        of_order = np.zeros((len(self.names) - len(self.far), *counts.shape[1:]), counts.dtype)
-        np.add.at(of_order, self.kind, of_grid)
-        return np.concatenate([of_grid, of_order])
+        by_kind = np.argsort(self.kind, kind="stable")
+        first = np.flatnonzero(np.diff(self.kind[by_kind], prepend=-1))
+        return np.concatenate([of_grid, np.add.reduceat(of_grid[by_kind], first)])
 
 
 def _over_the_grid(right: int, down: int) -> str:
@@ -121,21 +125,17 @@ _ENDS = ("up", "down")
 
 
 @jit
-def _count(order, columns, rows, step, counts):
-    """Add pairs to counts (steps over the grid, delays). order: (detections,) tick << 16 | pixel, rising."""
-    delays = counts.shape[1]
-    width = 2 * columns - 1
-    longest = np.int64(step * delays)
+def _count(order, step, counts):
+    """Add pairs to counts (steps over the grid, delays). order: (detections,) tick << _PLACE | place, rising."""
+    of_lag = np.arange(step * counts.shape[1]) // step
+    zero = counts.shape[0] // 2  # no way at all
     for i in range(order.size):
-        at, pixel = np.int64(order[i] >> np.uint64(16)), np.int64(order[i] & np.uint64(0xFFFF))
-        row, column = pixel // columns, pixel % columns
+        at, here = order[i] >> _PLACE, (order[i] & _HERE) - zero
         for j in range(i + 1, order.size):
-            lag = np.int64(order[j] >> np.uint64(16)) - at
-            if lag >= longest:
+            lag = (order[j] >> _PLACE) - at
+            if lag >= of_lag.size:
                 break
-            other = np.int64(order[j] & np.uint64(0xFFFF))
-            down, right = other // columns - row, other % columns - column
-            counts[(down + rows - 1) * width + right + columns - 1, lag // step] += 1
+            counts[(order[j] & _HERE) - here, of_lag[lag]] += 1
 
 
 def _meeting(n: np.ndarray) -> np.ndarray:
