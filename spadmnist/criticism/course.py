@@ -13,7 +13,7 @@ from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Key, with_values
-from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
+from .fit import RATES, Bench, Cell, Sensors, State, stacked
 from .ladder import errors_of, row
 from .search import Search
 from .settling import Settled
@@ -76,12 +76,11 @@ def begun(bench: Bench) -> Course:
     state = bench.state({})
     keys = recordings.swinging(bench.start)
     if keys:  # what swings begins anew in every capture
-        turns = search.turns(keys)
-        turned = bench.moved(state, [state.sensors.changed({}, t) for t in turns], fit.FEW)
-        if not any(isinstance(m, str) for m in turned):
-            *_, phases = search.best_phases(state, turned, turns, (1.0,))  # type: ignore[arg-type]
-            state = bench.state({}, state.sensors.changed({}, phases))
-            search.phases.update(phases)
+        swing = search.swing(state, keys, {}, fit.FEW)
+        if not isinstance(swing, str):
+            *_, found = swing.suited(bench, state, [1.0])
+            search.phases.update({(id, key): p for id, p in found.items() for key in keys})
+            state = bench.state({}, state.sensors.changed({}, search.phases))
     course = Course(bench, search, state, {}, [], [])
     course.rung("start")
     return course
@@ -128,17 +127,6 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
     slopes = _slopes_known(course)
     if settled is not None and settled.dials != dials:
         settled = None
-    for step in course.steps:
-        if step.phased:
-            keys = _keys_of(step.change, course)
-            own = {k: v for k, v in course.values.items() if k in keys}
-            known = {pair: x for pair, x in search.phases.items() if pair[1] in step.change.phases}
-            one = Tried(step.change, own, Moved({}, {}, {}), 0.0, 1.0, phases=known)
-            course.values = {**course.values, **search.tuned(state, one, own, (math.pi / 4,))}
-            search.phases.update(one.phases)
-            step.intervals.update(one.intervals)
-            sensors, maps = _model(course)
-            state = bench.state(course.values, sensors)
     # from where it nearly is right: the scatter of the cells is that of the model with the effect
     near: Settled | None = None
     for turn in range(_AGAIN + 1 if dials else 0):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from joblib import Parallel
@@ -58,81 +59,28 @@ def diagnose(
         return _diagnosed(bench, measurement, max_steps, quick, short)
 
 
+@dataclass
+class _Beside:
+    """What a diagnosis says beside its steps.
+
+    explained: is what fails in the totals the set-up's? tried: candidates as they were last looked at.
+    """
+
+    setup: list[dict[str, Any]]
+    explained: bool
+    advice: list[dict[str, Any]] = field(default_factory=list)
+    rival: Tried | None = None
+    placebo: dict[str, Any] | None = None
+    tried: list[Tried] = field(default_factory=list)
+
+
 def _diagnosed(
     bench: Bench, measurement: Measurement, max_steps: int, quick: bool, short: Mapping[str, tuple[float, float]]
 ) -> Diagnosis:
     course = begun(bench)
-    search, start = course.search, course.state
-    setup: list[dict[str, Any]] = []
-    advice: list[dict[str, Any]] = []
-    rival: Tried | None = None
-    for id, (share, error) in short.items():
-        told = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
-        setup.append({"capture": id, "quantity": "exposure", "factor": told, "confused": False})
-    explained = bool(short)  # is what fails in the totals the set-up's?
-    placebo: dict[str, Any] | None = None
-    tried: list[Tried] = []
-    model: State | None = None  # as it was before a closer look
-    while len(course.steps) < max_steps:
-        failed = course.failed
-        number = len(course.steps) + 1
-        if failed and not course.steps and min(b.p for b in failed) > _PLAIN and bench.replicates < _CLOSER:
-            course.state = _closer(course)  # lest the scatter of few recordings decide
-            failed = course.failed
-        if not failed:
-            # no check fails by itself: does any candidate's whole trace stand out?
-            bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
-            tried = search.scan(course.state, everywhere=True, known=tried)
-            model = course.state
-            if not _stands_out(course, tried, _TRACE if not course.steps else _LATER_TRACE):
-                break
-            if course.state is not model:  # which may show lines that the few recordings did not
-                tried = search.scan(course.state, everywhere=True, known=tried)
-        if failed and all(b.cell[0] == "" for b in failed):
-            found, others, wanted = _by_setup(course)
-            if found:
-                setup += found
-                explained = True
-                if others:
-                    rival = others[0]
-                advice += wanted
-                break
-        if failed:
-            first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
-            bench.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
-            tried = search.scan(course.state, known=tried)
-        # what a step has set is settled anew with every other one: no finding of its own
-        tried = [t for t in tried if t.change.kind != "set" or course.values.keys().isdisjoint(t.values)]
-        bench.say(f"step {number}: the best of them on all captures")
-        second = search.structured(course.state, search.again(course.state, course.values, tried))
-        if not second:
-            break
-        worth = search.worth(second)
-        bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
-        refined = [search.refine(course.state, one) for one in worth]
-        best = search.preferred(refined)
-        significance, p = chance.of_best(bench, course.state, tried, best)
-        if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (LEAST_GAIN if failed else _TRACE_GAIN):
-            break
-        before, earlier = course.state, course.kept()
-        fell = course.misfit
-        new = accept(course, best, significance)
-        if best.maps is None and not best.phases:
-            unseen = search.scattered(before, course.values, best)
-            refined, second = refined + unseen, second + unseen
-        new[0].alternatives = _alternatives(bench, before, best, refined, second)
-        named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
-        placebo = placebo or placebo_row(bench, before, tried, best, named)
-        if not failed and course.failed:
-            course.back_to(earlier)  # nothing was wrong before, now something is
-            break
-        # totals are no part of the misfit: where fewer checks fail it is a step, whatever chance makes of the rest
-        if len(course.failed) >= max(len(failed), 1) and fell - course.misfit < 0.05 * (fell - 1):
-            if course.misfit > fell:
-                course.back_to(earlier)
-            break
-    if model is not None and len(course.state.own[RATES]) > len(model.own[RATES]):
-        course.state = model  # no check failed, and there is no step: so nothing is left
+    start, beside = course.state, _Beside(_too_short(short), bool(short))
+    while len(course.steps) < max_steps and _another(course, beside):
+        pass
     if course.steps:
         drop_needless(course)
         drop_mimics(course, start)
@@ -140,37 +88,27 @@ def _diagnosed(
         settle_exactly(course, measurement)
     open_ends(course)
     left = course.failed
-    if left and explained and all(b.cell[0] == "" for b in left):
+    if left and beside.explained and all(b.cell[0] == "" for b in left):
         left = []
-    verdict = _verdict(course, left, bool(setup), rival)
+    verdict = _verdict(course, left, beside)
     if not course.steps:
         course.state, course.judged, course.values = start, None, {}
         course.ladder = course.ladder[:1] if verdict != "unexplained" else course.ladder
     if verdict == "explained":
-        near = [(s.change, a["tried"]) for s in course.steps for a in s.alternatives if a.get("confused")]
-        if near:
-            verdict = "confused"
-            advice += outlook.advice(course.search, course.state, *near[-1])
-        for step in course.steps:
-            unlisted = mimicked(step)
-            if unlisted is not None:
-                verdict = "confused"
-                step.alternatives.insert(0, _outside(unlisted, course.misfit))
-                advice.append(outlook.advice_on_mimic(step, unlisted))
-    if rival is not None:
-        step = _rival_step(course, rival)
-        course.steps.append(step)
+        verdict = _or_confused(course, beside)
+    if beside.rival is not None:
+        course.steps.append(_rival_step(course, beside.rival))
     for step in course.steps:
         for other in step.alternatives:
             other.pop("confused", None)
             other.pop("tried", None)
-    if placebo:
-        course.ladder.insert(1, placebo)
+    if beside.placebo:
+        course.ladder.insert(1, beside.placebo)
     excluded: list[dict[str, Any]] = []
     invisible: list[dict[str, Any]] = []
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
-        excluded, invisible = outlook.upper_limits(course.search, course.state, tried)
+        excluded, invisible = outlook.upper_limits(course.search, course.state, beside.tried)
     remains = verdict in ("unexplained", "partly_explained")
     return Diagnosis(
         bench.start.name,
@@ -181,10 +119,10 @@ def _diagnosed(
         checks.usual_misfit(start),
         nuisances(bench, course.state),
         course.steps,
-        setup,
+        beside.setup,
         remainder(bench, course.state, course.state.residuals) if remains else [],
         course.ladder,
-        advice,
+        beside.advice,
         excluded,
         invisible,
         traces(bench, start, course.state),
@@ -193,6 +131,75 @@ def _diagnosed(
         bench.simulations,
         bench.dark,
     )
+
+
+# --- a step ------------------------------------------------------------------------------------------------------
+
+
+def _another(course: Course, beside: _Beside) -> bool:
+    """Is there a step more, after which another one may come? Takes it."""
+    bench, search, failed = course.bench, course.search, course.failed
+    number = len(course.steps) + 1
+    if failed and not course.steps and min(b.p for b in failed) > _PLAIN and bench.replicates < _CLOSER:
+        course.state = _closer(course)  # lest the scatter of few recordings decide
+        failed = course.failed
+    if not failed:
+        # no check fails by itself: does any candidate's whole trace stand out?
+        bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
+        beside.tried = search.scan(course.state, everywhere=True, known=beside.tried)
+        before = course.state
+        if _stands_out(course, beside.tried, _TRACE if not course.steps else _LATER_TRACE):
+            closer = course.state
+            if closer is not before:  # which may show lines that the few recordings did not
+                beside.tried = search.scan(closer, everywhere=True, known=beside.tried)
+            if _added(course, beside, failed):
+                return True
+            if course.state is not closer:
+                return False
+        course.state = before  # by which no check fails: so nothing is left
+        return False
+    if search.only_rates(course.state) and _by_setup(course, beside):
+        return False
+    first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
+    bench.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
+    beside.tried = search.scan(course.state, known=beside.tried)
+    return _added(course, beside, failed)
+
+
+def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> bool:
+    """Is the best of the candidates a step after which another one may come? Adds it, if it is one."""
+    bench, search = course.bench, course.search
+    number = len(course.steps) + 1
+    # what a step has set is settled anew with every other one: no finding of its own
+    beside.tried = [t for t in beside.tried if t.change.kind != "set" or course.values.keys().isdisjoint(t.values)]
+    bench.say(f"step {number}: the best of them on all captures")
+    second = search.structured(course.state, search.again(course.state, course.values, beside.tried))
+    if not second:
+        return False
+    worth = search.worth(second)
+    bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
+    refined = [search.refine(course.state, one) for one in worth]
+    best = search.preferred(refined)
+    significance, p = chance.of_best(bench, course.state, beside.tried, best)
+    if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (LEAST_GAIN if failed else _TRACE_GAIN):
+        return False
+    before, earlier, fell = course.state, course.kept(), course.misfit
+    new = accept(course, best, significance)
+    if best.maps is None and not best.phases:
+        unseen = search.scattered(before, course.values, best)
+        refined, second = refined + unseen, second + unseen
+    new[0].alternatives = _alternatives(bench, before, best, refined, second)
+    named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
+    beside.placebo = beside.placebo or placebo_row(bench, before, beside.tried, best, named)
+    if not failed and course.failed:
+        course.back_to(earlier)  # nothing was wrong before, now something is
+        return False
+    # totals are no part of the misfit: where fewer checks fail it is a step, whatever chance makes of the rest
+    if len(course.failed) >= max(len(failed), 1) and fell - course.misfit < 0.05 * (fell - 1):
+        if course.misfit > fell:
+            course.back_to(earlier)
+        return False
+    return True
 
 
 def _stands_out(course: Course, tried: Sequence[Tried], trace: float) -> bool:
@@ -215,33 +222,66 @@ def _closer(course: Course) -> State:
     return course.bench.state(course.values, course.state.sensors, _CLOSER, course.state)
 
 
-def _verdict(course: Course, left: Sequence[checks.Block], setup: bool, rival: Tried | None) -> str:
-    if rival is not None:
+# --- the verdict -------------------------------------------------------------------------------------------------
+
+
+def _verdict(course: Course, left: Sequence[checks.Block], beside: _Beside) -> str:
+    if beside.rival is not None:
         return "confused"
     if left:
         return "partly_explained" if course.steps else "unexplained"
     if course.steps:
         return "explained"
-    return "setup" if setup else "adequate"
+    return "setup" if beside.setup else "adequate"
 
 
-def _by_setup(course: Course) -> tuple[list[dict[str, Any]], list[Tried], list[dict[str, Any]]]:
-    """(entries, changes of the sensor that cannot be told from them, what would): of failing totals."""
+def _or_confused(course: Course, beside: _Beside) -> str:
+    """The verdict on steps that leave nothing: does something else do as well? Adds what would tell."""
+    verdict = "explained"
+    near = [(s.change, a["tried"]) for s in course.steps for a in s.alternatives if a.get("confused")]
+    if near:
+        verdict = "confused"
+        beside.advice += outlook.advice(course.search, course.state, *near[-1])
+    for step in course.steps:
+        unlisted = mimicked(step)
+        if unlisted is not None:
+            verdict = "confused"
+            step.alternatives.insert(0, _outside(unlisted, course.misfit))
+            beside.advice.append(outlook.advice_on_mimic(step, unlisted))
+    return verdict
+
+
+def _too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
+    """Entries of captures that stopped early: (share that was exposed, its standard deviation)."""
+    out = []
+    for id, (share, error) in short.items():
+        told = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
+        out.append({"capture": id, "quantity": "exposure", "factor": told, "confused": False})
+    return out
+
+
+def _by_setup(course: Course, beside: _Beside) -> bool:
+    """Does the set-up explain the totals that fail? Says what of it, and which change of the sensor would as well."""
     bench, state = course.bench, course.state
     likely = setups.explanations(bench, state)
     cost = likely[0].cost if likely else float(state.residuals[RATES] @ state.residuals[RATES])
     others = setups.rivals(course.search, state, cost)
-    if not likely:
-        return [], [], []
     own = others[0].cost(state) if others else math.inf
-    if own < cost - setups.ALIKE:
-        return [], [], []  # the sensor explains it better
+    if not likely or own < cost - setups.ALIKE:
+        return False  # the sensor explains it better
     near = [e for e in likely if e.cost < cost + setups.ALIKE and len(e.factors) == len(likely[0].factors)]
     found = setups.entries(bench, state, near)
+    if not found:
+        return False
     if own < cost + setups.ALIKE:
         found = [{**entry, "confused": True} for entry in found]
-        return found, others, outlook.advice_on_totals(course.search, state, likely[0], others[0])
-    return found, [], outlook.advice_on_setup(bench, state, found)
+        beside.rival = others[0]
+        beside.advice += outlook.advice_on_totals(course.search, state, likely[0], others[0])
+    else:
+        beside.advice += outlook.advice_on_setup(bench, state, found)
+    beside.setup += found
+    beside.explained = True
+    return True
 
 
 def _rival_step(course: Course, rival: Tried) -> Step:

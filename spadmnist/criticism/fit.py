@@ -546,6 +546,11 @@ class Bench:
             out[cell] = _judged(null, values, seen.total, moved.shifts[cell], moved.noise.get(cell, 0.0) * noisy)
         return out
 
+    def judged(self, state: State, cell: Cell, shift: np.ndarray) -> np.ndarray:
+        """The data's residuals of one block if its expectation were shifted."""
+        seen = self.seen[cell[0]]
+        return _judged(state.nulls[cell], seen.summaries[cell[1]].values, seen.total, shift, 0.0)
+
     def template(self, state: State, moved: Moved) -> dict[Cell, np.ndarray]:
         """The residuals that a model at this state would see in data of the other."""
         out: dict[Cell, np.ndarray] = {}

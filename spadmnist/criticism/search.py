@@ -21,9 +21,10 @@ from ..sensor import Sensor
 from . import checks, fit, mapping, settling
 from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
 from .chance import LEAST_P, of_map
-from .fit import RATES, Bench, Cell, Moved, Sensors, State, stacked
+from .fit import Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
 from .settling import Settled
+from .swings import Swing
 from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger
 
 _SCAN = 2  # recordings of each capture for a first look
@@ -32,8 +33,8 @@ _NEARLY = 0.8  # of the largest gain
 _REFINED = 3  # of these, that are settled
 _TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 _NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
-_TURNS = 8  # phases that are tried first
-_NARROWER = (math.pi, math.pi / 3)  # rad, about the best of these
+_TURNS = 8  # phases that are simulated
+_ASIDE = 0.1  # of a logarithm, for the slope of what swings
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _SHOWS = 0.01  # of the square of a trace, in a capture that tells it
 _LEAST_CHANCE = 1e-3  # of a map that is tried
@@ -84,63 +85,21 @@ class Search:
             tries = [best[1] * x for x in _NEAR if x != 1]
         return best
 
-    def best_phases(
-        self, state: State, turned: Sequence[Moved], turns: Sequence[Phases], times: Sequence[float] = _TIMES
-    ) -> tuple[float, float, Moved, Phases]:
-        """(gain, times, what it does, phases), each capture having the phase that suits it.
+    def swing(self, state: State, keys: Sequence[Key], values: Mapping[Key, Any], few: int) -> Swing | str:
+        """What swings, at these values and any phase."""
+        turns = self.turns(keys)
+        models = [state.sensors.changed(values, t) for t in turns]
+        lit = [id for id, seen in self.bench.seen.items() if not seen.capture.light.dark]
+        turned = self.bench.moved(state, models, few, lit)
+        made = [m for m in turned if not isinstance(m, str)]
+        if len(made) < len(turned):
+            return next(m for m in turned if isinstance(m, str))
+        return Swing.of(made, [next(iter(t.values())) for t in turns])
 
-        turned: what the model does at each of `turns`.
-        """
-        now = self.square(state.residuals)
-        ids, _, root, _ = self.bench.rate_space(state)
-        best: tuple[float, float, list[int]] | None = None
-        captures = list(self.bench.seen)
-        for t in times:
-            own = np.zeros((len(turned), len(captures)))
-            for k, moved in enumerate(turned):
-                for cell, z in self.bench.residuals(state, moved, t).items():
-                    if cell != RATES:
-                        own[k, captures.index(cell[0])] += float(z @ z)
-            chosen = own.argmin(axis=0)
-            if ids:
-                logs = np.array([[m.logs.get(i, 0.0) for i in ids] for m in turned])
-                where = [captures.index(i) for i in ids]
-                for _ in range(3):
-                    for n, c in enumerate(where):
-                        x = logs[chosen[where], np.arange(len(ids))]
-                        left = []
-                        for k in range(len(turned)):
-                            x[n] = logs[k, n]
-                            z = state.residuals[RATES] + t * (root @ x)
-                            left.append(own[k, c] + float(z @ z))
-                        chosen[c] = int(np.argmin(left))
-                x = logs[chosen[where], np.arange(len(ids))]
-                rates = state.residuals[RATES] + t * (root @ x)
-                total = float(rates @ rates)
-            else:
-                total = 0.0
-            gain = now - total - float(own[chosen, np.arange(len(captures))].sum())
-            if best is None or gain > best[0]:
-                best = gain, t, chosen.tolist()
-        assert best is not None
-        gain, t, picked = best
-        whole = Moved({}, {}, {})
-        phases: dict[tuple[str, Key], float] = {}
-        for id, k in zip(captures, picked, strict=True):
-            whole.logs |= {i: x for i, x in turned[k].logs.items() if i == id}
-            whole.shifts |= {c: x for c, x in turned[k].shifts.items() if c[0] == id}
-            whole.noise |= {c: x for c, x in turned[k].noise.items() if c[0] == id}
-            phases |= {(i, key): x for (i, key), x in turns[k].items() if i == id}
-        return gain, t, whole, phases
-
-    def turns(self, keys: Sequence[Key], around: Phases | None = None, width: float = 2 * math.pi) -> list[Phases]:
-        """Phases to try: all round, or about some, so far to both sides together."""
-        out: list[Phases] = []
-        for k in range(_TURNS):
-            shift = width * (k / _TURNS if around is None else k / (_TURNS - 1) - 0.5)
-            pairs = [(i, p) for i in self.bench.seen for p in keys]
-            out.append({pair: ((around or {}).get(pair, 0.0) + shift) % (2 * math.pi) for pair in pairs})
-        return out
+    def turns(self, keys: Sequence[Key]) -> list[Phases]:
+        """Phases to try, all round."""
+        pairs = [(i, p) for i in self.bench.seen for p in keys]
+        return [dict.fromkeys(pairs, 2 * math.pi * k / _TURNS) for k in range(_TURNS)]
 
     def lines(self, state: State) -> list[Line]:
         """What stands out of the data's spectra, the clearest first."""
@@ -194,17 +153,19 @@ class Search:
         for change, tried in tries:
             if not change.phases:
                 continue
-            turns = self.turns(change.phases)
-            models = [state.sensors.changed(tried, t) for t in turns]
-            turned = self.bench.moved(state, models, fit.FEW, hasty=True)
-            if any(isinstance(m, str) for m in turned):
+            swing = self.swing(state, change.phases, tried, fit.FEW)
+            if isinstance(swing, str):
                 continue
-            gain, times, moved, phases = self.best_phases(state, turned, turns)  # type: ignore[arg-type]
-            one = Tried(change, tried, moved, gain - 2 * len(phases), times, phases=phases, seen=set(state.made))
+            gain, times, found = swing.suited(self.bench, state)
+            phases = {(id, key): p for id, p in found.items() for key in change.phases}
+            gain -= 2 * len(phases)
+            one = Tried(change, tried, swing.at(found), gain, times, phases=phases, seen=set(state.made))
             for dial in lines_of(change):
                 f = float(tried[dial.key])
-                error = next((line.error for line in self.lines(state) if line.frequency == f), dial.high)
+                line = next((line for line in self.lines(state) if line.frequency == f), None)
+                error = line.error if line else dial.high
                 one.intervals[dial.key] = max(f - 1.96 * error, dial.low), min(f + 1.96 * error, dial.high)
+                one.chance = line.p if line else None
             out.append(one)
         return out
 
@@ -279,9 +240,9 @@ class Search:
         return out
 
     def only_rates(self, state: State) -> bool:
-        """Is nothing wrong but the totals?"""
+        """Is nothing wrong but the totals? A line in the spectra may be what moves those of short captures."""
         failed = checks.failing(checks.blocks(self.bench, state, state.residuals))
-        return bool(failed) and all(b.cell[0] == "" for b in failed)
+        return bool(failed) and all(b.cell[0] == "" for b in failed) and not self.lines(state)
 
     def telling(self, state: State) -> list[str]:
         """Up to three captures that show best what is wrong: a dark one, and those with the least likely checks."""
@@ -305,7 +266,10 @@ class Search:
             if len(best) == _SECOND:
                 break
         out: list[Tried] = []
+        kept = [one for one in best if one.phases]  # which all captures have shown, at any strength
         for one in best:
+            if one.phases:
+                continue
             # a faint trace drowns in what is left of chance: a stronger one tells what it looks like, but of an edge
             size = self.size(state, one.moved)
             least = 0.0 if any(map(is_edge, one.change.strengths)) else min(_STRONG / max(size, 1e-9), 1.0)
@@ -314,7 +278,6 @@ class Search:
             out.append(
                 replace(one, values=given, gain=size, sensors=state.sensors.changed(given, one.phases, one.chips))
             )
-        kept = []
         for one in self._simulated(state, [*out, *self.maps(state, values)], fit.FEW):
             if one.maps is None:
                 before, x, size = one.gain, abs(one.times), self.size(state, one.moved)
@@ -322,7 +285,6 @@ class Search:
                     # in proportion or with the square: more cannot be said, for chance hides what is faint
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
-                one.gain -= 2 * len(one.phases)
                 if one.chips and one.gain > _PROMISING:
                     one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
             else:
@@ -457,11 +419,10 @@ class Search:
         if one.maps is not None or not one.change.dials:
             one.residuals = self.bench.residuals(state, one.moved, noisy=True)
             return one
-        given = one.scaled()
-        narrow = lines_of(one.change)
-        dials = [d for d in one.change.dials if d.key in given and not d.whole and d not in narrow]
         if one.change.phases:
-            given = self.tuned(state, one, given)
+            return self._swung(state, one)
+        given = one.scaled()
+        dials = [d for d in one.change.dials if d.key in given and not d.whole]
         boost, power = self._boost(state, one, given)
         found = settling.settle(
             self.bench,
@@ -471,7 +432,7 @@ class Search:
             lambda v: state.sensors.changed(v, one.phases, one.chips),
             rounds,
             stronger=(boost, power),
-            only=() if one.phases else self._showing(state, one.moved),
+            only=self._showing(state, one.moved),
         )
         if isinstance(found, str):
             return one
@@ -480,7 +441,7 @@ class Search:
         one.faint = boost > 1
         one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
         one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
-        one.gain = self.square(state.residuals) - found.square - 2 * len(one.phases)
+        one.gain = self.square(state.residuals) - found.square
         if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
             one.gain = max(one.gain, self.square(state.residuals) - self.square(self.state_of(one).residuals))
         return one
@@ -589,25 +550,40 @@ class Search:
         """By how much the data lie nearer to another model, each judged by its own scatter."""
         return self.square(state.residuals) - self.square(self.bench.state({}, sensors).residuals)
 
-    def tuned(
-        self, state: State, one: Tried, given: dict[Key, Any], turns: Sequence[float] = _NARROWER
-    ) -> dict[Key, Any]:
-        """The values with the strength settled, and with it the phases of each capture.
+    def _swung(self, state: State, one: Tried) -> Tried:
+        """The strength of what swings, and its phase in each capture.
 
-        turns: rad, how far about what they are phases are looked for, one search after the other.
+        It is simulated as strong as chance does not hide it; what it does then tells what less of it does.
         """
-        for width in turns:
-            tries = self.turns(one.change.phases, one.phases, width)
-            turned = self._in_light(state, [state.sensors.changed(given, t) for t in tries])
-            if any(isinstance(m, str) for m in turned):
-                return given
-            _, times, _, one.phases = self.best_phases(state, turned, tries, _NEAR)  # type: ignore[arg-type]
-            given = {**given, **{d.key: d.scaled(float(given[d.key]), times) for d in one.change.strengths}}
-        return given
-
-    def _in_light(self, state: State, models: Sequence[Sensors]) -> list[Moved | str]:
-        lit = [id for id, seen in self.bench.seen.items() if not seen.capture.light.dark]
-        return self.bench.moved(state, models, _SWINGING, lit)
+        dials = tuple(d for d in one.change.strengths if d.key in one.values)
+        size, given = self.size(state, one.moved.at(one.times)), one.scaled()
+        room = min(room_of(d, float(given[d.key])) for d in dials)
+        stronger_by = max(1.0, min(math.sqrt(_STRONG / max(size, 1e-9)), room))
+        strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}
+        swing = self.swing(state, one.change.phases, strong, _SWINGING)
+        if isinstance(swing, str):
+            return one
+        gain, times, found = swing.suited(self.bench, state, [x / stronger_by for x in (0.5, *_NEAR, 2.0)])
+        moved = swing.at(found)
+        one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
+        one.moved, one.gain = moved, gain - 2 * len(one.phases)
+        one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
+        one.times, one.faint = times, True
+        one.residuals = residuals = self.bench.residuals(state, moved, times)
+        one.sensors = state.sensors.changed(one.values, one.phases, one.chips)
+        aside = [self.bench.residuals(state, moved, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]
+        # of one number, or of several that all go up together
+        apart = [d.coordinate(d.scaled(float(one.values[d.key]), math.exp(2 * _ASIDE))) for d in dials]
+        now = settling.point_of(dials, one.values)
+        slopes = {
+            cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(dials)
+            for cell in residuals
+        }
+        own = np.concatenate([state.own[cell] for cell in residuals], axis=1)
+        covariance = settling.covariance_of(np.concatenate(list(slopes.values())), own)
+        square = self.square(residuals)
+        one.settled = Settled(dials, now, covariance, residuals, slopes, square, one.values)
+        return one
 
 
 def alike(gain: float) -> float:
