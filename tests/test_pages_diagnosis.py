@@ -436,7 +436,7 @@ def test_the_command_writes_it_and_says_before_the_work_that_it_cannot(
     assert told.exit_code == 0, told.output
     assert {p.name for p in folder.iterdir()} == {"report.html", "sensor.yaml"}
     assert "Adequate" in (folder / "report.html").read_text() and f"Report: {folder / 'report.html'}" in told.stderr
-    assert "the next model lies beside this page: <b>sensor.yaml</b>" in (folder / "report.html").read_text()
+    assert "nothing was added, lies beside this page: <b>sensor.yaml</b>" in (folder / "report.html").read_text()
     (folder / "report.html").write_text("mine")
     told = CliRunner().invoke(cli.cli, ["diagnose", sensor, "lab", "-o", str(folder)])
     assert isinstance(told.exception, SpadError) and len(asked) == 1

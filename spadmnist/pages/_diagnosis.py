@@ -307,7 +307,8 @@ main { max-width: 1160px; }
 .chosen td { font-weight: 600; }
 .beside { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
 .fall { font-size: 1.5rem; font-weight: 650; font-variant-numeric: tabular-nums; }
-@media (max-width: 900px) { .ladder, .beside { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
+@media (max-width: 1180px) { .ladder { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
+@media (max-width: 900px) { .beside { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
 @media (max-width: 600px) {
   main { padding: 16px 12px 40px; }
   h1 { font-size: 1.35rem; }
@@ -327,7 +328,8 @@ chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 10
 {% if fallen %} It was there before, for it knows no totals: the error of the {{ fallen[0] }} fell from \
 <b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.{% endif %}</p>
 <p class="small">{{ found.sensor or "A sensor without a name" }} beside {{ found.measurement }}\
-{% if next %} &middot; the next model lies beside this page: <b>{{ next }}</b>{% endif %}\
+{% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
+beside this page: <b>{{ next }}</b>{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
 </section>
 

@@ -93,13 +93,14 @@ def ticks_of(recording: Recording) -> tuple[list[np.ndarray], float]:
 
 
 @pytest.mark.parametrize(
-    "kind", ["tr", "tr without ticks", "coarse", "hexagons", "two rows", "crowded", "crowded hexagons"]
+    "kind", ["tr", "tr without ticks", "coarse", "hexagons", "two rows", "crowded", "crowded hexagons", "several slabs"]
 )
 def test_stamps_of_a_small_recording(kind: str) -> None:
     more = {
         "coarse": lambda: tr(3, grid(4, 5), 3e5, 2e-3, 50e-9, tick=5e-9),
         "hexagons": lambda: tr(3, HEXAGONS, 2e5, 5e-3, 50e-9),
         "two rows": lambda: tr(3, grid(2, 9), np.geomspace(100, 3e6, 18), 1e-3, 50e-9),
+        "several slabs": lambda: tr(3, grid(3, 4), np.geomspace(1e5, 4e5, 12), 2e-2, 50e-9),
         "crowded": lambda: tr(3, grid(3, 3), 6e8, 5e-6, 0.0, tick=1e-9),
         "crowded hexagons": lambda: tr(3, HEXAGONS, 1e8, 5e-6, 0.0, tick=1e-9),
     }

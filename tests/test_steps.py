@@ -1,0 +1,131 @@
+"""The course of a diagnosis: closer looks, what becomes of them, and what looks the same as what was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tinylab import CROSSTALK, bench_of, change_of
+
+from spadmnist.criticism import answer, diagnose, findings
+from spadmnist.criticism import course as course_of
+from spadmnist.criticism.answer import Step
+from spadmnist.criticism.fit import RATES, State
+
+
+def test_a_closer_look_only_adds_recordings(lab):
+    """And so it is the same as if they had been made at once; half of the work."""
+    bench = bench_of(lab(), 16)
+    few = bench.state({})
+    done = bench.simulations
+    more = bench.state({}, few.sensors, 32, few)
+    assert bench.simulations - done == 2 * 16  # of two captures
+    whole = bench_of(lab(), 32).state({})
+    assert more.residuals.keys() == whole.residuals.keys()
+    for cell, z in whole.residuals.items():
+        np.testing.assert_array_equal(more.residuals[cell], z)
+        np.testing.assert_array_equal(more.own[cell], whole.own[cell])
+    for id, made in whole.made.items():
+        np.testing.assert_array_equal(more.made[id].totals, made.totals)
+
+
+def test_levels_are_evenly_spread_however_many_they_are(lab):
+    """So that the first recordings are a fair sample of all, and every fourth of them is, too."""
+    for number in (16, 32, 96):
+        factors = np.log(bench_of(lab(), number).state({}).factors["flat"])
+        for some in (factors, factors[: number // 2], factors[::4]):
+            place = np.sort(some) / factors.max()
+            gaps = np.diff(place, prepend=-1.0, append=1.0)
+            assert gaps.max() < 2.7 * 2 / len(some)
+
+
+def test_models_may_be_looked_at_in_captures_of_their_own(lab):
+    bench = bench_of(lab())
+    state = bench.state({})
+    models = [state.sensors.changed({CROSSTALK: x}) for x in (0.05, 0.1)]
+    mixed = bench.moved(state, models, only_of=[["flat"], ["dark"]])
+    for moved, model, id in zip(mixed, models, ("flat", "dark"), strict=True):
+        (alone,) = bench.moved(state, [model], only=[id])
+        assert not isinstance(moved, str) and not isinstance(alone, str)
+        assert moved.shifts.keys() == alone.shifts.keys() and {cell[0] for cell in moved.shifts} == {id}
+        for cell, shift in alone.shifts.items():
+            np.testing.assert_array_equal(moved.shifts[cell], shift)
+        assert moved.logs == alone.logs
+        assert moved.only([id]).shifts.keys() == moved.shifts.keys() and not moved.only([]).shifts
+
+
+# --- what becomes of a closer look -------------------------------------------------------------------------------
+
+
+def looked_closer(course: course_of.Course, monkeypatch: pytest.MonkeyPatch, added: Any) -> tuple[State, State, bool]:
+    """(the state before, the closer one, is there another step?), where something stands out by a closer look."""
+    before, closer = course.state, replace(course.state)
+
+    def stands_out(course: course_of.Course, tried: Any, level: float) -> bool:
+        course.state = closer
+        return True
+
+    monkeypatch.setattr(diagnose, "_stands_out", stands_out)
+    monkeypatch.setattr(diagnose, "_added", added)
+    return before, closer, diagnose._another(course, diagnose._Beside([], False))
+
+
+def test_after_a_closer_look_that_led_to_nothing_the_model_is_as_it_was(lab, monkeypatch):
+    """By which no check fails; by the closer one some might, and nobody would say of what."""
+    course = course_of.begun(bench_of(lab()))
+    assert not course.failed
+    before, _, another = looked_closer(course, monkeypatch, lambda *_: False)
+    assert not another and course.state is before
+
+
+def test_what_a_step_leaves_stays(lab, monkeypatch):
+    course = course_of.begun(bench_of(lab()))
+    new = replace(course.state)
+
+    def last(course: course_of.Course, *_: Any) -> bool:
+        course.state = new
+        return False
+
+    _, closer, another = looked_closer(course, monkeypatch, lambda *_: True)
+    assert another and course.state is closer
+    _, _, another = looked_closer(course, monkeypatch, last)
+    assert not another and course.state is new
+
+
+# --- what looks the same -----------------------------------------------------------------------------------------
+
+
+def of(name: str, state: State, bench: Any, **sizes: float) -> Step:
+    """A step whose trace has such sizes, each in one cell of a statistic of the flat field."""
+    trace = {cell: np.zeros(len(z)) for cell, z in state.residuals.items()}
+    trace[RATES][:] = 7.0  # of totals, which anything may move
+    for statistic, size in sizes.items():
+        trace["flat", statistic][0] = size
+    return Step(change_of(bench, f"add {name}"), {}, 1.0, 20.0, "", template=trace)
+
+
+def test_jitter_is_confused_where_only_intervals_tell(lab):
+    """A dead time drawn anew for every detection blurs the same edge; what neighbours share it does not blur."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    found = findings.mimicked(of("jitter", state, bench, intervals=30.0, edge_intervals=30.0, neighbours=3.9))
+    assert found is not None and found.what == "a dead time that differs from event to event"
+    assert findings.mimicked(of("jitter", state, bench, intervals=30.0, neighbours=4.1)) is None
+    assert findings.mimicked(of("crosstalk", state, bench, intervals=30.0)) is None
+
+
+def test_what_looks_the_same_is_named_with_what_tells(lab):
+    course = course_of.begun(bench_of(lab()))
+    step = of("jitter", course.state, course.bench, intervals=30.0)
+    course.steps.append(step)
+    beside = diagnose._Beside([], False)
+    assert diagnose._or_confused(course, beside) == "confused"
+    assert step.alternatives[0]["what"] == "a dead time that differs from event to event"
+    (told,) = beside.advice
+    assert told["capture"] == "a pulsed source" and told["significance_then"] == 20.0
+    assert told["separates"] == ["jitter", step.alternatives[0]["what"]]
+    assert answer.mimic(step.change) is not None
+    course.steps = [of("crosstalk", course.state, course.bench, intervals=30.0)]
+    assert diagnose._or_confused(course, diagnose._Beside([], False)) == "explained"

@@ -1,0 +1,68 @@
+"""What swings, at any phase and strength, from what it does at a few phases."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from tinylab import bench_of, change_of, quiet
+
+from spadmnist.criticism.fit import Moved
+from spadmnist.criticism.swings import Swing
+from spadmnist.criticism.tried import Tried
+
+EIGHT = 2 * np.pi * np.arange(8) / 8
+FLICKER = "    flicker: {amplitude: %s, frequency: 100 Hz, phase: 0.7 rad}\n"
+AMPLITUDE, FREQUENCY, PHASE = (("flicker", name) for name in ("amplitude", "frequency", "phase"))
+
+
+def literal(x: float, p: float) -> np.ndarray:
+    """A swing through a trend (its sign), a power (whatever its sign) and a sum over half a turn (both)."""
+    s = x * math.sin(0.3 + p)
+    return np.array([3 * x * math.cos(p), 5 * x**2, 2 * s + s**2])
+
+
+@pytest.mark.parametrize("strength", [-0.7, 0.1, 1.0, 2.5])
+def test_phases_all_round_tell_every_phase_and_strength(strength: float) -> None:
+    cell = "flat", "trend"
+    turned = [Moved({cell: literal(1.0, p)}, {cell: 0.8}, {"flat": 2 * math.sin(p)}) for p in EIGHT]
+    swing = Swing.of(turned, EIGHT)
+    for p in (0.0, 1.1, 4.0):
+        moved = swing.at({"flat": p}).at(strength)
+        assert moved.shifts[cell] == pytest.approx(literal(strength, p), abs=1e-12)
+        assert moved.logs["flat"] == pytest.approx(2 * strength * math.sin(p), abs=1e-12)
+        assert moved.noise[cell] == pytest.approx(0.1 * strength**2)  # eight say it
+
+
+def test_a_cell_that_some_phases_leave_alone() -> None:
+    cell = "flat", "trend"
+    turned = [Moved({cell: np.array([max(0.0, math.cos(p))])} if math.cos(p) > 0.1 else {}, {}, {}) for p in EIGHT]
+    found = Swing.of(turned, EIGHT).at({"flat": 0.0}).at(1.0).shifts[cell]
+    assert 0.8 < found[0] < 1.2
+
+
+@pytest.mark.parametrize(("amplitude", "seed"), [(0.3, 0), (0.12, 1)])
+def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> None:
+    """By a trace eight times as strong, or half: 20 ms of 100 Hz, about 18,000 detections of 10,000 a pixel and s.
+
+    A known sine tells its amplitude to root(2 / n) and its phase to that / amplitude; six standard deviations are
+    allowed (false alarms: 1e-8 each), for statistics do not hold all of it.
+    """
+    bench = bench_of(lab(FLICKER % amplitude, seed=seed, light=400), 32)
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add flicker")
+    values = {AMPLITUDE: 0.06 if amplitude > 0.2 else 0.24, FREQUENCY: 100.0}
+    swing = look.swing(state, [PHASE], values, 6)
+    assert isinstance(swing, Swing)
+    gain, times, phases = swing.suited(bench, state)
+    one = Tried(change, values, swing.at(phases), gain, times, phases={(id, PHASE): p for id, p in phases.items()})
+    found = look.refine(state, one)
+    error = math.sqrt(2 / bench.seen["flat"].total)
+    assert found.gain > 0.3 * (amplitude / error) ** 2
+    assert found.values[AMPLITUDE] == pytest.approx(amplitude, abs=6 * error)
+    off = (found.phases["flat", PHASE] - 0.7 + math.pi) % (2 * math.pi) - math.pi
+    assert abs(off) < 6 * error / amplitude + math.radians(2)
+    assert found.settled is not None
+    _, low, high = found.settled.interval(0)
+    assert low < found.values[AMPLITUDE] < high and high - low < 12 * error
