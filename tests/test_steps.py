@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, bench_of, change_of
+from tinylab import CROSSTALK, bench_of, change_of, quiet
 
 from spadmnist.criticism import answer, diagnose, findings
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, State
+from spadmnist.criticism.lines import Line
 
 
 def test_a_closer_look_only_adds_recordings(lab):
@@ -54,6 +55,22 @@ def test_models_may_be_looked_at_in_captures_of_their_own(lab):
             np.testing.assert_array_equal(moved.shifts[cell], shift)
         assert moved.logs == alone.logs
         assert moved.only([id]).shifts.keys() == moved.shifts.keys() and not moved.only([]).shifts
+
+
+def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monkeypatch):
+    """A capture shorter than a period of the lamp has more light than stated, or less, and no clock was misread."""
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    residuals = {cell: np.full(len(z), 10.0 if cell == RATES else 0.0) for cell, z in state.residuals.items()}
+    state = replace(state, residuals=residuals, exact=[])
+    assert look.only_rates(state)
+    monkeypatch.setattr(look, "lines", lambda state: [Line(100.0, 1.0, -20.0)])
+    assert not look.only_rates(state)
+    course = course_of.Course(bench, look, state, {}, [], [])
+    monkeypatch.setattr(diagnose, "_by_setup", lambda *_: pytest.fail("the set-up was asked"))
+    monkeypatch.setattr(look, "scan", lambda *_, **__: [])
+    monkeypatch.setattr(diagnose, "_added", lambda *_: False)
+    assert not diagnose._another(course, diagnose._Beside([], False))
 
 
 # --- what becomes of a closer look -------------------------------------------------------------------------------
