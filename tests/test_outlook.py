@@ -212,13 +212,17 @@ def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, t
 def test_verdicts(lab):
     course = course_of.begun(bench_of(lab()))
     step, some = object(), [object()]
-    assert diagnose._verdict(course, [], False, None) == "adequate"
-    assert diagnose._verdict(course, [], True, None) == "setup"
-    assert diagnose._verdict(course, some, False, None) == "unexplained"  # type: ignore[arg-type]
+
+    def verdict(left: Any, setup: bool = False, rival: Tried | None = None) -> str:
+        return diagnose._verdict(course, left, diagnose._Beside([{}] * setup, setup, rival=rival))
+
+    assert verdict([]) == "adequate"
+    assert verdict([], setup=True) == "setup"
+    assert verdict(some) == "unexplained"
     course.steps.append(step)  # type: ignore[arg-type]
-    assert diagnose._verdict(course, [], False, None) == "explained"
-    assert diagnose._verdict(course, some, False, None) == "partly_explained"  # type: ignore[arg-type]
-    assert diagnose._verdict(course, [], True, given(course, "add crosstalk", {}, False)) == "confused"
+    assert verdict([]) == "explained"
+    assert verdict(some) == "partly_explained"
+    assert verdict([], setup=True, rival=given(course, "add crosstalk", {}, False)) == "confused"
 
 
 @pytest.mark.slow

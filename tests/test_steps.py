@@ -12,8 +12,9 @@ from tinylab import CROSSTALK, bench_of, change_of, quiet
 from spadmnist.criticism import answer, diagnose, findings
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
-from spadmnist.criticism.fit import RATES, State
+from spadmnist.criticism.fit import RATES, Moved, State
 from spadmnist.criticism.lines import Line
+from spadmnist.criticism.tried import Tried, weaker
 
 
 def test_a_closer_look_only_adds_recordings(lab):
@@ -71,6 +72,20 @@ def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monk
     monkeypatch.setattr(look, "scan", lambda *_, **__: [])
     monkeypatch.setattr(diagnose, "_added", lambda *_: False)
     assert not diagnose._another(course, diagnose._Beside([], False))
+
+
+def test_an_edge_that_drowns_all_else_is_tried_weaker(lab):
+    """A readout that takes 30 ns loses nearly all of what comes every 3 ns: nothing is told of one that takes 2 ns."""
+    bench = bench_of(lab())
+    nothing = Moved({}, {}, {})
+    service, jitter = ("readout_loss", "service_time"), ("jitter", "sigma")
+    change = change_of(bench, "add readout_loss")
+    least = change.strengths[0].low
+    down = weaker(Tried(change, {service: 100 * least, ("readout_loss", "queue"): 8.0}, nothing, 0.0, 1.0))
+    assert down == {service: pytest.approx(10 * least), ("readout_loss", "queue"): 8.0}
+    assert weaker(Tried(change, {service: least}, nothing, 0.0, 1.0)) is None
+    assert weaker(Tried(change_of(bench, "add crosstalk"), {CROSSTALK: 0.1}, nothing, 0.0, 1.0)) is None
+    assert weaker(Tried(change_of(bench, "set dead_time.duration"), {jitter: 1e-8}, nothing, 0.0, 1.0)) is None
 
 
 # --- what becomes of a closer look -------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from .fit import Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
 from .settling import Settled
 from .swings import Swing
-from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger
+from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
@@ -45,6 +45,7 @@ _POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at anoth
 _LINE = 0.25  # of the square of a trace, in one cell of a spectrum
 _LEAST_BOOST = 1.5  # worth it
 _SILENT = 6.0  # standard deviations of a trace that is none
+_LOUD, _WEAKER = 300.0, 3  # the same of one that says little of a smaller one; times that one is looked for
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
@@ -196,8 +197,8 @@ class Search:
         only_rates = self.only_rates(state)
         tries: list[tuple[Change, dict[Key, Any]]] = []
         for change in changes(state.sensors.one):
-            if change.phases and (only_rates or (everywhere and not self.lines(state))):
-                continue  # without a line in any spectrum nothing swings
+            if change.phases and not self.lines(state):
+                continue  # nothing swings; and with a phase for each capture it would explain any totals
             if change.strengths or change.fixed:
                 tries += [(change, tried) for tried in self.begun(state, change)]
         if not only_rates:
@@ -213,6 +214,15 @@ class Search:
             raised = {(one.change.name, shape_of(one)) for one in found}
             again = [t for t in faint if (t.change.name, shape_of(t)) in raised]
             out = old + [t for t in out if not any(t is one for one in again)] + found
+            # and of what does not grow in proportion a strong one tells nothing of a weak one
+            loud = [t for t in out if self.size(state, t.moved) > _LOUD]
+            for _ in range(_WEAKER):
+                lower = [(t.change, down) for t in loud if (down := weaker(t))]
+                loud = [t for t in self._looked_at(state, lower, some) if self.size(state, t.moved) > _SILENT]
+                out += loud
+                loud = [t for t in loud if self.size(state, t.moved) > _LOUD]
+                if not loud:
+                    break
         else:
             out = []
             for change, tried in tries:

@@ -83,6 +83,17 @@ def shape_of(one: Tried) -> tuple[Any, ...]:
     return tuple(one.values.get(dial.key) for dial in one.change.shapes)
 
 
+def weaker(one: Tried) -> dict[Key, Any] | None:
+    """The values of an added edge half as far, of a logarithm, from the least that is looked for; None of all else."""
+    if one.change.kind != "add" or len(one.change.strengths) != 1:
+        return None
+    dial = one.change.strengths[0]
+    value = float(one.values[dial.key])
+    if dial.off != 0 or not is_edge(dial) or not 0 < dial.low < value:
+        return None
+    return {**one.values, dial.key: math.sqrt(dial.low * value)}
+
+
 def stronger(one: Tried) -> dict[Key, Any] | None:
     """The values of a candidate at several times its strength, or nothing where it cannot be stronger."""
     out = dict(one.values)
