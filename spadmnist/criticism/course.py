@@ -28,6 +28,7 @@ _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
 _EXCLUDED = 6.0  # in chi square: what costs more is no value of a number
+_LOST = 30.0  # in chi square: what costs so much is no step to the better
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -148,6 +149,14 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
             settled = replace(settled, point=settling.point_of(dials, here))
             break
     course.state = state
+    if settled is not None and dials:
+        # where the last step of all was not simulated: it must not lose a line or an edge, which slopes do not know
+        here = {d.key: course.values[d.key] for d in dials}
+        there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
+        (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
+        now = search.square(state.residuals)
+        if isinstance(moved, str) or search.square(bench.residuals(state, moved)) > now + _LOST:
+            settled = replace(settled, point=settling.point_of(dials, here))
     if settled is not None and dials:
         point, covariance = settled.point, settled.covariance
         course.judged = _unseen(state, settled)
