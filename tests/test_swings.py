@@ -63,6 +63,9 @@ def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> Non
     assert found.values[AMPLITUDE] == pytest.approx(amplitude, abs=6 * error)
     off = (found.phases["flat", PHASE] - 0.7 + math.pi) % (2 * math.pi) - math.pi
     assert abs(off) < 6 * error / amplitude + math.radians(2)
+    assert found.times == 1 and found.scaled() == found.values  # what it does is what it does at these values
+    again = bench.residuals(state, found.moved)
+    assert look.square(state.residuals) - look.square(again) == pytest.approx(found.gain + 2 * len(found.phases))
     assert found.settled is not None
     _, low, high = found.settled.interval(0)
     assert low < found.values[AMPLITUDE] < high and high - low < 12 * error

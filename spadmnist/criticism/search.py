@@ -24,15 +24,13 @@ from .chance import LEAST_P, of_map
 from .fit import Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
 from .settling import Settled
-from .swings import Swing
+from .swings import NEAR, TIMES, Swing
 from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
 _REFINED = 3  # of these, that are settled
-_TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
-_NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _TURNS = 8  # phases that are simulated
 _ASIDE = 0.1  # of a logarithm, for the slope of what swings
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
@@ -75,7 +73,7 @@ class Search:
         """(gain in chi square, times the strength at which it is largest)."""
         now = self.square(state.residuals)
         best = 0.0, 1.0
-        tries = [*_TIMES, *([-t for t in _TIMES] if signed else [])]
+        tries = [*TIMES, *([-t for t in TIMES] if signed else [])]
         for _ in range(2):
             for times in tries:
                 gain = now - self.square(self.bench.residuals(state, moved, times))
@@ -83,7 +81,7 @@ class Search:
                     best = gain, times
             if best[0] < _PROMISING:
                 break
-            tries = [best[1] * x for x in _NEAR if x != 1]
+            tries = [best[1] * x for x in NEAR if x != 1]
         return best
 
     def swing(self, state: State, keys: Sequence[Key], values: Mapping[Key, Any], few: int) -> Swing | str:
@@ -573,12 +571,12 @@ class Search:
         swing = self.swing(state, one.change.phases, strong, _SWINGING)
         if isinstance(swing, str):
             return one
-        gain, times, found = swing.suited(self.bench, state, [x / stronger_by for x in (0.5, *_NEAR, 2.0)])
+        gain, times, found = swing.suited(self.bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
         moved = swing.at(found)
         one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
-        one.moved, one.gain = moved, gain - 2 * len(one.phases)
+        one.moved, one.gain = moved.at(times), gain - 2 * len(one.phases)
         one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
-        one.times, one.faint = times, True
+        one.times, one.faint = 1.0, True
         one.residuals = residuals = self.bench.residuals(state, moved, times)
         one.sensors = state.sensors.changed(one.values, one.phases, one.chips)
         aside = [self.bench.residuals(state, moved, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]

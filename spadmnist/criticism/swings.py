@@ -10,8 +10,9 @@ import numpy as np
 
 from .fit import RATES, Bench, Cell, Moved, State
 
-_TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
-_NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
+# times the strength of what was simulated: at first, and about the best of these
+TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
+NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _PHASES = 24  # that are looked at
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step from one to the next
 
@@ -52,14 +53,14 @@ class Swing:
         return Moved(odd.shifts, odd.noise, odd.logs, even=even)
 
     def suited(
-        self, bench: Bench, state: State, times: Sequence[float] = _TIMES
+        self, bench: Bench, state: State, times: Sequence[float] = TIMES
     ) -> tuple[float, float, dict[str, float]]:
         """(gain in chi square, strength, phase of each capture) that bring the data nearest."""
         every = 2 * math.pi * np.arange(_PHASES) / _PHASES
         around = dict.fromkeys(bench.seen, every)
         best = _best(self, bench, state, times, around)
         if len(times) > 1:
-            best = max(best, _best(self, bench, state, [best[1] * x for x in _NEAR], around), key=lambda b: b[0])
+            best = max(best, _best(self, bench, state, [best[1] * x for x in NEAR], around), key=lambda b: b[0])
         step = 2 * math.pi / _PHASES
         return _best(self, bench, state, [best[1]], {id: p + step * _CLOSER for id, p in best[2].items()})
 
