@@ -24,6 +24,7 @@ _HELD = 0.9  # of what directions of a candidate have in common, by few recordin
 _SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
 _LEAST_VARIANCE = 0.3  # of a cell
 _TOGETHER, _FEWEST = 1.25, 3.0  # standard deviations of a sum of cells that go together; degrees of freedom it has
+_EVENTS = 25.0  # in a cell that is as good as normal
 _SURER, _JOINED = 1.1, 1.6  # of a variance of squares: to be sure, and from where on values move together
 
 
@@ -134,7 +135,7 @@ def along(bench: Bench, state: State, moved: Moved) -> Likeness:
     if not keys:
         return Likeness(0.0, 0.0, np.zeros(many), 1.0, usual)
     own = np.zeros(many)
-    size = data = norm = fourth = 0.0
+    size = data = norm = fourth = wild = 0.0
     for key in keys:
         whole, *parts = _weights(state, key)
         t, w = template[key], whole(template[key])
@@ -142,14 +143,24 @@ def along(bench: Bench, state: State, moved: Moved) -> Likeness:
             own[part] += state.own[key][part] @ weigh(t)
         size, data = size + float(t @ w), data + float(state.residuals[key] @ w)
         norm, fourth = norm + float(w @ w), fourth + float(np.sum(w**4))
+        wild += float(np.sum(w[~_many(bench, state, key)] ** 4))
     norm = math.sqrt(norm)
     # many cells may scatter less together than they would by themselves; the score of a single one is what it is, even
     # where chance fills it so seldom that it hardly scatters
     cells = norm**4 / fourth
     spread = max(float(own.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
     # cells that go together may all be far out together: their tails are those of few
-    freedom = usual if spread < _TOGETHER else min(max(2 * cells / spread**2, _FEWEST), usual)
+    few = 2 * norm**4 / max(wild, 1e-300) / spread**2
+    freedom = usual if spread < _TOGETHER else min(max(few, _FEWEST), usual)
     return Likeness(size / norm / spread, data / norm / spread, own / norm / spread, spread, freedom)
+
+
+def _many(bench: Bench, state: State, key: Cell) -> np.ndarray:
+    """(cells,) bool: which are numbers of so many events that they are as good as normal."""
+    null = state.nulls.get(key)
+    if null is None or null.law != "poisson":
+        return np.zeros(len(state.residuals[key]), bool)
+    return np.asarray(null.expected(bench.seen[key[0]].total)[0] >= _EVENTS)
 
 
 _Weigh = Callable[[np.ndarray], np.ndarray]

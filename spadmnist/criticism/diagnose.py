@@ -179,10 +179,16 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
     refined = [search.refine(course.state, one) for one in worth]
-    best = search.preferred(refined)
-    significance, p = chance.of_best(bench, course.state, beside.tried, best)
-    if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < (LEAST_GAIN if failed else _TRACE_GAIN):
-        return False
+    judged = {id(one): chance.of_best(bench, course.state, beside.tried, one) for one in refined}
+    # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best
+    best = search.preferred(refined, lambda t: (0.0 if failed else -judged[id(t)][1], t.gain))
+    significance, p = judged[id(best)]
+    few = best.chance is None and best.gain < (LEAST_GAIN if failed else _TRACE_GAIN)
+    if p > (comparing.FALSE_ALARM if failed else _TRACE) or few:
+        if not failed or len(course.state.own[RATES]) >= _CLOSER:
+            return False
+        course.state = _closer(course)  # something is wrong: too few recordings may be all that hides what it is
+        return True
     before, earlier, fell = course.state, course.kept(), course.misfit
     new = accept(course, best, significance)
     if best.maps is None and not best.phases:
@@ -191,6 +197,8 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     new[0].alternatives = _alternatives(bench, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
     beside.placebo = beside.placebo or placebo_row(bench, before, beside.tried, best, named)
+    if not failed and course.failed and len(course.state.own[RATES]) < _CLOSER:
+        course.state = _closer(course)  # as close as the model without it was looked at
     if not failed and course.failed:
         course.back_to(earlier)  # nothing was wrong before, now something is
         return False

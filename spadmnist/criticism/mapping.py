@@ -26,6 +26,7 @@ from .recordings import InTheDark, in_frames
 _TAILS = 3.0  # degrees of freedom of the prior
 _ALONE = 0.6  # share of what is known of a map, in the mean over its pixels: then a capture is needed to settle it
 _TELLING, _LEAST_WIDTH = 0.2, 1e-3  # noise of a logarithm below which pixels tell how wide they lie; no narrower
+_DOUBT = 2.34  # of the variance of many pixels by the median of their distances: relative error, times the root of them
 _TURNS = 16
 _MOST = 10.0  # of a logarithm
 _ODD, _WIDE = 3.5, 2.0  # standard deviations of a pixel that is odd; of a logarithm, how wide these lie
@@ -54,14 +55,31 @@ class Map:
     high: float = math.inf
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) how likely each is
 
-    def values(self, draw: np.ndarray | None = None) -> np.ndarray:
-        """(groups,) values; draw: standard normal numbers, for one of the maps that may be true."""
-        # a draw of the logarithm has the mean of the estimate in the value itself
-        logs = self.estimate if draw is None else self.estimate + draw * self.error - self.error**2 / 2
+    def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
+        """(groups,) values; draw, width: standard normal numbers, for one of the maps that may be true."""
+        logs = self.estimate
+        if draw is not None:
+            scale, middle = self._as_wide(width), _middle(self.estimate)
+            error = self.error * np.sqrt(scale)
+            # a draw of the logarithm has the mean of the estimate in the value itself
+            logs = middle + (self.estimate - middle) * scale + draw * error - error**2 / 2
         relative = np.exp(np.clip(logs, -_MOST, _MOST))
         if self.likely is not None:  # a pixel that says much by itself is where it says
             relative = np.where(self.raw_error < _TELLING, relative, self._one_of(draw))
         return np.clip(self.base * relative, self.low, self.high)
+
+    def _as_wide(self, draw: float) -> np.ndarray:
+        """(groups,) by how much less noise is kept out, if the width is another one that the pixels bear with.
+
+        Of an estimate and of its variance alike: both are what the prior's width leaves of them.
+        """
+        noise = np.minimum(self.raw_error**2, _MOST)
+        usual = float(np.median(noise))
+        if usual >= _TELLING**2:
+            return np.ones(noise.size)  # these have a law of their own
+        doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + usual)
+        other = max(self.sigma**2 + draw * doubt, _LEAST_WIDTH**2)
+        return np.asarray(other / (other + noise) * (self.sigma**2 + noise) / self.sigma**2)
 
     def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
         assert self.likely is not None
@@ -441,7 +459,7 @@ def sensors_with(
         rng = np.random.Generator(np.random.Philox(key=[bench.seed + 7, number]))
         drawn = {}
         for key, m in maps[id].items():
-            drawn[key] = m.values(rng.standard_normal(len(m.estimate)))
+            drawn[key] = m.values(rng.standard_normal(len(m.estimate)), float(rng.standard_normal()))
         return with_values(bench.start, {**values, **drawn})
 
     def typical(id: str) -> Sensor:

@@ -25,7 +25,7 @@ from .fit import Bench, Cell, Moved, Sensors, State, stacked
 from .lines import Line, lines
 from .settling import Settled
 from .swings import NEAR, TIMES, Swing
-from .tried import Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger, weaker
+from .tried import EACH, Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
@@ -50,6 +50,8 @@ _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: 
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
+_NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
+_BETTER, _EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 
@@ -210,7 +212,7 @@ class Search:
             silent = [(t.change, up) for t in faint if (up := stronger(t))]
             found = self._looked_at(state, silent, some) if silent else []
             raised = {(one.change.name, shape_of(one)) for one in found}
-            again = [t for t in faint if (t.change.name, shape_of(t)) in raised]
+            again = [t for t in faint if t.gain < EACH and (t.change.name, shape_of(t)) in raised]
             out = old + [t for t in out if not any(t is one for one in again)] + found
             # and of what does not grow in proportion a strong one tells nothing of a weak one
             loud = [t for t in out if self.size(state, t.moved) > _LOUD]
@@ -237,15 +239,16 @@ class Search:
         self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]], known: Sequence[Tried]
     ) -> list[Tried]:
         """Those of `known` that may be tried still and that the data do not resemble, at the strength that suits."""
-        out = []
+        out, promising = [], set()
         for one in known:
             if one.change.phases or not any(is_same(one, *t) for t in tries):
                 continue
             now = replace(one)
             now.gain, now.times = self.line_search(state, one.moved, one.signed)
-            if now.gain < _PROMISING / 4:
-                out.append(now)
-        return out
+            out.append(now)
+            if now.gain >= _PROMISING / 4:
+                promising.add((now.change.name, shape_of(now)))
+        return [t for t in out if (t.change.name, shape_of(t)) not in promising]
 
     def only_rates(self, state: State) -> bool:
         """Is nothing wrong but the totals? A line in the spectra may be what moves those of short captures."""
@@ -432,18 +435,26 @@ class Search:
         given = one.scaled()
         dials = [d for d in one.change.dials if d.key in given and not d.whole]
         boost, power = self._boost(state, one, given)
-        found = settling.settle(
-            self.bench,
-            state,
-            dials,
-            given,
-            lambda v: state.sensors.changed(v, one.phases, one.chips),
-            rounds,
-            stronger=(boost, power),
-            only=self._showing(state, one.moved),
-        )
+        showing = self._showing(state, one.moved)
+
+        def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
+            return settling.settle(
+                self.bench,
+                state,
+                dials,
+                values,
+                lambda v: state.sensors.changed(v, one.phases, one.chips),
+                rounds,
+                stronger=(boost, power),
+                only=showing,
+            )
+
+        found = settled(given)
         if isinstance(found, str):
             return one
+        for dial in one.change.dials:
+            if dial.whole and dial.key in given:
+                found, one.intervals[dial.key] = _counted(found, dial, lambda v: settled(v, 2))
         if boost == 1 and checks.failing(checks.blocks(self.bench, state, found.residuals)):
             found = self._probed(state, one, found)
         one.faint = boost > 1
@@ -461,14 +472,14 @@ class Search:
             one.state = self.bench.state({}, one.sensors)
         return one.state
 
-    def preferred(self, refined: Sequence[Tried]) -> Tried:
-        """The best of some settled candidates.
+    def preferred(self, refined: Sequence[Tried], merit: Callable[[Tried], Any]) -> Tried:
+        """The best of some settled candidates, a pattern of several being the first.
 
         Whether chance or a map says which pixels are odd is no matter of the squares, for a map has a number for each
         pixel: what leaves fewer checks failing is better, and a map is where both leave as many, for what chance has
         decided once and for all is a map.
         """
-        best = refined[0] if is_pattern(refined[0]) else max(refined, key=lambda t: t.gain)
+        best = refined[0] if is_pattern(refined[0]) else max(refined, key=merit)
         rivals = [t for t in refined if t.chips or (t.maps and t.change.per == "pixel")]
         if best not in rivals or len({t.chips for t in rivals}) < 2:
             return best
@@ -592,6 +603,31 @@ class Search:
         square = self.square(residuals)
         one.settled = Settled(dials, now, covariance, residuals, slopes, square, one.values)
         return one
+
+
+def _counted(
+    found: Settled, dial: Dial, settled: Callable[[Mapping[Key, Any]], Settled | str]
+) -> tuple[Settled, tuple[float, float]]:
+    """(the best with a whole number settled beside the others, which of its values the data do not exclude).
+
+    No slope leads from one to the next: from its neighbours, ever nearer ones, all else being settled at each.
+    """
+    squares, step = {found.values[dial.key]: found.square}, _NEXT[0]
+    while step > _NEXT[1]:
+        here = float(found.values[dial.key])
+        near = {dial.value(dial.coordinate(here) + x) for x in (-step, step)} - squares.keys()
+        tries = [one for x in sorted(near) if not isinstance(one := settled({**found.values, dial.key: x}), str)]
+        squares |= {one.values[dial.key]: one.square for one in tries}
+        best = min(tries, key=lambda one: one.square, default=found)
+        if best.square < found.square - _BETTER:
+            found = best
+        else:
+            step /= 2
+    here = float(found.values[dial.key])
+    out = [x for x, square in squares.items() if square > found.square + _EXCLUDED]
+    low = max((x + 1 for x in out if x < here), default=dial.low)
+    high = min((x - 1 for x in out if x > here), default=dial.high)
+    return found, (low, high)
 
 
 def alike(gain: float) -> float:
