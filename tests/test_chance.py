@@ -13,7 +13,7 @@ from spadmnist.criticism import chance
 from spadmnist.criticism.fit import RATES
 
 RECORDINGS, CELL = 32, ("flat", "windows")
-BENCH: Any = SimpleNamespace(template=lambda state, moved: moved)
+BENCH: Any = SimpleNamespace(template=lambda state, moved: moved, seen={"flat": SimpleNamespace(total=1.0)})
 
 
 def model(rng: np.random.Generator, cells: int, common: float, recordings: int = RECORDINGS) -> Any:
@@ -26,7 +26,10 @@ def model(rng: np.random.Generator, cells: int, common: float, recordings: int =
     own -= own.mean(axis=0)
     own[:] *= np.sqrt(recordings / (recordings - 1))
     return SimpleNamespace(
-        residuals={CELL: draw(1)[0], RATES: np.zeros(0)}, own={CELL: own, RATES: np.zeros((recordings, 0))}, weights={}
+        residuals={CELL: draw(1)[0], RATES: np.zeros(0)},
+        own={CELL: own, RATES: np.zeros((recordings, 0))},
+        weights={},
+        nulls={},
     )
 
 
@@ -95,3 +98,8 @@ def test_what_goes_together_has_the_tails_of_few() -> None:
     state.own[CELL] = np.repeat(state.own[CELL][:, :1], 14, axis=1) / 2
     chance_of = chance.along(BENCH, state, candidate(np.ones(14), "one").moved)
     assert chance_of.freedom < 31
+    # numbers of many events have no such tails, whatever they have in common
+    for events, few in ((5.0, True), (1000.0, False)):
+        null = SimpleNamespace(law="poisson", expected=lambda total, n=events: (np.full(14, n), 0.0))
+        state.nulls = {CELL: null}
+        assert (chance.along(BENCH, state, candidate(np.ones(14), "one").moved).freedom < 31) == few

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import chance, checks, recordings
+from spadmnist.criticism import chance, checks, recordings, search, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
+from spadmnist.criticism.candidates import Dial
 from spadmnist.criticism.fit import Bench, Moved
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.tried import Tried
@@ -203,7 +204,7 @@ def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
 
     def better(left_by_map: int, left_by_chance: int, *more: Tried) -> str:
         pair = [replace(map_, state=_Model(left_by_map)), replace(chance, state=_Model(left_by_chance))]  # type: ignore[arg-type]
-        return look.preferred([*pair, *more]).change.effect
+        return look.preferred([*pair, *more], lambda t: t.gain).change.effect
 
     assert better(0, 0) == "dark_counts"
     assert better(1, 0) == "blinking_dark_counts"
@@ -233,3 +234,43 @@ def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> No
     change = change_of(bench, "add crosstalk")
     (one,) = look.looked_at(state, change, [{CROSSTALK: 0.01}])
     assert one.moved.even is None and bench.simulations - before == 2 * len(bench.seen)
+
+
+# --- whole numbers, templates, and candidates that are told apart by chance -------------------------------------
+
+
+@pytest.mark.parametrize(("truth", "first"), [(4, 8), (64, 8), (1, 32), (5, 2)])
+def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> None:
+    """The other number follows it along a narrow valley; from afar the valley's floor is not reached at once."""
+    dial = Dial("bus", "queue", "", 1.0, 256.0, None, whole=True)
+
+    def settled(values: dict[Any, Any]) -> settling.Settled:
+        queue = float(values[dial.key])
+        square = 1000.0 + 40.0 * math.log(queue / truth) ** 2 * truth
+        return settling.Settled((), np.zeros(0), np.zeros((0, 0)), {}, {}, square, dict(values))
+
+    found, (low, high) = search._counted(settled({dial.key: float(first)}), dial, settled)
+    assert low <= truth <= high and abs(math.log(found.values[dial.key] / truth)) < 0.15
+    assert low >= 1 and (low, high) == (round(low), round(high))
+    if truth < 10:
+        assert found.values[dial.key] == truth
+
+
+def test_a_template_of_another_strength_does_not_hide_one_that_promises(lab) -> None:
+    """What is known of a strong one is no reason not to look at a weak one again."""
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add crosstalk")
+    strengths = (1e-3, 1e-1)
+    tries = [(change, {CROSSTALK: x}) for x in strengths]
+    cell = ("flat", "fine_intervals")
+    like = Moved({cell: -state.residuals[cell]}, {}, {})
+    weak, strong = (Tried(change, v, m, 0.0, 1.0) for (_, v), m in zip(tries, (like, Moved({}, {}, {})), strict=True))
+    assert [t.values for t in look._still(state, tries, [strong])] == [strong.values]
+    cells = len(state.residuals[cell])
+    state.residuals[cell] = np.full(cells, 4.0)
+    usual = np.maximum(state.nulls[cell].expected(bench.seen["flat"].total)[0], 1.0)
+    weak.moved = Moved({cell: 4.0 * np.sqrt(usual)}, {}, {})
+    weak.gain, _ = look.line_search(state, weak.moved, weak.signed)
+    assert weak.gain > 25
+    assert look._still(state, tries, [weak, strong]) == []

@@ -10,7 +10,7 @@ import pytest
 
 from spadmnist import config
 from spadmnist import measurement as measurements
-from spadmnist.criticism import compare, diagnose, next_sensor
+from spadmnist.criticism import answer, compare, diagnose, next_sensor
 from spadmnist.errors import InputError
 from spadmnist.measurement import Measurement
 
@@ -105,6 +105,20 @@ def test_a_capture_at_another_wavelength_is_named(tmp_path):
     (entry,) = found.setup
     assert (entry["capture"], entry["quantity"], entry["confused"]) == ("low-700", "wavelength", False)
     assert entry["factor"]["low"] < ratio < entry["factor"]["high"]
+
+
+@pytest.mark.parametrize(("odd", "mean", "verdict"), [("high-500", 9626, "confused"), ("low-500", 423, "setup")])
+def test_the_brightest_capture_alone_may_be_a_nonlinearity(tmp_path, odd, mean, verdict):
+    """A mistake at any other level is the laboratory's: no sensor answers less at a level between two others."""
+    means = {"low-500": 457, "low-700": 60, "high-500": 9740, "high-700": 4184, "dark": 2.65, odd: mean}
+    data = measured(tmp_path, {id: (*PAPER[id][:3], mean) for id, mean in means.items()})
+    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    assert found.verdict == verdict and not found.steps
+    assert {e["capture"] for e in found.setup} == {odd}
+    doubted = [a for a in found.advice if answer.NONLINEARITY in a["separates"]]
+    assert bool(doubted) == bool(found.unexplained) == (verdict == "confused")
+    assert (answer.NONLINEARITY in answer.table(found)) == (verdict == "confused")
+    assert all(odd in a["capture"] and a["significance_then"] > a["significance_now"] for a in doubted)
 
 
 TR = """sensor:

@@ -17,6 +17,8 @@ from ..statistics import Statistic, Summary
 from .candidates import Change, Dial, Key
 from .fit import Cell
 
+NONLINEARITY = "a nonlinearity of the sensor that no effect here has"
+
 
 def plain(value: float) -> float:
     """A finite number of six digits."""
@@ -245,6 +247,8 @@ def sentence(found: Diagnosis) -> str:
     names = " and ".join(title(s.change) for s in found.steps)
     if found.verdict == "explained":
         return f"{names} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
+    if found.verdict == "confused" and found.setup and not found.steps:
+        return f"the set-up of {found.setup[0]['capture']}, or {NONLINEARITY}: it is the brightest capture."
     if found.verdict == "confused":
         return f"{names}, or something that looks the same here."
     if found.verdict == "partly_explained":

@@ -63,11 +63,13 @@ def diagnose(
 class _Beside:
     """What a diagnosis says beside its steps.
 
-    explained: is what fails in the totals the set-up's? tried: candidates as they were last looked at.
+    explained: is what fails in the totals the set-up's? bent: or that of a nonlinearity that no effect here has? tried:
+    candidates as they were last looked at.
     """
 
     setup: list[dict[str, Any]]
     explained: bool
+    bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Tried | None = None
     placebo: dict[str, Any] | None = None
@@ -109,7 +111,7 @@ def _diagnosed(
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
         excluded, invisible = outlook.upper_limits(course.search, course.state, beside.tried)
-    remains = verdict in ("unexplained", "partly_explained")
+    remains = verdict in ("unexplained", "partly_explained") or beside.bent
     return Diagnosis(
         bench.start.name,
         measurement.name,
@@ -234,7 +236,7 @@ def _closer(course: Course) -> State:
 
 
 def _verdict(course: Course, left: Sequence[checks.Block], beside: _Beside) -> str:
-    if beside.rival is not None:
+    if beside.rival is not None or beside.bent:
         return "confused"
     if left:
         return "partly_explained" if course.steps else "unexplained"
@@ -287,6 +289,10 @@ def _by_setup(course: Course, beside: _Beside) -> bool:
         beside.advice += outlook.advice_on_totals(course.search, state, likely[0], others[0])
     else:
         beside.advice += outlook.advice_on_setup(bench, state, found)
+        bright = setups.brightest(bench, likely[0])
+        if bright is not None:
+            beside.bent = True
+            beside.advice.append(outlook.advice_on_brightest(bench, state, likely[0], bright))
     beside.setup += found
     beside.explained = True
     return True

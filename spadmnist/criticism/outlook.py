@@ -14,7 +14,7 @@ from .. import twin, units
 from ..effects import Conditions, Mimic
 from ..recording import Capture, Light, Recording
 from . import fit, recordings
-from .answer import Step, plain
+from .answer import NONLINEARITY, Step, plain
 from .candidates import Change
 from .chance import along
 from .fit import Bench, Moved, Seen, Sensors, State
@@ -175,6 +175,13 @@ def advice_on_totals(search: Search, state: State, setup: Explanation, other: Tr
 def advice_on_mimic(step: Step, other: Mimic) -> dict[str, Any]:
     """What tells a finding from what looks the same in all that was measured: at least as clearly as it was found."""
     return _told(other.capture, [step.change.effect, other.what], 0.0, step.significance)
+
+
+def advice_on_brightest(bench: Bench, state: State, setup: Explanation, id: str) -> dict[str, Any]:
+    """What tells a set-up from a nonlinearity: with half of the light, half is left, of a mistake nothing."""
+    then = 0.5 * abs(float(setup.logs[0])) / bench.level_error(state, id)
+    words = f"a flat field half as bright as {id}, its light measured anew"
+    return _told(words, [setup.factors[0].quantity, NONLINEARITY], 0.0, then)
 
 
 def _dark(conditions: Conditions) -> Conditions:

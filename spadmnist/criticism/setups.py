@@ -102,6 +102,21 @@ def _overlap(pair: Sequence[Factor]) -> bool:
     return a <= b or b <= a
 
 
+def brightest(bench: Bench, one: Explanation) -> str | None:
+    """The capture that it is all about, if that is the brightest of several; else None.
+
+    What a sensor does at the highest rates alone looks the same: a nonlinearity that no effect here has.
+    """
+    named = {id for factor in one.factors for id in factor.captures}
+    rates = {
+        id: seen.total / seen.capture.conditions.exposure
+        for id, seen in bench.seen.items()
+        if not seen.capture.light.dark
+    }
+    most = max(rates, key=lambda id: rates[id], default=None)
+    return most if named == {most} and len(rates) > 2 else None
+
+
 def entries(bench: Bench, state: State, likely: Sequence[Explanation]) -> list[dict[str, Any]]:
     """As `formats` has them; what cannot be told apart is marked."""
     out: list[dict[str, Any]] = []
