@@ -181,6 +181,7 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
     refined = [search.refine(course.state, one) for one in worth]
+    search.weigh(course.state, refined)
     judged = {id(one): chance.of_best(bench, course.state, beside.tried, one) for one in refined}
     # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best
     best = search.preferred(refined, lambda t: (0.0 if failed else -judged[id(t)][1], t.gain))

@@ -53,6 +53,7 @@ _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neithe
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
 _BETTER, _EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
+_MOVED = 0.3  # standard deviations, by which a cell is moved
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 
 
@@ -471,6 +472,27 @@ class Search:
             assert one.sensors is not None
             one.state = self.bench.state({}, one.sensors)
         return one.state
+
+    def weigh(self, state: State, refined: Sequence[Tried]) -> None:
+        """Those that may be best are simulated as often as the state: differences of a few recordings blur an edge.
+
+        Compared by the cells that either of them moves, lest chance in all others decide.
+        """
+        known = [t for t in refined if t.maps is None and t.sensors is not None and not t.chips]
+        most = max((t.gain for t in known), default=0.0)
+        near = [t for t in known if most - t.gain < alike(most)]
+        if len(near) < 2:
+            return
+        traces = [self.bench.template(state, t.moved.at(t.times)) for t in near]
+        moved = {cell: np.any([np.abs(t[cell]) > _MOVED for t in traces], axis=0) for cell in state.residuals}
+
+        def left(residuals: Mapping[Cell, np.ndarray]) -> float:
+            return sum(float(residuals[cell][some] @ residuals[cell][some]) for cell, some in moved.items())
+
+        states = [self.state_of(one) for one in near]
+        moved = {cell: some for cell, some in moved.items() if all(cell in there.residuals for there in states)}
+        for one, there in zip(near, states, strict=True):
+            one.gain = left(state.residuals) - left(there.residuals)
 
     def preferred(self, refined: Sequence[Tried], merit: Callable[[Tried], Any]) -> Tried:
         """The best of some settled candidates, a pattern of several being the first.
