@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, bench_of, change_of, quiet
 
-from spadmnist.criticism import answer, diagnose, findings
+from spadmnist.criticism import answer, diagnose, findings, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved, State
@@ -161,3 +161,66 @@ def test_what_looks_the_same_is_named_with_what_tells(lab):
     assert answer.mimic(step.change) is not None
     course.steps = [of("crosstalk", course.state, course.bench, intervals=30.0)]
     assert diagnose._or_confused(course, diagnose._Beside([], False)) == "explained"
+
+
+def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
+    """Slopes do not know that an echo's line falls into the next bin."""
+    course = course_of.begun(bench_of(lab()))
+    change = change_of(course.bench, "add crosstalk")
+    dials = change.strengths
+    course.values = {CROSSTALK: 0.01}
+    further = settling.point_of(dials, {CROSSTALK: 0.02})
+    settled = settling.Settled(dials, further, np.eye(1), {}, {}, 0.0, {CROSSTALK: 0.02})
+    now = course.search.square(course.state.residuals)
+    for square, point in ((now + 1e3, 0.01), (now + 1.0, 0.02)):
+        monkeypatch.setattr(course.bench, "moved", lambda *_, **__: [Moved({}, {}, {})])
+        monkeypatch.setattr(course.search, "square", lambda z, s=square: now if z is course.state.residuals else s)
+        held = course_of._held(course, settled)
+        assert dials[0].value(float(held.point[0])) == pytest.approx(point)
+    monkeypatch.setattr(course.bench, "moved", lambda *_, **__: ["beyond what can be simulated"])
+    assert dials[0].value(float(course_of._held(course, settled).point[0])) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, monkeypatch, fails):
+    """A candidate that could be chance by few recordings is looked at by many before the answer is that none fits."""
+    course = course_of.begun(bench_of(lab()))
+    one = Tried(change_of(course.bench, "add crosstalk"), {CROSSTALK: 0.01}, Moved({}, {}, {}), 50.0, 1.0)
+    for name in ("again", "worth"):
+        monkeypatch.setattr(course.search, name, lambda *_: [one])
+    monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
+    monkeypatch.setattr(course.search, "refine", lambda state, one: one)
+    monkeypatch.setattr(diagnose.chance, "of_best", lambda *_: (3.0, 0.2))
+    failed: Any = [object()] if fails else []
+    beside = diagnose._Beside([], False)
+    assert diagnose._added(course, beside, failed) == fails
+    assert (len(course.state.own[RATES]) > 16) == fails
+    assert not diagnose._added(course, beside, failed)  # and not again and again
+    assert not course.steps
+
+
+def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, monkeypatch):
+    course = course_of.begun(bench_of(lab()))
+    map_, other = (
+        Tried(change_of(course.bench, name), {}, Moved({}, {}, {}), gain, 1.0)
+        for name, gain in (("per_pixel dark_counts.rate", 18.0), ("add slow_afterpulsing", 37.0))
+    )
+    for name in ("again", "worth"):
+        monkeypatch.setattr(course.search, name, lambda *_: [map_, other])
+    monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
+    monkeypatch.setattr(course.search, "refine", lambda state, one: one)
+    monkeypatch.setattr(
+        diagnose.chance, "of_best", lambda bench, state, tried, one: (4.0, 1e-5 if one is map_ else 1e-3)
+    )
+    taken: list[Tried] = []
+
+    def accept(course: Any, best: Tried, significance: float) -> Any:
+        taken.append(best)
+        raise StopIteration
+
+    monkeypatch.setattr(diagnose, "accept", accept)
+    map_.chance = 1e-5  # and so no gain is asked of it
+    for failed in ([], [object()]):
+        with pytest.raises(StopIteration):
+            diagnose._added(course, diagnose._Beside([], False), failed)  # type: ignore[arg-type]
+    assert taken == [map_, other]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy import stats
 from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
-from .candidates import Change, Key, with_values
+from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, stacked
 from .ladder import errors_of, row
 from .search import Search
@@ -120,17 +121,32 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
 
 def settle_all(course: Course, settled: Settled | None = None) -> None:
     """The model with all its steps beside the data: maps, then all numbers together. settled: those of the last."""
-    bench, search = course.bench, course.search
     sensors, maps = _model(course)
-    state = bench.state(course.values, sensors)
+    state = course.bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
-    errors = errors_known(course, settled)
-    slopes = _slopes_known(course)
-    if settled is not None and settled.dials != dials:
-        settled = None
-    # from where it nearly is right: the scatter of the cells is that of the model with the effect
+    found: Settled | None = None
+    if dials:
+        found, state, maps = _followed(course, state, maps, dials, errors_known(course, settled))
+        found = found or (settled if settled is not None and settled.dials == dials else None)
+    course.state = state
+    course.judged = None
+    if found is not None:
+        found = _held(course, found)
+        course.judged = _unseen(state, found)
+    _written(course, found, maps)
+
+
+def _followed(
+    course: Course, state: State, maps: dict[Key, mapping.Map], dials: tuple[Dial, ...], errors: Mapping[Key, float]
+) -> tuple[Settled | None, State, dict[Key, mapping.Map]]:
+    """(numbers settled from where they nearly are right, the model there, its maps): the scatter is that model's own.
+
+    None where they cannot be followed.
+    """
+    bench, search, slopes = course.bench, course.search, _slopes_known(course)
+    settled: Settled | None = None
     near: Settled | None = None
-    for turn in range(_AGAIN + 1 if dials else 0):
+    for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
         closer = settling.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
         if isinstance(closer, str):
@@ -139,36 +155,39 @@ def settle_all(course: Course, settled: Settled | None = None) -> None:
         if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
             break
         near = closer if np.all(np.abs(closer.point - settling.point_of(dials, here)) < _SAME) else None
-        before = course.values, sensors, maps, state
+        before = course.values, maps, state
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)
         state = bench.state(course.values, sensors)
-        if search.square(state.residuals) > search.square(before[3].residuals):
+        if search.square(state.residuals) > search.square(before[2].residuals):
             # a line or an edge: slopes do not lead further
-            course.values, sensors, maps, state = before
+            course.values, maps, state = before
             settled = replace(settled, point=settling.point_of(dials, here))
             break
-    course.state = state
-    if settled is not None and dials:
-        # where the last step of all was not simulated: it must not lose a line or an edge, which slopes do not know
-        here = {d.key: course.values[d.key] for d in dials}
-        there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
-        (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
-        now = search.square(state.residuals)
-        if isinstance(moved, str) or search.square(bench.residuals(state, moved)) > now + _LOST:
-            settled = replace(settled, point=settling.point_of(dials, here))
-    if settled is not None and dials:
-        point, covariance = settled.point, settled.covariance
-        course.judged = _unseen(state, settled)
+    return settled, state, maps
+
+
+def _held(course: Course, settled: Settled) -> Settled:
+    """The last step of all was not simulated: it is not taken where it loses a line or an edge, as no slope knows."""
+    bench, state, dials = course.bench, course.state, settled.dials
+    there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
+    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
+    now = course.search.square(state.residuals)
+    if isinstance(moved, str) or course.search.square(bench.residuals(state, moved)) > now + _LOST:
+        return replace(settled, point=settling.point_of(dials, course.values))
+    return settled
+
+
+def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping.Map]) -> None:
+    """The values of all steps, as they were settled, with their intervals."""
+    if settled is not None:
         place = {d.key: i for i, d in enumerate(settled.dials)}
         for step in course.steps:
             for dial in step.dials:
                 i = place[dial.key]
-                half, u = _HALF * math.sqrt(max(float(covariance[i, i]), 0.0)), float(point[i])
+                u, half = float(settled.point[i]), _HALF * math.sqrt(max(float(settled.covariance[i, i]), 0.0))
                 step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
-    else:
-        course.judged = None
     for step in course.steps:
         if step.change.carrier and step.change.carrier in maps:
             step.values = _map_values(maps[step.change.carrier])

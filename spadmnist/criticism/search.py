@@ -195,46 +195,55 @@ class Search:
         known: what they did to an earlier model. That is taken for what they do to this one, but where the data
         resemble it.
         """
-        only_rates = self.only_rates(state)
         tries: list[tuple[Change, dict[Key, Any]]] = []
         for change in changes(state.sensors.one):
             if change.phases and not self.lines(state):
                 continue  # nothing swings; and with a phase for each capture it would explain any totals
             if change.strengths or change.fixed:
                 tries += [(change, tried) for tried in self.begun(state, change)]
-        if not only_rates:
+        if self.only_rates(state):
+            out = self._by_totals(state, tries)
+        else:
             some = () if everywhere else self.telling(state)
             seen = set.intersection(*(t.seen for t in known)) if known else set()
             old = self._still(state, tries, known) if everywhere or set(some) <= seen else []
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
-            out = self._looked_at(state, tries, some)
-            # what leaves no trace yet may do so when it is stronger
-            faint = [t for t in out if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
-            silent = [(t.change, up) for t in faint if (up := stronger(t))]
-            found = self._looked_at(state, silent, some) if silent else []
-            raised = {(one.change.name, shape_of(one)) for one in found}
-            again = [t for t in faint if t.gain < EACH and (t.change.name, shape_of(t)) in raised]
-            out = old + [t for t in out if not any(t is one for one in again)] + found
-            # and of what does not grow in proportion a strong one tells nothing of a weak one
-            loud = [t for t in out if self.size(state, t.moved) > _LOUD]
-            for _ in range(_WEAKER):
-                lower = [(t.change, down) for t in loud if (down := weaker(t))]
-                loud = [t for t in self._looked_at(state, lower, some) if self.size(state, t.moved) > _SILENT]
-                out += loud
-                loud = [t for t in loud if self.size(state, t.moved) > _LOUD]
-                if not loud:
-                    break
-        else:
-            out = []
-            for change, tried in tries:
-                try:
-                    moved = self.bench.told(state, state.sensors.changed(tried))
-                except SpadError:
-                    continue
-                one = Tried(change, tried, moved, 0.0, 1.0)
-                one.gain, one.times = self.line_search(state, moved, one.signed)
-                out.append(one)
+            out = old + self._raised(state, self._looked_at(state, tries, some), some)
+            out += self._lowered(state, out, some)
         return sorted(out, key=lambda t: -t.gain)
+
+    def _by_totals(self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]]) -> list[Tried]:
+        """Candidates by what the closed forms say of the totals: nothing else is wrong, nothing need be simulated."""
+        out = []
+        for change, tried in tries:
+            with contextlib.suppress(SpadError):
+                one = Tried(change, tried, self.bench.told(state, state.sensors.changed(tried)), 0.0, 1.0)
+                one.gain, one.times = self.line_search(state, one.moved, one.signed)
+                out.append(one)
+        return out
+
+    def _raised(self, state: State, tried: list[Tried], some: Sequence[str]) -> list[Tried]:
+        """These, and stronger ones for those that leave no trace: these may do so."""
+        faint = [t for t in tried if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
+        silent = [(t.change, up) for t in faint if (up := stronger(t))]
+        found = self._looked_at(state, silent, some) if silent else []
+        raised = {(one.change.name, shape_of(one)) for one in found}
+        # but what the data resemble as faint as it is stays
+        again = [t for t in faint if t.gain < EACH and (t.change.name, shape_of(t)) in raised]
+        return [t for t in tried if not any(t is one for one in again)] + found
+
+    def _lowered(self, state: State, tried: Sequence[Tried], some: Sequence[str]) -> list[Tried]:
+        """Weaker ones for those that drown all else: where it does not grow in proportion, they tell nothing of it."""
+        out: list[Tried] = []
+        loud = [t for t in tried if self.size(state, t.moved) > _LOUD]
+        for _ in range(_WEAKER):
+            lower = [(t.change, down) for t in loud if (down := weaker(t))]
+            loud = [t for t in self._looked_at(state, lower, some) if self.size(state, t.moved) > _SILENT]
+            out += loud
+            loud = [t for t in loud if self.size(state, t.moved) > _LOUD]
+            if not loud:
+                break
+        return out
 
     def _still(
         self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]], known: Sequence[Tried]
