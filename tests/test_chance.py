@@ -100,6 +100,6 @@ def test_what_goes_together_has_the_tails_of_few() -> None:
     assert chance_of.freedom < 31
     # numbers of many events have no such tails, whatever they have in common
     for events, few in ((5.0, True), (1000.0, False)):
-        null = SimpleNamespace(law="poisson", expected=lambda total, n=events: (np.full(14, n), 0.0))
+        null = SimpleNamespace(law="poisson", factor=1.0, expected=lambda total, n=events: (np.full(14, n), 0.0))
         state.nulls = {CELL: null}
         assert (chance.along(BENCH, state, candidate(np.ones(14), "one").moved).freedom < 31) == few

@@ -118,6 +118,10 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     bigger, usual = (s**2 / (s**2 + noise**2) for s in (math.sqrt(sigma**2 + alone), sigma))
     follows = float(np.var(raw)) * (bigger**2 - usual**2) + noise**2 * (bigger - usual)
     assert 0.7 < math.sqrt(np.var(doubted) - np.var(known)) / follows < 1.4
+    # an odd pixel, from which the prior keeps nothing out, stays where it is
+    map_.estimate[7], map_.error[7] = 3.0, noise * (1 - 1e-6)
+    for width in (-3.0, 3.0):
+        assert math.log(map_.values(np.zeros(n), width)[7]) == pytest.approx(3.0, abs=0.01)
     # where each pixel says where it is, there is no doubt
     clear = mapping.Map(("a", "b"), 1.0, np.arange(n), raw, np.full(n, 1e-4), raw, np.full(n, 1e-4), sigma)
     draw = rng.standard_normal(n)

@@ -56,7 +56,8 @@ def of_any(bench: Bench, state: State, tried: Sequence[Tried], values: dict[Key,
 def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried) -> tuple[float, float]:
     """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
     if best.chance is not None:
-        return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), best.chance
+        others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
+        return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
     _, own = _of_traces(bench, state, [best, *tried])
     found = along(bench, state, best.moved)
     if found.size <= 0:
@@ -160,7 +161,8 @@ def _many(bench: Bench, state: State, key: Cell) -> np.ndarray:
     null = state.nulls.get(key)
     if null is None or null.law != "poisson":
         return np.zeros(len(state.residuals[key]), bool)
-    return np.asarray(null.expected(bench.seen[key[0]].total)[0] >= _EVENTS)
+    # events that come in bursts are as many as there are bursts
+    return np.asarray(null.expected(bench.seen[key[0]].total)[0] >= _EVENTS * max(null.factor, 1.0) ** 2)
 
 
 _Weigh = Callable[[np.ndarray], np.ndarray]

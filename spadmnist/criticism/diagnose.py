@@ -26,7 +26,7 @@ from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
 from .search import alike
-from .tried import Tried
+from .tried import EACH, Tried
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself: far less than what checks alarm by
@@ -111,7 +111,7 @@ def _diagnosed(
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
         excluded, invisible = outlook.upper_limits(course.search, course.state, beside.tried)
-    remains = verdict in ("unexplained", "partly_explained") or beside.bent
+    remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not course.steps)
     return Diagnosis(
         bench.start.name,
         measurement.name,
@@ -142,7 +142,7 @@ def _another(course: Course, beside: _Beside) -> bool:
     """Is there a step more, after which another one may come? Takes it."""
     bench, search, failed = course.bench, course.search, course.failed
     number = len(course.steps) + 1
-    if failed and not course.steps and min(b.p for b in failed) > _PLAIN and bench.replicates < _CLOSER:
+    if failed and not course.steps and min(b.p for b in failed) > _PLAIN and _few(course):
         course.state = _closer(course)  # lest the scatter of few recordings decide
         failed = course.failed
     if not failed:
@@ -186,9 +186,10 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best
     best = search.preferred(refined, lambda t: (0.0 if failed else -judged[id(t)][1], t.gain))
     significance, p = judged[id(best)]
-    few = best.chance is None and best.gain < (LEAST_GAIN if failed else _TRACE_GAIN)
-    if p > (comparing.FALSE_ALARM if failed else _TRACE) or few:
-        if not failed or len(course.state.own[RATES]) >= _CLOSER:
+    # small differences of many pixels, or codes, are no matter of squares: their chance is known by itself
+    least = LEAST_GAIN if failed else _TRACE_GAIN if best.chance is None else EACH
+    if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < least:
+        if not failed or not _few(course):
             return False
         course.state = _closer(course)  # something is wrong: too few recordings may be all that hides what it is
         return True
@@ -200,7 +201,7 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     new[0].alternatives = _alternatives(bench, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
     beside.placebo = beside.placebo or placebo_row(bench, before, beside.tried, best, named)
-    if not failed and course.failed and len(course.state.own[RATES]) < _CLOSER:
+    if not failed and course.failed and _few(course):
         course.state = _closer(course)  # as close as the model without it was looked at
     if not failed and course.failed:
         course.back_to(earlier)  # nothing was wrong before, now something is
@@ -221,10 +222,15 @@ def _stands_out(course: Course, tried: Sequence[Tried], trace: float) -> bool:
     p = chance.of_any(course.bench, course.state, tried, course.values, course.search.lines(course.state))
     if p >= min(_MAYBE * trace, 1.0):
         return False
-    if len(course.state.own[RATES]) < _CLOSER:
+    if _few(course):
         course.state = _closer(course)
         p = chance.of_any(course.bench, course.state, tried, course.values, course.search.lines(course.state))
     return p <= trace
+
+
+def _few(course: Course) -> bool:
+    """Has the model been simulated so seldom that a closer look would tell more?"""
+    return len(course.state.own[RATES]) < _CLOSER
 
 
 def _closer(course: Course) -> State:
@@ -237,12 +243,14 @@ def _closer(course: Course) -> State:
 
 
 def _verdict(course: Course, left: Sequence[checks.Block], beside: _Beside) -> str:
-    if beside.rival is not None or beside.bent:
+    if beside.rival is not None:
         return "confused"
     if left:
         return "partly_explained" if course.steps else "unexplained"
     if course.steps:
         return "explained"
+    if beside.bent:
+        return "confused"
     return "setup" if beside.setup else "adequate"
 
 
@@ -293,8 +301,8 @@ def _by_setup(course: Course, beside: _Beside) -> bool:
         bright = setups.brightest(bench, likely[0])
         if bright is not None:
             beside.bent = True
-            beside.advice.append(outlook.advice_on_brightest(bench, state, likely[0], bright))
-    beside.setup += found
+            beside.advice.append(outlook.advice_on_brightest(bench, state, likely[0], found[0]))
+    beside.setup = found + beside.setup
     beside.explained = True
     return True
 

@@ -78,8 +78,10 @@ class Map:
         if usual >= _TELLING**2:
             return np.ones(noise.size)  # these have a law of their own
         doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + usual)
-        other = max(self.sigma**2 + draw * doubt, _LEAST_WIDTH**2)
-        return np.asarray(other / (other + noise) * (self.sigma**2 + noise) / self.sigma**2)
+        other = max(self.sigma**2 + draw * doubt, min(_LEAST_WIDTH, self.sigma) ** 2)
+        # by what the prior has done to each: an odd one is none of those whose width is in doubt
+        pulled = np.maximum(noise / np.maximum(self.error**2, 1e-30) - 1, 0.0)
+        return np.asarray((1 + pulled) / (1 + pulled * self.sigma**2 / other))
 
     def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
         assert self.likely is not None

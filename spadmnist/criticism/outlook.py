@@ -177,11 +177,11 @@ def advice_on_mimic(step: Step, other: Mimic) -> dict[str, Any]:
     return _told(other.capture, [step.change.effect, other.what], 0.0, step.significance)
 
 
-def advice_on_brightest(bench: Bench, state: State, setup: Explanation, id: str) -> dict[str, Any]:
+def advice_on_brightest(bench: Bench, state: State, setup: Explanation, entry: Mapping[str, Any]) -> dict[str, Any]:
     """What tells a set-up from a nonlinearity: with half of the light, half is left, of a mistake nothing."""
-    then = 0.5 * abs(float(setup.logs[0])) / bench.level_error(state, id)
-    words = f"a flat field half as bright as {id}, its light measured anew"
-    return _told(words, [setup.factors[0].quantity, NONLINEARITY], 0.0, then)
+    then = 0.5 * abs(float(setup.logs[0])) / bench.level_error(state, entry["capture"])
+    words = f"a flat field half as bright as {entry['capture']}, its light measured anew"
+    return _told(words, [entry["quantity"], NONLINEARITY], 0.0, then)
 
 
 def _dark(conditions: Conditions) -> Conditions:

@@ -483,25 +483,32 @@ class Search:
         return one.state
 
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:
-        """Those that may be best are simulated as often as the state: differences of a few recordings blur an edge.
+        """Those that may be best get states of their own: differences of a few recordings blur an edge.
 
         Compared by the cells that either of them moves, lest chance in all others decide.
         """
-        known = [t for t in refined if t.maps is None and t.sensors is not None and not t.chips]
+        known = [t for t in refined if t.maps is None and t.residuals is not None and not t.chips]
         most = max((t.gain for t in known), default=0.0)
         near = [t for t in known if most - t.gain < alike(most)]
         if len(near) < 2:
             return
-        traces = [self.bench.template(state, t.moved.at(t.times)) for t in near]
-        moved = {cell: np.any([np.abs(t[cell]) > _MOVED for t in traces], axis=0) for cell in state.residuals}
-
-        def left(residuals: Mapping[Cell, np.ndarray]) -> float:
-            return sum(float(residuals[cell][some] @ residuals[cell][some]) for cell, some in moved.items())
-
-        states = [self.state_of(one) for one in near]
-        moved = {cell: some for cell, some in moved.items() if all(cell in there.residuals for there in states)}
-        for one, there in zip(near, states, strict=True):
-            one.gain = left(state.residuals) - left(there.residuals)
+        costs: dict[int, float] = {}
+        states: list[tuple[Tried, State]] = []
+        for one in near:
+            with contextlib.suppress(SpadError):  # what cannot be simulated everywhere stays what it is
+                states.append((one, self.state_of(one)))
+        if len(states) < 2:
+            return
+        for cell, z in state.residuals.items():
+            if any(len(there.residuals.get(cell, ())) != len(z) for _, there in states):
+                continue
+            moved = np.any([np.abs(one.residuals[cell] - z) > _MOVED for one, _ in states if one.residuals], axis=0)
+            for one, there in states:
+                left = there.residuals[cell][moved]
+                costs[id(one)] = costs.get(id(one), 2.0 * len(one.phases)) + float(left @ left)
+        best = min((one for one, _ in states), key=lambda one: costs[id(one)])
+        for one, _ in states:
+            one.gain = best.gain - (costs[id(one)] - costs[id(best)])
 
     def preferred(self, refined: Sequence[Tried], merit: Callable[[Tried], Any]) -> Tried:
         """The best of some settled candidates, a pattern of several being the first.
@@ -644,21 +651,40 @@ def _counted(
     No slope leads from one to the next: from its neighbours, ever nearer ones, all else being settled at each.
     """
     squares, step = {found.values[dial.key]: found.square}, _NEXT[0]
+
+    def there(value: float) -> Settled | None:
+        one = settled({**found.values, dial.key: value})
+        squares[value] = math.inf if isinstance(one, str) else one.square
+        return None if isinstance(one, str) else one
+
     while step > _NEXT[1]:
         here = float(found.values[dial.key])
-        near = {dial.value(dial.coordinate(here) + x) for x in (-step, step)} - squares.keys()
-        tries = [one for x in sorted(near) if not isinstance(one := settled({**found.values, dial.key: x}), str)]
-        squares |= {one.values[dial.key]: one.square for one in tries}
-        best = min(tries, key=lambda one: one.square, default=found)
+        near = {_beside(dial, here, x) for x in (-step, step)} - squares.keys()
+        best = min((one for x in sorted(near) if (one := there(x))), key=lambda one: one.square, default=found)
         if best.square < found.square - _BETTER:
             found = best
         else:
             step /= 2
     here = float(found.values[dial.key])
+    for side in (-1, 1):  # on to where they do
+        step = _NEXT[0]
+        while all(side * (x - here) <= 0 or squares[x] <= found.square + _EXCLUDED for x in squares):
+            far = max(squares, key=lambda x, side=side: side * x)  # type: ignore[misc]
+            if (further := _beside(dial, far, side * step)) == far:
+                break
+            there(further)
+            step *= 2
     out = [x for x, square in squares.items() if square > found.square + _EXCLUDED]
     low = max((x + 1 for x in out if x < here), default=dial.low)
     high = min((x - 1 for x in out if x > here), default=dial.high)
     return found, (low, high)
+
+
+def _beside(dial: Dial, value: float, step: float) -> float:
+    """The whole number so far away, of a logarithm, but at least the next one; at a bound that itself."""
+    other = dial.value(dial.coordinate(value) + step)
+    other = min(other, value - 1) if step < 0 else max(other, value + 1)
+    return min(max(other, dial.low), dial.high)
 
 
 def alike(gain: float) -> float:

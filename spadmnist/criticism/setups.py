@@ -108,11 +108,11 @@ def brightest(bench: Bench, one: Explanation) -> str | None:
     What a sensor does at the highest rates alone looks the same: a nonlinearity that no effect here has.
     """
     named = {id for factor in one.factors for id in factor.captures}
-    rates = {
-        id: seen.total / seen.capture.conditions.exposure
-        for id, seen in bench.seen.items()
-        if not seen.capture.light.dark
-    }
+    rates = {}
+    for id, seen in bench.seen.items():
+        c = seen.capture.conditions
+        if not seen.capture.light.dark:  # frames may have gaps between them
+            rates[id] = seen.total / (c.exposure if seen.capture.modality == "tr" else c.frames * c.frame_time)
     most = max(rates, key=lambda id: rates[id], default=None)
     return most if named == {most} and len(rates) > 2 else None
 
