@@ -33,6 +33,7 @@ _ODD, _WIDE = 3.5, 2.0  # standard deviations of a pixel that is odd; of a logar
 CODES = "codes"
 _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _GRID, _ROUNDS = (-4.0, 8.0, 97), 100  # logarithms about the middle that pixels of few counts may have
+_FAR_OFF = 4.0  # standard deviations from most pixels, beyond which it does not matter how far
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
 
 
@@ -515,13 +516,15 @@ def summary(map_: Map) -> dict[str, float]:
     }
 
 
-def patterned(map_: Map, designs: dict[str, np.ndarray]) -> dict[str, float]:
-    """p-value of each pattern in a map of pixels, against the scatter of what the patterns leave (F tests).
+def patterned(map_: Map, designs: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """(p-value of each pattern in a map of pixels, against the scatter of what it leaves (F test); what it leaves, and
+    what its numbers cost, by which patterns compare that are all beyond doubt (Schwarz, Ann. Statist. 6, 1978)).
 
     designs: (pixels, k) columns, without the mean.
     """
-    ranks = stats.rankdata(map_.raw) / (len(map_.raw) + 1)
-    y = stats.norm.ppf(ranks)  # odd pixels do not make a pattern
+    y = np.exp(np.clip(map_.raw, -_MOST, _MOST))
+    middle, width = _middle(y), 1.4826 * _middle(np.abs(y - _middle(y)))
+    y = np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)  # odd pixels do not make a pattern
     out = {}
     ones = np.ones((len(y), 1))
     for name, design in designs.items():
@@ -530,5 +533,7 @@ def patterned(map_: Map, designs: dict[str, np.ndarray]) -> dict[str, float]:
         k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
         free = len(y) - k - 1
         explained = float(((y - y.mean()) ** 2).sum() - (left**2).sum())
-        out[name] = float(stats.f.sf(explained / max(k, 1) / max(float((left**2).sum()) / free, 1e-30), k, free))
+        square = max(float((left**2).sum()), 1e-30)
+        p = float(stats.f.sf(explained / max(k, 1) / (square / free), k, free))
+        out[name] = p, len(y) * math.log(square) + k * math.log(len(y))
     return out

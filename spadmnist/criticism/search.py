@@ -38,6 +38,7 @@ _SHOWS = 0.01  # of the square of a trace, in a capture that tells it
 _LEAST_CHANCE = 1e-3  # of a map that is tried
 _STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
+_FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
 _POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
 _LINE = 0.25  # of the square of a trace, in one cell of a spectrum
@@ -377,11 +378,11 @@ class Search:
             else:
                 designs[one.change.name] = np.stack([*place, radius], axis=1)
         found = mapping.patterned(free, designs)
-        real = [t for t in patterns if found[t.change.name] < 1e-3]
+        real = [t for t in patterns if found[t.change.name][0] < 1e-3]
         dropped = [t for t in patterns if t not in real]
         rest = [t for t in tried if t not in dropped]
-        if real and rest[0] in maps:
-            first = min(real, key=lambda t: found[t.change.name])
+        if real and (rest[0] in maps or rest[0] in real):
+            first = min(real, key=lambda t: found[t.change.name][1])
             rest.remove(first)
             rest.insert(0, first)
         return rest
@@ -577,7 +578,8 @@ class Search:
                     found, moved = self._nearest(state, one, found, dial, _FAR)
                     if not moved:
                         break
-                found, _ = self._nearest(state, one, found, dial, _PROBES)
+                for probes in (_PROBES, _FINE):
+                    found, _ = self._nearest(state, one, found, dial, probes)
         return found
 
     def _nearest(
