@@ -87,6 +87,7 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     assert boost > 2 and round(found) == power
 
 
+@pytest.mark.slow
 def test_a_faint_effect_is_settled_at_its_own_strength(lab) -> None:
     """Afterpulsing of 0.4 % in 19,000 detections a second: what a stronger one does only says what it looks like."""
     made = lab("    afterpulsing: {probability: 0.6 %, lifetime: 40 ns}\n", light=900, side=4)
@@ -123,6 +124,7 @@ def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab, mo
         assert step.values["probability"] == told["probability"]
 
 
+@pytest.mark.slow
 def test_numbers_that_have_a_likelihood_get_their_intervals_from_it(lab) -> None:
     made = lab("    afterpulsing: {probability: 2 %, lifetime: 40 ns}\n", light=900)
     course = course_of.begun(bench_of(made))

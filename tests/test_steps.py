@@ -112,6 +112,7 @@ def test_after_a_closer_look_that_led_to_nothing_the_model_is_as_it_was(lab, mon
     assert not another and course.state is before
 
 
+@pytest.mark.slow
 def test_what_a_step_leaves_stays(lab, monkeypatch):
     course = course_of.begun(bench_of(lab()))
     new = replace(course.state)
