@@ -16,7 +16,7 @@ from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, stacked
 from .ladder import errors_of, row
-from .search import Search
+from .search import EXCLUDED, Search
 from .settling import Settled
 from .tried import Tried
 
@@ -28,7 +28,6 @@ _MOSTLY = 0.95  # of what was wrong: what explains so much is no look-alike, wha
 _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
-_EXCLUDED = 6.0  # in chi square: what costs more is no value of a number
 _LOST = 30.0  # in chi square: what costs so much is no step to the better
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
@@ -225,7 +224,7 @@ def open_ends(course: Course) -> None:
     models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
     now = course.search.square(state.residuals)
     for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW), strict=True):
-        if not isinstance(moved, str) and course.search.square(bench.residuals(state, moved)) < now + _EXCLUDED:
+        if not isinstance(moved, str) and course.search.square(bench.residuals(state, moved)) < now + EXCLUDED:
             v = step.values[dial.parameter]
             assert v.low is not None and v.high is not None
             step.values[dial.parameter] = replace(v, low=min(v.low, end), high=max(v.high, end))

@@ -52,7 +52,7 @@ _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels t
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
-_BETTER, _EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
+_BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _MOVED = 0.3  # standard deviations, by which a cell is moved
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
@@ -670,13 +670,13 @@ def _counted(
     here = float(found.values[dial.key])
     for side in (-1, 1):  # on to where they do
         step = _NEXT[0]
-        while all(side * (x - here) <= 0 or squares[x] <= found.square + _EXCLUDED for x in squares):
+        while all(side * (x - here) <= 0 or squares[x] <= found.square + EXCLUDED for x in squares):
             far = max(squares, key=lambda x, side=side: side * x)  # type: ignore[misc]
             if (further := _beside(dial, far, side * step)) == far:
                 break
             there(further)
             step *= 2
-    out = [x for x, square in squares.items() if square > found.square + _EXCLUDED]
+    out = [x for x, square in squares.items() if square > found.square + EXCLUDED]
     low = max((x + 1 for x in out if x < here), default=dial.low)
     high = min((x - 1 for x in out if x > here), default=dial.high)
     return found, (low, high)
