@@ -30,7 +30,7 @@ def advised(bench: Bench, found: str, values: dict[Key, Any]) -> tuple[dict[str,
     residuals = bench.residuals(state, moved)
     rival = Tried(change_of(bench, "add afterpulsing"), values, moved, 0.0, 1.0, other, residuals=residuals)
     (told,) = outlook.advice(look, state, change_of(bench, found), rival)
-    return told, look.square(residuals) - look.square(state.residuals)
+    return told, fit.square(residuals) - fit.square(state.residuals)
 
 
 def test_dark_rates_are_told_by_a_long_dark_capture(lab):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import chance, checks, recordings, search, settling
+from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.candidates import Dial
@@ -83,7 +83,7 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     state, look = bench.state({}), quiet(bench)
     (moved,) = bench.moved(state, [state.sensors.changed(values)], 2, kept="sure")
     assert isinstance(moved, Moved)
-    boost, found = look._boost(state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values)
+    boost, found = refining._boost(bench, state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values)
     assert boost > 2 and round(found) == power
 
 
@@ -251,7 +251,7 @@ def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> 
         square = 1000.0 + 40.0 * math.log(queue / truth) ** 2 * truth
         return settling.Settled((), np.zeros(0), np.zeros((0, 0)), {}, {}, square, dict(values))
 
-    found, (low, high) = search._counted(settled({dial.key: float(first)}), dial, settled)
+    found, (low, high) = refining._counted(settled({dial.key: float(first)}), dial, settled)
     assert low <= truth <= high and abs(math.log(found.values[dial.key] / truth)) < 0.15
     assert low >= 1 and (low, high) == (round(low), round(high))
     if truth < 10:

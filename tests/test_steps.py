@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, bench_of, change_of, quiet
 
-from spadmnist.criticism import answer, diagnose, findings, settling
+from spadmnist.criticism import answer, diagnose, findings, fit, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved, State
@@ -172,10 +172,10 @@ def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
     course.values = {CROSSTALK: 0.01}
     further = settling.point_of(dials, {CROSSTALK: 0.02})
     settled = settling.Settled(dials, further, np.eye(1), {}, {}, 0.0, {CROSSTALK: 0.02})
-    now = course.search.square(course.state.residuals)
+    now = fit.square(course.state.residuals)
     for square, point in ((now + 1e3, 0.01), (now + 1.0, 0.02)):
         monkeypatch.setattr(course.bench, "moved", lambda *_, **__: [Moved({}, {}, {})])
-        monkeypatch.setattr(course.search, "square", lambda z, s=square: now if z is course.state.residuals else s)
+        monkeypatch.setattr(course_of, "square", lambda z, s=square: now if z is course.state.residuals else s)
         held = course_of._held(course, settled)
         assert dials[0].value(float(held.point[0])) == pytest.approx(point)
     monkeypatch.setattr(course.bench, "moved", lambda *_, **__: ["beyond what can be simulated"])
@@ -190,7 +190,7 @@ def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, mon
     for name in ("again", "worth"):
         monkeypatch.setattr(course.search, name, lambda *_: [one])
     monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
-    monkeypatch.setattr(course.search, "refine", lambda state, one: one)
+    monkeypatch.setattr(diagnose, "refine", lambda bench, state, one: one)
     monkeypatch.setattr(diagnose.chance, "of_best", lambda *_: (3.0, 0.2))
     failed: Any = [object()] if fails else []
     beside = diagnose._Beside([], False)
@@ -209,7 +209,7 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
     for name in ("again", "worth"):
         monkeypatch.setattr(course.search, name, lambda *_: [map_, other])
     monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
-    monkeypatch.setattr(course.search, "refine", lambda state, one: one)
+    monkeypatch.setattr(diagnose, "refine", lambda bench, state, one: one)
     monkeypatch.setattr(
         diagnose.chance, "of_best", lambda bench, state, tried, one: (4.0, 1e-5 if one is map_ else 1e-3)
     )

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from tinylab import bench_of, change_of, quiet
+from tinylab import bench_of, change_of
 
+from spadmnist.criticism import fit, refining, swings
 from spadmnist.criticism.fit import Moved
 from spadmnist.criticism.swings import Swing
 from spadmnist.criticism.tried import Tried
@@ -50,14 +51,14 @@ def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> Non
     allowed (false alarms: 1e-8 each), for statistics do not hold all of it.
     """
     bench = bench_of(lab(FLICKER % amplitude, seed=seed, light=400), 32)
-    state, look = bench.state({}), quiet(bench)
+    state = bench.state({})
     change = change_of(bench, "add flicker")
     values = {AMPLITUDE: 0.06 if amplitude > 0.2 else 0.24, FREQUENCY: 100.0}
-    swing = look.swing(state, [PHASE], values, 6)
+    swing = swings.turned(bench, state, [PHASE], values, 6)
     assert isinstance(swing, Swing)
     gain, times, phases = swing.suited(bench, state)
     one = Tried(change, values, swing.at(phases), gain, times, phases={(id, PHASE): p for id, p in phases.items()})
-    found = look.refine(state, one)
+    found = refining.refine(bench, state, one)
     error = math.sqrt(2 / bench.seen["flat"].total)
     assert found.gain > 0.3 * (amplitude / error) ** 2
     assert found.values[AMPLITUDE] == pytest.approx(amplitude, abs=6 * error)
@@ -65,7 +66,7 @@ def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> Non
     assert abs(off) < 6 * error / amplitude + math.radians(2)
     assert found.times == 1 and found.scaled() == found.values  # what it does is what it does at these values
     again = bench.residuals(state, found.moved)
-    assert look.square(state.residuals) - look.square(again) == pytest.approx(found.gain + 2 * len(found.phases))
+    assert fit.square(state.residuals) - fit.square(again) == pytest.approx(found.gain + 2 * len(found.phases))
     assert found.settled is not None
     _, low, high = found.settled.interval(0)
     assert low < found.values[AMPLITUDE] < high and high - low < 12 * error

@@ -10,7 +10,7 @@ from joblib import Parallel
 
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
-from spadmnist.criticism import candidates
+from spadmnist.criticism import candidates, refining
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.candidates import Change, Key
 from spadmnist.criticism.fit import Bench, Moved
@@ -86,7 +86,7 @@ def given(course: course_of.Course, name: str, values: dict[Key, Any], settle: b
     (moved,) = bench.moved(state, [state.sensors.changed(values)], kept="sure")
     assert isinstance(moved, Moved)
     one = Tried(change, values, moved, 0.0, 1.0)
-    return course.search.refine(state, one) if settle else one
+    return refining.refine(course.bench, state, one) if settle else one
 
 
 def taken(course: course_of.Course, name: str, values: dict[Key, Any], settle: bool = True) -> None:

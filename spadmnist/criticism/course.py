@@ -14,10 +14,12 @@ from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
-from .fit import RATES, Bench, Cell, Sensors, State, stacked
+from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
 from .ladder import errors_of, row
-from .search import EXCLUDED, Search
+from .refining import EXCLUDED, showing
+from .search import Search
 from .settling import Settled
+from .swings import turned
 from .tried import Tried
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
@@ -77,7 +79,7 @@ def begun(bench: Bench) -> Course:
     state = bench.state({})
     keys = recordings.swinging(bench.start)
     if keys:  # what swings begins anew in every capture
-        swing = search.swing(state, keys, {}, fit.FEW)
+        swing = turned(bench, state, keys, {}, fit.FEW)
         if not isinstance(swing, str):
             *_, found = swing.suited(bench, state, [1.0])
             search.phases.update({(id, key): p for id, p in found.items() for key in keys})
@@ -142,7 +144,7 @@ def _followed(
 
     None where they cannot be followed.
     """
-    bench, search, slopes = course.bench, course.search, _slopes_known(course)
+    bench, slopes = course.bench, _slopes_known(course)
     settled: Settled | None = None
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
@@ -151,14 +153,14 @@ def _followed(
         if isinstance(closer, str):
             break
         settled = closer
-        if turn == _AGAIN or search.square(state.residuals) - closer.square < _WORTH:
+        if turn == _AGAIN or square(state.residuals) - closer.square < _WORTH:
             break
         near = closer if np.all(np.abs(closer.point - settling.point_of(dials, here)) < _SAME) else None
         before = course.values, maps, state
         course.values = {**course.values, **closer.values}
         sensors, maps = _model(course)
         state = bench.state(course.values, sensors)
-        if search.square(state.residuals) > search.square(before[2].residuals):
+        if square(state.residuals) > square(before[2].residuals):
             # a line or an edge: slopes do not lead further
             course.values, maps, state = before
             settled = replace(settled, point=settling.point_of(dials, here))
@@ -171,8 +173,8 @@ def _held(course: Course, settled: Settled) -> Settled:
     bench, state, dials = course.bench, course.state, settled.dials
     there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
     (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
-    now = course.search.square(state.residuals)
-    if isinstance(moved, str) or course.search.square(bench.residuals(state, moved)) > now + _LOST:
+    now = square(state.residuals)
+    if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
         return replace(settled, point=settling.point_of(dials, course.values))
     return settled
 
@@ -222,9 +224,10 @@ def open_ends(course: Course) -> None:
                 tests += [(step, dial, end) for end in (dial.low, dial.high) if not v.low <= end <= v.high]
     state, bench = course.state, course.bench
     models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
-    now = course.search.square(state.residuals)
-    for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW), strict=True):
-        if not isinstance(moved, str) and course.search.square(bench.residuals(state, moved)) < now + EXCLUDED:
+    some = [showing(state, step.template) for step, _, _ in tests]
+    now = square(state.residuals)
+    for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW, only_of=some), strict=True):
+        if not isinstance(moved, str) and square(bench.residuals(state, moved)) < now + EXCLUDED:
             v = step.values[dial.parameter]
             assert v.low is not None and v.high is not None
             step.values[dial.parameter] = replace(v, low=min(v.low, end), high=max(v.high, end))
@@ -357,13 +360,13 @@ def drop_needless(course: Course) -> None:
             continue
         others = tuple(d for s in course.steps if s is not step for d in s.dials)
         z = bench.residuals(course.state, moved)
-        loss = course.search.square(z) - course.search.square(course.state.residuals)
+        loss = square(z) - square(course.state.residuals)
         if loss > 30 and not others:
             continue
         point = {d.key: rest[d.key] for d in others}
         closer = settling.settle(bench, course.state, others, point, sensors.changed, 2) if others else None
         if isinstance(closer, Settled):
-            loss = closer.square - course.search.square(course.state.residuals)
+            loss = closer.square - square(course.state.residuals)
         if loss < _NEEDLESS:
             bench.say(f"{title(step.change)} is no longer needed")
             course.steps.remove(step)

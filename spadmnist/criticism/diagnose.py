@@ -25,6 +25,7 @@ from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needles
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
+from .refining import refine
 from .search import alike
 from .tried import EACH, Tried
 
@@ -180,7 +181,7 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
         return False
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
-    refined = [search.refine(course.state, one) for one in worth]
+    refined = [refine(bench, course.state, one) for one in worth]
     search.weigh(course.state, refined)
     judged = {id(one): chance.of_best(bench, course.state, beside.tried, one) for one in refined}
     # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best

@@ -546,6 +546,10 @@ class Bench:
             out[cell] = _judged(null, values, seen.total, moved.shifts[cell], moved.noise.get(cell, 0.0) * noisy)
         return out
 
+    def size(self, state: State, moved: Moved) -> float:
+        """Standard deviations of what a model would change."""
+        return math.sqrt(square(self.template(state, moved)))
+
     def judged(self, state: State, cell: Cell, shift: np.ndarray) -> np.ndarray:
         """The data's residuals of one block if its expectation were shifted."""
         seen = self.seen[cell[0]]
@@ -608,6 +612,11 @@ def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noi
         expected = np.maximum(expected, _LEAST_POWER * usual)
     z = _standardized(null.law, values, expected, null.spread, leverage + noise, null.recordings, null.scaled)
     return np.asarray(z / null.factor)
+
+
+def square(residuals: Mapping[Cell, np.ndarray]) -> float:
+    """Sum of all squared residuals."""
+    return sum(float(z @ z) for z in residuals.values())
 
 
 def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:

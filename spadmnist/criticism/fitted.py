@@ -17,6 +17,7 @@ from .candidates import Change, Key, changes
 from .course import Course, accept, begun, errors_known, material, settle_all
 from .findings import nuisances, remainder, traces
 from .fit import Bench, Moved
+from .refining import refine
 from .settling import Settled
 from .tried import Tried
 
@@ -108,7 +109,7 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
         if change.carrier:
             best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={})
         else:
-            best = course.search.refine(course.state, _started(course, change), 5)
+            best = refine(course.bench, course.state, _started(course, change), 5)
         accept(course, best, math.sqrt(max(best.gain, 0.0)))
     ends: dict[Key, tuple[float, float]] = {}
     dials = tuple(d for step in course.steps for d in step.dials)

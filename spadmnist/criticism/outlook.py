@@ -17,7 +17,7 @@ from . import fit, recordings
 from .answer import NONLINEARITY, Step, plain
 from .candidates import Change
 from .chance import along
-from .fit import Bench, Moved, Seen, Sensors, State
+from .fit import Bench, Moved, Seen, Sensors, State, square
 from .search import Search
 from .setups import Explanation
 from .tried import Tried
@@ -42,7 +42,7 @@ def advice(search: Search, state: State, found: Change, other: Tried) -> list[di
     bench = search.bench
     assert other.sensors is not None
     residuals = other.residuals or {}
-    now = math.sqrt(max(search.square(residuals) - search.square(state.residuals), 0.0))
+    now = math.sqrt(max(square(residuals) - square(state.residuals), 0.0))
     bench.say("which capture would tell")
     best: tuple[float, str] | None = None
     for words, capture, like in _menu(bench, state):

@@ -18,41 +18,28 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
-from . import checks, fit, mapping, settling
-from .candidates import Change, Dial, Key, chancy, changes, templates, with_values
+from . import checks, fit, mapping
+from .candidates import Change, Key, chancy, changes, templates, with_values
 from .chance import LEAST_P, of_map
-from .fit import Bench, Cell, Moved, Sensors, State, stacked
+from .fit import Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
-from .settling import Settled
-from .swings import NEAR, TIMES, Swing
-from .tried import EACH, Phases, Tried, is_edge, is_pattern, is_same, lines_of, room_of, shape_of, stronger, weaker
+from .refining import STRONG, state_of
+from .swings import NEAR, TIMES, turned
+from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
 _REFINED = 3  # of these, that are settled
-_TURNS = 8  # phases that are simulated
-_ASIDE = 0.1  # of a logarithm, for the slope of what swings
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
-_SHOWS = 0.01  # of the square of a trace, in a capture that tells it
 _LEAST_CHANCE = 1e-3  # of a map that is tried
-_STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
-_PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
-_FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
-_FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
-_POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
-_LINE = 0.25  # of the square of a trace, in one cell of a spectrum
-_LEAST_BOOST = 1.5  # worth it
 _SILENT = 6.0  # standard deviations of a trace that is none
 _LOUD, _WEAKER = 300.0, 3  # the same of one that says little of a smaller one; times that one is looked for
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
-_SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
-_NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
-_BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _MOVED = 0.3  # standard deviations, by which a cell is moved
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
@@ -69,40 +56,20 @@ class Search:
 
     # --- looking -------------------------------------------------------------------------------------------------
 
-    def square(self, residuals: Mapping[Cell, np.ndarray]) -> float:
-        """Sum of all squared residuals."""
-        return sum(float(z @ z) for z in residuals.values())
-
     def line_search(self, state: State, moved: Moved, signed: bool) -> tuple[float, float]:
         """(gain in chi square, times the strength at which it is largest)."""
-        now = self.square(state.residuals)
+        now = square(state.residuals)
         best = 0.0, 1.0
         tries = [*TIMES, *([-t for t in TIMES] if signed else [])]
         for _ in range(2):
             for times in tries:
-                gain = now - self.square(self.bench.residuals(state, moved, times))
+                gain = now - square(self.bench.residuals(state, moved, times))
                 if gain > best[0]:
                     best = gain, times
             if best[0] < _PROMISING:
                 break
             tries = [best[1] * x for x in NEAR if x != 1]
         return best
-
-    def swing(self, state: State, keys: Sequence[Key], values: Mapping[Key, Any], few: int) -> Swing | str:
-        """What swings, at these values and any phase."""
-        turns = self.turns(keys)
-        models = [state.sensors.changed(values, t) for t in turns]
-        lit = [id for id, seen in self.bench.seen.items() if not seen.capture.light.dark]
-        turned = self.bench.moved(state, models, few, lit)
-        made = [m for m in turned if not isinstance(m, str)]
-        if len(made) < len(turned):
-            return next(m for m in turned if isinstance(m, str))
-        return Swing.of(made, [next(iter(t.values())) for t in turns])
-
-    def turns(self, keys: Sequence[Key]) -> list[Phases]:
-        """Phases to try, all round."""
-        pairs = [(i, p) for i in self.bench.seen for p in keys]
-        return [dict.fromkeys(pairs, 2 * math.pi * k / _TURNS) for k in range(_TURNS)]
 
     def lines(self, state: State) -> list[Line]:
         """What stands out of the data's spectra, the clearest first."""
@@ -156,7 +123,7 @@ class Search:
         for change, tried in tries:
             if not change.phases:
                 continue
-            swing = self.swing(state, change.phases, tried, fit.FEW)
+            swing = turned(self.bench, state, change.phases, tried, fit.FEW)
             if isinstance(swing, str):
                 continue
             gain, times, found = swing.suited(self.bench, state)
@@ -225,7 +192,7 @@ class Search:
 
     def _raised(self, state: State, tried: list[Tried], some: Sequence[str]) -> list[Tried]:
         """These, and stronger ones for those that leave no trace: these may do so."""
-        faint = [t for t in tried if not t.moved.nothing and self.size(state, t.moved) < _SILENT]
+        faint = [t for t in tried if not t.moved.nothing and self.bench.size(state, t.moved) < _SILENT]
         silent = [(t.change, up) for t in faint if (up := stronger(t))]
         found = self._looked_at(state, silent, some) if silent else []
         raised = {(one.change.name, shape_of(one)) for one in found}
@@ -236,12 +203,12 @@ class Search:
     def _lowered(self, state: State, tried: Sequence[Tried], some: Sequence[str]) -> list[Tried]:
         """Weaker ones for those that drown all else: where it does not grow in proportion, they tell nothing of it."""
         out: list[Tried] = []
-        loud = [t for t in tried if self.size(state, t.moved) > _LOUD]
+        loud = [t for t in tried if self.bench.size(state, t.moved) > _LOUD]
         for _ in range(_WEAKER):
             lower = [(t.change, down) for t in loud if (down := weaker(t))]
-            loud = [t for t in self._looked_at(state, lower, some) if self.size(state, t.moved) > _SILENT]
+            loud = [t for t in self._looked_at(state, lower, some) if self.bench.size(state, t.moved) > _SILENT]
             out += loud
-            loud = [t for t in loud if self.size(state, t.moved) > _LOUD]
+            loud = [t for t in loud if self.bench.size(state, t.moved) > _LOUD]
             if not loud:
                 break
         return out
@@ -293,8 +260,8 @@ class Search:
             if one.phases:
                 continue
             # a faint trace drowns in what is left of chance: a stronger one tells what it looks like, but of an edge
-            size = self.size(state, one.moved)
-            least = 0.0 if any(map(is_edge, one.change.strengths)) else min(_STRONG / max(size, 1e-9), 1.0)
+            size = self.bench.size(state, one.moved)
+            least = 0.0 if any(map(is_edge, one.change.strengths)) else min(STRONG / max(size, 1e-9), 1.0)
             one.times = math.copysign(max(abs(one.times), least), one.times)
             given = one.scaled()
             out.append(
@@ -302,7 +269,7 @@ class Search:
             )
         for one in self._simulated(state, [*out, *self.maps(state, values)], fit.FEW):
             if one.maps is None:
-                before, x, size = one.gain, abs(one.times), self.size(state, one.moved)
+                before, x, size = one.gain, abs(one.times), self.bench.size(state, one.moved)
                 if min(size, before) > 5 and not 0.7 < x < 1.4 and one.change.kind == "add" and not one.moved.even:
                     # in proportion or with the square: more cannot be said, for chance hides what is faint
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
@@ -310,15 +277,11 @@ class Search:
                 if one.chips and one.gain > _PROMISING:
                     one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
             else:
-                one.gain = self.square(state.residuals) - self.square(self.bench.residuals(state, one.moved))
+                one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
                 if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
                     one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, LEAST_P) / 2)) ** 2)
             kept.append(one)
         return sorted(kept, key=lambda t: -t.gain)
-
-    def size(self, state: State, moved: Moved) -> float:
-        """Standard deviations of what a model would change."""
-        return math.sqrt(sum(float(t @ t) for t in self.bench.template(state, moved).values()))
 
     def maps(self, state: State, values: dict[Key, Any]) -> list[Tried]:
         """Every map whose values differ beyond their noise, and all that are needed side by side."""
@@ -411,7 +374,7 @@ class Search:
                     if isinstance(moved, str):
                         continue
                     residuals = self.bench.residuals(state, moved)
-                    gain = self.square(state.residuals) - self.square(residuals)
+                    gain = square(state.residuals) - square(residuals)
                     if best is None or gain > best.gain:
                         best = Tried(change, {}, moved, gain, 1.0, sensors, residuals=residuals)
                         about = float(sigma)
@@ -436,53 +399,6 @@ class Search:
         first = second[0]
         return [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
 
-    def refine(self, state: State, one: Tried, rounds: int = 3) -> Tried:
-        """Settle the numbers of a candidate."""
-        if one.maps is not None or not one.change.dials:
-            one.residuals = self.bench.residuals(state, one.moved, noisy=True)
-            return one
-        if one.change.phases:
-            return self._swung(state, one)
-        given = one.scaled()
-        dials = [d for d in one.change.dials if d.key in given and not d.whole]
-        boost, power = self._boost(state, one, given)
-        showing = self._showing(state, one.moved)
-
-        def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
-            return settling.settle(
-                self.bench,
-                state,
-                dials,
-                values,
-                lambda v: state.sensors.changed(v, one.phases, one.chips),
-                rounds,
-                stronger=(boost, power),
-                only=showing,
-            )
-
-        found = settled(given)
-        if isinstance(found, str):
-            return one
-        for dial in one.change.dials:
-            if dial.whole and dial.key in given:
-                found, one.intervals[dial.key] = _counted(found, dial, lambda v: settled(v, 2))
-        if boost == 1 and checks.failing(checks.blocks(self.bench, state, found.residuals)):
-            found = self._probed(state, one, found)
-        one.faint = boost > 1
-        one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
-        one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
-        one.gain = self.square(state.residuals) - found.square
-        if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
-            one.gain = max(one.gain, self.square(state.residuals) - self.square(self.state_of(one).residuals))
-        return one
-
-    def state_of(self, one: Tried) -> State:
-        """The model of a candidate beside the data, each cell judged by that model's own scatter."""
-        if one.state is None:
-            assert one.sensors is not None
-            one.state = self.bench.state({}, one.sensors)
-        return one.state
-
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:
         """Those that may be best get states of their own: differences of a few recordings blur an edge.
 
@@ -497,7 +413,7 @@ class Search:
         states: list[tuple[Tried, State]] = []
         for one in near:
             with contextlib.suppress(SpadError):  # what cannot be simulated everywhere stays what it is
-                states.append((one, self.state_of(one)))
+                states.append((one, state_of(self.bench, one)))
         if len(states) < 2:
             return
         for cell, z in state.residuals.items():
@@ -524,169 +440,13 @@ class Search:
             return best
         left = {}
         for one in rivals:
-            state = self.state_of(one)
+            state = state_of(self.bench, one)
             left[id(one)] = len(checks.failing(checks.blocks(self.bench, state, state.residuals)))
         return min(rivals, key=lambda t: (left[id(t)], t.chips, -t.gain))
 
-    def _showing(self, state: State, moved: Moved) -> list[str]:
-        """The captures that show what a model does: all but those that have hardly any of its trace."""
-        share = dict.fromkeys(state.made, 0.0)
-        for (id, _), t in self.bench.template(state, moved).items():
-            if id in share:
-                share[id] += float(t @ t)
-        least = _SHOWS * max(sum(share.values()), 1e-12)
-        return [id for id, x in share.items() if x >= least]
-
-    def _boost(self, state: State, one: Tried, given: Mapping[Key, Any]) -> tuple[float, float]:
-        """(how much stronger a faint effect is simulated, the power with which its trace grows).
-
-        1 where that is no power: an edge moves, and much of anything saturates.
-        """
-        trace = self.bench.template(state, one.moved.at(one.times))
-        size = math.sqrt(sum(float(t @ t) for t in trace.values()))
-        strengths = [d for d in one.change.strengths if d.key in given]
-        spectra = [t for cell, t in trace.items() if cell in state.nulls and state.nulls[cell].law == "exponential"]
-        if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
-            return 1.0, 1.0  # a line stands out by itself, and no slope says where
-        if size > _STRONG or one.moved.even or not strengths or any(is_edge(d) for d in strengths):
-            return 1.0, 1.0
-        room = min(room_of(d, float(given[d.key])) for d in strengths)
-        boost = min((_STRONG / max(size, 1e-3)) ** (1 / one.power), room)
-        if boost < _LEAST_BOOST:
-            return 1.0, 1.0
-        ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
-        models = [state.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
-        traces = []
-        for moved in self.bench.moved(state, models, 2 * fit.FEW, kept="sure"):
-            if isinstance(moved, str):
-                return 1.0, 1.0
-            traces.append(stacked(self.bench.template(state, moved), list(state.residuals)))
-        far, near = traces
-        along = float(near @ far)  # of the same trace, lest it is chance that is compared
-        power = 2 * math.log(float(far @ far) / along) / math.log(boost) if along > 0 else 0.0
-        return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
-
-    def _probed(self, state: State, one: Tried, found: Settled) -> Settled:
-        """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge."""
-        for dial in one.change.dials:
-            if dial not in found.dials or not dial.log:
-                continue
-            if dial in one.change.shapes:
-                found, _ = self._nearest(state, one, found, dial, _PROBES)
-            elif is_edge(dial):
-                for _ in range(_MOVES):  # a wall is not seen from afar: step by step, first long ones
-                    found, moved = self._nearest(state, one, found, dial, _FAR)
-                    if not moved:
-                        break
-                for probes in (_PROBES, _FINE):
-                    found, _ = self._nearest(state, one, found, dial, probes)
-        return found
-
-    def _nearest(
-        self, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float]
-    ) -> tuple[Settled, bool]:
-        """(the best of the probes to both sides of a number, or what was settled; is it one of the probes?)."""
-        at, before = float(found.values[dial.key]), found
-        steps = [s * x for x in probes for s in (-1, 1)]
-        tries = [{**found.values, dial.key: dial.value(dial.coordinate(at) + x)} for x in steps]
-        models = [state.sensors.changed(t, one.phases, one.chips) for t in tries]
-        best = found.square - 6
-        for tried, x, moved in zip(tries, steps, self.bench.moved(state, models, fit.FEW), strict=True):
-            if isinstance(moved, str):
-                continue
-            residuals = self.bench.residuals(state, moved)
-            if self.square(residuals) < best:
-                best = self.square(residuals)
-                found = replace(
-                    found, point=settling.point_of(found.dials, tried), residuals=residuals, square=best, values=tried
-                )
-                i = found.dials.index(dial)
-                # no slope told it, so that its neighbours must
-                found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
-        return found, found is not before
-
     def beside(self, state: State, sensors: Sensors) -> float:
         """By how much the data lie nearer to another model, each judged by its own scatter."""
-        return self.square(state.residuals) - self.square(self.bench.state({}, sensors).residuals)
-
-    def _swung(self, state: State, one: Tried) -> Tried:
-        """The strength of what swings, and its phase in each capture.
-
-        It is simulated as strong as chance does not hide it; what it does then tells what less of it does.
-        """
-        dials = tuple(d for d in one.change.strengths if d.key in one.values)
-        size, given = self.size(state, one.moved.at(one.times)), one.scaled()
-        room = min(room_of(d, float(given[d.key])) for d in dials)
-        stronger_by = max(1.0, min(math.sqrt(_STRONG / max(size, 1e-9)), room))
-        strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}
-        swing = self.swing(state, one.change.phases, strong, _SWINGING)
-        if isinstance(swing, str):
-            return one
-        gain, times, found = swing.suited(self.bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
-        moved = swing.at(found)
-        one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
-        one.moved, one.gain = moved.at(times), gain - 2 * len(one.phases)
-        one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
-        one.times, one.faint = 1.0, True
-        one.residuals = residuals = self.bench.residuals(state, moved, times)
-        one.sensors = state.sensors.changed(one.values, one.phases, one.chips)
-        aside = [self.bench.residuals(state, moved, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]
-        # of one number, or of several that all go up together
-        apart = [d.coordinate(d.scaled(float(one.values[d.key]), math.exp(2 * _ASIDE))) for d in dials]
-        now = settling.point_of(dials, one.values)
-        slopes = {
-            cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(dials)
-            for cell in residuals
-        }
-        own = np.concatenate([state.own[cell] for cell in residuals], axis=1)
-        covariance = settling.covariance_of(np.concatenate(list(slopes.values())), own)
-        square = self.square(residuals)
-        one.settled = Settled(dials, now, covariance, residuals, slopes, square, one.values)
-        return one
-
-
-def _counted(
-    found: Settled, dial: Dial, settled: Callable[[Mapping[Key, Any]], Settled | str]
-) -> tuple[Settled, tuple[float, float]]:
-    """(the best with a whole number settled beside the others, which of its values the data do not exclude).
-
-    No slope leads from one to the next: from its neighbours, ever nearer ones, all else being settled at each.
-    """
-    squares, step = {found.values[dial.key]: found.square}, _NEXT[0]
-
-    def there(value: float) -> Settled | None:
-        one = settled({**found.values, dial.key: value})
-        squares[value] = math.inf if isinstance(one, str) else one.square
-        return None if isinstance(one, str) else one
-
-    while step > _NEXT[1]:
-        here = float(found.values[dial.key])
-        near = {_beside(dial, here, x) for x in (-step, step)} - squares.keys()
-        best = min((one for x in sorted(near) if (one := there(x))), key=lambda one: one.square, default=found)
-        if best.square < found.square - _BETTER:
-            found = best
-        else:
-            step /= 2
-    here = float(found.values[dial.key])
-    for side in (-1, 1):  # on to where they do
-        step = _NEXT[0]
-        while all(side * (x - here) <= 0 or squares[x] <= found.square + EXCLUDED for x in squares):
-            far = max(squares, key=lambda x, side=side: side * x)  # type: ignore[misc]
-            if (further := _beside(dial, far, side * step)) == far:
-                break
-            there(further)
-            step *= 2
-    out = [x for x, square in squares.items() if square > found.square + EXCLUDED]
-    low = max((x + 1 for x in out if x < here), default=dial.low)
-    high = min((x - 1 for x in out if x > here), default=dial.high)
-    return found, (low, high)
-
-
-def _beside(dial: Dial, value: float, step: float) -> float:
-    """The whole number so far away, of a logarithm, but at least the next one; at a bound that itself."""
-    other = dial.value(dial.coordinate(value) + step)
-    other = min(other, value - 1) if step < 0 else max(other, value + 1)
-    return min(max(other, dial.low), dial.high)
+        return square(state.residuals) - square(self.bench.state({}, sensors).residuals)
 
 
 def alike(gain: float) -> float:

@@ -20,7 +20,7 @@ from .. import twin
 from .answer import plain
 from .candidates import changes, templates
 from .compare import FALSE_ALARM
-from .fit import RATES, Bench, Moved, State
+from .fit import RATES, Bench, Moved, State, square
 from .search import Search
 from .tried import EACH, Tried
 
@@ -51,8 +51,7 @@ class Explanation:
     def p(self) -> float:
         """Of what is left."""
         freedom = len(self.left) - len(self.factors)
-        square = float(self.left @ self.left)
-        return float(stats.chi2.sf(square, freedom)) if freedom > 0 else 1.0
+        return float(stats.chi2.sf(float(self.left @ self.left), freedom)) if freedom > 0 else 1.0
 
     @property
     def cost(self) -> float:
@@ -180,9 +179,9 @@ def rivals(search: Search, state: State, cost: float) -> list[Tried]:
                 best = float(left @ left), one
         if best is None:
             continue
-        square, settled = best
-        if square + EACH < cost + ALIKE and stats.chi2.sf(square, max(1, freedom - 1)) > FALSE_ALARM:
-            settled.gain = search.square(state.residuals) - square
+        remains, settled = best
+        if remains + EACH < cost + ALIKE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
+            settled.gain = square(state.residuals) - remains
             out.append(settled)
     out = sorted(out, key=lambda t: t.cost(state))[:_VERIFIED]
     models = [t.sensors for t in out if t.sensors is not None]
@@ -196,7 +195,7 @@ def _fits(search: Search, state: State, one: Tried, moved: Moved | str) -> bool:
     residuals = search.bench.residuals(state, moved)
     others = {c: z for c, z in residuals.items() if c != RATES}
     before = {c: z for c, z in state.residuals.items() if c != RATES}
-    return search.square(others) - search.square(before) < EACH + ALIKE
+    return square(others) - square(before) < EACH + ALIKE
 
 
 def _settled(search: Search, state: State, one: Tried) -> Tried:

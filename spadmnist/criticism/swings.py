@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from .candidates import Key
 from .fit import RATES, Bench, Cell, Moved, State
 
 # times the strength of what was simulated: at first, and about the best of these
 TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _PHASES = 24  # that are looked at
+_TURNS = 8  # of them, that are simulated
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step from one to the next
 
 
@@ -63,6 +66,19 @@ class Swing:
             best = max(best, _best(self, bench, state, [best[1] * x for x in NEAR], around), key=lambda b: b[0])
         step = 2 * math.pi / _PHASES
         return _best(self, bench, state, [best[1]], {id: p + step * _CLOSER for id, p in best[2].items()})
+
+
+def turned(bench: Bench, state: State, keys: Sequence[Key], values: Mapping[Key, Any], few: int) -> Swing | str:
+    """What swings, at these values and any phase. keys: parameters that are phases; few: recordings of each capture."""
+    turns = [2 * math.pi * k / _TURNS for k in range(_TURNS)]
+    pairs = [(id, key) for id in bench.seen for key in keys]
+    models = [state.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
+    lit = [id for id, seen in bench.seen.items() if not seen.capture.light.dark]
+    found = bench.moved(state, models, few, lit)
+    made = [m for m in found if not isinstance(m, str)]
+    if len(made) < len(found):
+        return next(m for m in found if isinstance(m, str))
+    return Swing.of(made, turns)
 
 
 def _waves(x: float, p: float) -> np.ndarray:

@@ -1,0 +1,250 @@
+"""Refining: the numbers of a candidate are settled beside the data, and how well they are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from . import checks, fit, settling
+from .candidates import Dial, Key
+from .fit import RATES, Bench, Cell, State, square, stacked
+from .settling import Settled
+from .swings import NEAR, turned
+from .tried import Tried, is_edge, room_of
+
+_ASIDE = 0.1  # of a logarithm, for the slope of what swings
+_SHOWS = 0.01  # of the square of a trace, in a capture that tells it
+STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
+_PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
+_FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
+_FAR, _MOVES = (0.6, 0.3, 0.15), 6  # of an edge, and how often
+_POWERS = (0.85, 2.3)  # with which a trace grows that may be simulated at another strength
+_LINE = 0.25  # of the square of a trace, in one cell of a spectrum
+_LEAST_BOOST = 1.5  # worth it
+_SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
+_NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
+_BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
+
+
+def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
+    """Settle the numbers of a candidate."""
+    if one.maps is not None or not one.change.dials:
+        one.residuals = bench.residuals(state, one.moved, noisy=True)
+        return one
+    if one.change.phases:
+        return _swung(bench, state, one)
+    given = one.scaled()
+    dials = [d for d in one.change.dials if d.key in given and not d.whole]
+    boost, power = _boost(bench, state, one, given)
+    some = showing(state, bench.template(state, one.moved))
+
+    def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
+        return settling.settle(
+            bench,
+            state,
+            dials,
+            values,
+            lambda v: state.sensors.changed(v, one.phases, one.chips),
+            rounds,
+            stronger=(boost, power),
+            only=some,
+        )
+
+    found = settled(given)
+    if isinstance(found, str):
+        return one
+    for dial in one.change.dials:
+        if dial.whole and dial.key in given:
+            found, one.intervals[dial.key] = _counted(found, dial, lambda v: settled(v, 2))
+    if boost == 1 and _fails_its_own(bench, state, one, found):
+        found = _probed(bench, state, one, found, some)
+    one.faint = boost > 1
+    one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
+    one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
+    one.gain = square(state.residuals) - found.square
+    if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
+        one.gain = max(one.gain, square(state.residuals) - square(state_of(bench, one).residuals))
+    return one
+
+
+def state_of(bench: Bench, one: Tried) -> State:
+    """The model of a candidate beside the data, each cell judged by that model's own scatter."""
+    if one.state is None:
+        assert one.sensors is not None
+        one.state = bench.state({}, one.sensors)
+    return one.state
+
+
+def showing(state: State, trace: Mapping[Cell, np.ndarray]) -> list[str]:
+    """The captures that show what a model does: all but those that have hardly any of its trace."""
+    share = dict.fromkeys(state.made, 0.0)
+    for (id, _), t in trace.items():
+        if id in share:
+            share[id] += float(t @ t)
+    least = _SHOWS * max(sum(share.values()), 1e-12)
+    return [id for id, x in share.items() if x >= least]
+
+
+def _fails_its_own(bench: Bench, state: State, one: Tried, found: Settled) -> bool:
+    """Does a check fail, the numbers being settled, of those that the candidate moves at all?"""
+    trace = bench.template(state, one.moved.at(one.times))
+    failed = checks.failing(checks.blocks(bench, state, found.residuals))
+    own = {RATES if block.cell[0] == "" else block.cell for block in failed}
+    return any(float(trace[cell] @ trace[cell]) > 1 for cell in own if cell in trace)
+
+
+def _boost(bench: Bench, state: State, one: Tried, given: Mapping[Key, Any]) -> tuple[float, float]:
+    """(how much stronger a faint effect is simulated, the power with which its trace grows).
+
+    1 where that is no power: an edge moves, and much of anything saturates.
+    """
+    trace = bench.template(state, one.moved.at(one.times))
+    size = math.sqrt(sum(float(t @ t) for t in trace.values()))
+    strengths = [d for d in one.change.strengths if d.key in given]
+    spectra = [t for cell, t in trace.items() if cell in state.nulls and state.nulls[cell].law == "exponential"]
+    if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
+        return 1.0, 1.0  # a line stands out by itself, and no slope says where
+    if size > STRONG or one.moved.even or not strengths or any(is_edge(d) for d in strengths):
+        return 1.0, 1.0
+    room = min(room_of(d, float(given[d.key])) for d in strengths)
+    boost = min((STRONG / max(size, 1e-3)) ** (1 / one.power), room)
+    if boost < _LEAST_BOOST:
+        return 1.0, 1.0
+    ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
+    models = [state.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
+    traces = []
+    for moved in bench.moved(state, models, 2 * fit.FEW, kept="sure"):
+        if isinstance(moved, str):
+            return 1.0, 1.0
+        traces.append(stacked(bench.template(state, moved), list(state.residuals)))
+    far, near = traces
+    along = float(near @ far)  # of the same trace, lest it is chance that is compared
+    power = 2 * math.log(float(far @ far) / along) / math.log(boost) if along > 0 else 0.0
+    return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
+
+
+def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Sequence[str]) -> Settled:
+    """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge.
+
+    only: captures that are simulated for it.
+    """
+    for dial in one.change.dials:
+        if dial not in found.dials or not dial.log:
+            continue
+        if dial in one.change.shapes:
+            found, _ = _nearest(bench, state, one, found, dial, _PROBES, only)
+        elif is_edge(dial):
+            for _ in range(_MOVES):  # a wall is not seen from afar: step by step, first long ones
+                found, moved = _nearest(bench, state, one, found, dial, _FAR, only)
+                if not moved:
+                    break
+            for probes in (_PROBES, _FINE):
+                found, _ = _nearest(bench, state, one, found, dial, probes, only)
+    return found
+
+
+def _nearest(
+    bench: Bench, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float], only: Sequence[str]
+) -> tuple[Settled, bool]:
+    """(the best of the probes to both sides of a number, or what was settled; is it one of the probes?)."""
+    at, before = float(found.values[dial.key]), found
+    steps = [s * x for x in probes for s in (-1, 1)]
+    tries = [{**found.values, dial.key: dial.value(dial.coordinate(at) + x)} for x in steps]
+    models = [state.sensors.changed(t, one.phases, one.chips) for t in tries]
+    best = found.square - 6
+    for tried, x, moved in zip(tries, steps, bench.moved(state, models, fit.FEW, only), strict=True):
+        if isinstance(moved, str):
+            continue
+        residuals = bench.residuals(state, moved)
+        if square(residuals) < best:
+            best = square(residuals)
+            found = replace(
+                found, point=settling.point_of(found.dials, tried), residuals=residuals, square=best, values=tried
+            )
+            i = found.dials.index(dial)
+            # no slope told it, so that its neighbours must
+            found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
+    return found, found is not before
+
+
+def _swung(bench: Bench, state: State, one: Tried) -> Tried:
+    """The strength of what swings, and its phase in each capture.
+
+    It is simulated as strong as chance does not hide it; what it does then tells what less of it does.
+    """
+    dials = tuple(d for d in one.change.strengths if d.key in one.values)
+    size, given = bench.size(state, one.moved.at(one.times)), one.scaled()
+    room = min(room_of(d, float(given[d.key])) for d in dials)
+    stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
+    strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}
+    swing = turned(bench, state, one.change.phases, strong, _SWINGING)
+    if isinstance(swing, str):
+        return one
+    gain, times, found = swing.suited(bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
+    moved = swing.at(found)
+    one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
+    one.moved, one.gain = moved.at(times), gain - 2 * len(one.phases)
+    one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
+    one.times, one.faint = 1.0, True
+    one.residuals = residuals = bench.residuals(state, moved, times)
+    one.sensors = state.sensors.changed(one.values, one.phases, one.chips)
+    aside = [bench.residuals(state, moved, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]
+    # of one number, or of several that all go up together
+    apart = [d.coordinate(d.scaled(float(one.values[d.key]), math.exp(2 * _ASIDE))) for d in dials]
+    now = settling.point_of(dials, one.values)
+    slopes = {
+        cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(dials)
+        for cell in residuals
+    }
+    own = np.concatenate([state.own[cell] for cell in residuals], axis=1)
+    covariance = settling.covariance_of(np.concatenate(list(slopes.values())), own)
+    one.settled = Settled(dials, now, covariance, residuals, slopes, square(residuals), one.values)
+    return one
+
+
+def _counted(
+    found: Settled, dial: Dial, settled: Callable[[Mapping[Key, Any]], Settled | str]
+) -> tuple[Settled, tuple[float, float]]:
+    """(the best with a whole number settled beside the others, which of its values the data do not exclude).
+
+    No slope leads from one to the next: from its neighbours, ever nearer ones, all else being settled at each.
+    """
+    squares, step = {found.values[dial.key]: found.square}, _NEXT[0]
+
+    def there(value: float) -> Settled | None:
+        one = settled({**found.values, dial.key: value})
+        squares[value] = math.inf if isinstance(one, str) else one.square
+        return None if isinstance(one, str) else one
+
+    while step > _NEXT[1]:
+        here = float(found.values[dial.key])
+        near = {_beside(dial, here, x) for x in (-step, step)} - squares.keys()
+        best = min((one for x in sorted(near) if (one := there(x))), key=lambda one: one.square, default=found)
+        if best.square < found.square - _BETTER:
+            found = best
+        else:
+            step /= 2
+    here = float(found.values[dial.key])
+    for side in (-1, 1):  # on to where they do
+        step = _NEXT[0]
+        while all(side * (x - here) <= 0 or squares[x] <= found.square + EXCLUDED for x in squares):
+            far = max(squares, key=lambda x, side=side: side * x)  # type: ignore[misc]
+            if (further := _beside(dial, far, side * step)) == far:
+                break
+            there(further)
+            step *= 2
+    out = [x for x, square in squares.items() if square > found.square + EXCLUDED]
+    low = max((x + 1 for x in out if x < here), default=dial.low)
+    high = min((x - 1 for x in out if x > here), default=dial.high)
+    return found, (low, high)
+
+
+def _beside(dial: Dial, value: float, step: float) -> float:
+    """The whole number so far away, of a logarithm, but at least the next one; at a bound that itself."""
+    other = dial.value(dial.coordinate(value) + step)
+    other = min(other, value - 1) if step < 0 else max(other, value + 1)
+    return min(max(other, dial.low), dial.high)
