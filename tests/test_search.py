@@ -83,7 +83,9 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     state, look = bench.state({}), quiet(bench)
     (moved,) = bench.moved(state, [state.sensors.changed(values)], 2, kept="sure")
     assert isinstance(moved, Moved)
-    boost, found = refining._boost(bench, state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values)
+    boost, found = refining._boost(
+        bench, state, Tried(change_of(bench, f"add {name}"), values, moved, 0.0, 1.0), values
+    )
     assert boost > 2 and round(found) == power
 
 
@@ -115,7 +117,7 @@ def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab, mo
     nothing = Moved({}, {}, {})
     worse = Moved({}, {}, dict.fromkeys(bench.seen, 10.0))
     for low, high in ((nothing, worse), (worse, nothing), (worse, worse)):
-        monkeypatch.setattr(Bench, "moved", lambda self, state, models, few, ends=(low, high): list(ends))
+        monkeypatch.setattr(Bench, "moved", lambda self, state, models, few, ends=(low, high), **_: list(ends))
         step.values = dict(told)
         course_of.open_ends(course)
         value = step.values["delay"]

@@ -113,17 +113,23 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
     course.search.phases.update(best.phases)
     course.steps += new
     course.values = {**course.values, **best.values}
-    settle_all(course, best.settled)
+    settle_all(course, best.settled, best.state)
     for step in new:
         step.misfit = course.misfit
     course.rung("+ " + " + ".join(title(step.change) for step in new))
     return new
 
 
-def settle_all(course: Course, settled: Settled | None = None) -> None:
-    """The model with all its steps beside the data: maps, then all numbers together. settled: those of the last."""
+def settle_all(course: Course, settled: Settled | None = None, known: State | None = None) -> None:
+    """The model with all its steps beside the data: maps, then all numbers together.
+
+    settled: the numbers of the last step; known: the model with it, where it has been simulated already.
+    """
     sensors, maps = _model(course)
-    state = course.bench.state(course.values, sensors)
+    if known is None or maps:
+        state = course.bench.state(course.values, sensors)
+    else:
+        state = replace(known, values=dict(course.values), sensors=sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
     found: Settled | None = None
     if dials:
