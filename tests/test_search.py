@@ -80,7 +80,7 @@ def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
 def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, Any], power: float) -> None:
     """Probabilities in proportion, fluctuations with the square: whatever chance hides of a faint trace."""
     bench = bench_of(lab(light=900, side=4))
-    state, look = bench.state({}), quiet(bench)
+    state = bench.state({})
     (moved,) = bench.moved(state, [state.sensors.changed(values)], 2, kept="sure")
     assert isinstance(moved, Moved)
     boost, found = refining._boost(

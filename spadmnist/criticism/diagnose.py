@@ -18,7 +18,7 @@ from joblib import Parallel
 from ..effects import Mimic
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import chance, checks, outlook, recordings, setups
+from . import advice, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
 from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
@@ -111,7 +111,7 @@ def _diagnosed(
     invisible: list[dict[str, Any]] = []
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
-        excluded, invisible = outlook.upper_limits(course.search, course.state, beside.tried)
+        excluded, invisible = limits.upper_limits(course.search, course.state, beside.tried)
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not course.steps)
     return Diagnosis(
         bench.start.name,
@@ -261,13 +261,13 @@ def _or_confused(course: Course, beside: _Beside) -> str:
     near = [(s.change, a["tried"]) for s in course.steps for a in s.alternatives if a.get("confused")]
     if near:
         verdict = "confused"
-        beside.advice += outlook.advice(course.search, course.state, *near[-1])
+        beside.advice += advice.between(course.search, course.state, *near[-1])
     for step in course.steps:
         unlisted = mimicked(step)
         if unlisted is not None:
             verdict = "confused"
             step.alternatives.insert(0, _outside(unlisted, course.misfit))
-            beside.advice.append(outlook.advice_on_mimic(step, unlisted))
+            beside.advice.append(advice.on_mimic(step, unlisted))
     return verdict
 
 
@@ -296,13 +296,13 @@ def _by_setup(course: Course, beside: _Beside) -> bool:
     if own < cost + setups.ALIKE:
         found = [{**entry, "confused": True} for entry in found]
         beside.rival = others[0]
-        beside.advice += outlook.advice_on_totals(course.search, state, likely[0], others[0])
+        beside.advice += advice.between_totals(course.search, state, likely[0], others[0])
     else:
-        beside.advice += outlook.advice_on_setup(bench, state, found)
+        beside.advice += advice.on_setup(bench, state, found)
         bright = setups.brightest(bench, likely[0])
         if bright is not None:
             beside.bent = True
-            beside.advice.append(outlook.advice_on_brightest(bench, state, likely[0], found[0]))
+            beside.advice.append(advice.on_brightest(bench, state, likely[0], found[0]))
     beside.setup = found + beside.setup
     beside.explained = True
     return True

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
-from spadmnist.criticism import candidates, chance, compare, diagnose, fit, outlook, search
+from spadmnist.criticism import advice, candidates, chance, compare, diagnose, fit, limits, search
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step, canonical
 from spadmnist.criticism.candidates import Key
@@ -29,7 +29,7 @@ def advised(bench: Bench, found: str, values: dict[Key, Any]) -> tuple[dict[str,
     assert isinstance(moved, Moved)
     residuals = bench.residuals(state, moved)
     rival = Tried(change_of(bench, "add afterpulsing"), values, moved, 0.0, 1.0, other, residuals=residuals)
-    (told,) = outlook.advice(look, state, change_of(bench, found), rival)
+    (told,) = advice.between(look, state, change_of(bench, found), rival)
     return told, fit.square(residuals) - fit.square(state.residuals)
 
 
@@ -68,7 +68,7 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     change = change_of(bench, f"add {name}")
     tried = look.looked_at(state, change, look.begun(state, change))
     assert tried and all(isinstance(t, Tried) for t in tried)
-    found, hidden = outlook.upper_limits(look, state, tried)
+    found, hidden = limits.upper_limits(look, state, tried)
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
     return limit, [chance.along(bench, state, t.moved).data for t in tried]

@@ -1,0 +1,124 @@
+"""Limits: how much of what was not found would have been seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from . import fit
+from .answer import plain
+from .chance import along
+from .fit import Bench, Moved, State
+from .search import Search
+from .tried import Tried
+
+_ONE_SIDED = 1.645  # 95 %
+_CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a trace that chance does not hide, and of one that it does
+_MOST_OF = 0.9  # of the square of a trace, which so many captures show
+_SATURATED = 1000.0  # of a trace that hardly grows any more
+_LOOKS = 5  # at other strengths, until that is found
+
+
+def upper_limits(
+    search: Search, state: State, tried: Sequence[Tried]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here).
+
+    tried: every candidate as it was looked at in all captures. The weakest limit of its shapes: whatever the shape,
+    more would have been seen. How the trace of each grows with its strength is simulated once more.
+    """
+    bench = search.bench
+    shapes: dict[str, list[_Shape]] = {}
+    for one in tried:
+        change = one.change
+        if change.kind != "add" or len(change.strengths) != 1 or change.phases:
+            continue
+        trace = along(bench, state, one.moved)
+        times = (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
+        shapes.setdefault(change.effect, []).append((times, trace.size, one))
+    # a template that saturates does not tell which shape is the weakest
+    asked = {
+        (name, n): shape
+        for name, all_ in shapes.items()
+        for n, shape in enumerate(all_)
+        if shape is max(all_, key=lambda s: s[0]) or min(s[1] for s in all_) > _SATURATED
+    }
+    times_of = _at_limit(search, state, asked)
+    excluded, hidden = [], []
+    for name in shapes:
+        limits = [_strength(shape[2], times_of[key]) for key, shape in asked.items() if key[0] == name]
+        dial = shapes[name][0][2].change.strengths[0]
+        if None in limits:
+            hidden.append(name)
+        else:
+            far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
+            excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
+    return excluded, [{"effect": name} for name in sorted(hidden)]
+
+
+# times the strength at which it would be seen if it grew in proportion, the size of its trace, what it is
+_Shape = tuple[float, float, Tried]
+
+
+def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _Shape]) -> dict[tuple[str, int], float]:
+    """Times the strength at which each would just be seen, its trace growing as stronger ones tell.
+
+    Where it stands out clearly, but not by far, the power is measured with which it grows.
+    """
+    bench = search.bench
+    out: dict[tuple[str, int], float] = {}
+    open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
+    needed: dict[tuple[str, int], float] = {}
+    where: dict[tuple[str, int], tuple[str, ...]] = {}
+    for name, (times, size, one) in weakest.items():
+        out[name] = times
+        if size > 2 * _CLEARLY:
+            where[name] = _telling(bench, state, one.moved)
+            seen = along(bench, state, one.moved.only(where[name])).size
+            needed[name] = times * seen
+            open_[name] = 1.0, seen, _CLEARLY / seen
+    for _ in range(_LOOKS):
+        known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
+        if not known:
+            break
+        models = []
+        for name, (_, _, try_) in known.items():
+            one = weakest[name][2]
+            dial = one.change.strengths[0]
+            models.append(state.sensors.changed({**one.values, dial.key: _strength(one, try_)}))
+        open_ = {}
+        only = [where[name] for name in known]
+        for (name, (strong, size, try_)), moved in zip(
+            known.items(), bench.moved(state, models, fit.FEW, kept="sure", only_of=only), strict=True
+        ):
+            there = 0.0 if isinstance(moved, str) else along(bench, state, moved.only(where[name])).size
+            power = math.log(max(there, _HARDLY) / size) / math.log(try_ / strong)
+            out[name] = try_ * (needed[name] / max(there, _HARDLY)) ** (1 / min(max(power, 0.5), 10.0))
+            if there < _CLEARLY / 3:  # it grows faster: a trace that chance hides tells no power
+                open_[name] = strong, size, math.sqrt(strong * try_)
+            elif there > 6 * _CLEARLY:
+                open_[name] = try_, there, try_ * _CLEARLY / there
+    return out
+
+
+def _telling(bench: Bench, state: State, moved: Moved) -> tuple[str, ...]:
+    """The captures that show most of what a model changes."""
+    told = dict.fromkeys(state.made, 0.0)
+    for cell, t in bench.template(state, moved).items():
+        if cell[0] in told:
+            told[cell[0]] += float(t @ t)
+    best = sorted(told, key=lambda id: -told[id])
+    so_far = np.cumsum([told[id] for id in best])
+    return tuple(best[: 1 + int(np.searchsorted(so_far, _MOST_OF * so_far[-1]))])
+
+
+def _strength(one: Tried, times: float) -> float | None:
+    """So many times the strength of a candidate; None beyond where it is looked for."""
+    dial = one.change.strengths[0]
+    off = dial.off or 0.0
+    value = off + (float(one.values[dial.key]) - off) * times
+    inside = math.isfinite(value) and (value <= dial.high if dial.off != dial.high else value >= dial.low)
+    return value if inside else None
