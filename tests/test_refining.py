@@ -1,0 +1,155 @@
+"""What a search does with a candidate between its first look and its place in the model."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tinylab import CROSSTALK, DURATION, bench_of, change_of, given, quiet
+
+from spadmnist.criticism import course as course_of
+from spadmnist.criticism import refining, search, settling
+from spadmnist.criticism.answer import Step
+from spadmnist.criticism.fit import RATES, Moved
+from spadmnist.criticism.search import Search
+from spadmnist.criticism.tried import Tried
+
+NOTHING = Moved({}, {}, {})
+SERVICE = ("readout_loss", "service_time")
+
+
+def test_a_scan_tries_weaker_edges_beside_one_that_drowns_all_else(lab, monkeypatch) -> None:
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add readout_loss")
+    least = change.strengths[0].low
+    first = {SERVICE: 1e4 * least, ("readout_loss", "queue"): 8.0}
+
+    def looked_at(self: Search, state: Any, tries: Any, only: Any = ()) -> list[Tried]:
+        return [Tried(one, values, Moved({}, {}, {"size": values[SERVICE]}), 1.0, 1.0) for one, values in tries]
+
+    monkeypatch.setattr(search, "changes", lambda sensor: [change])
+    monkeypatch.setattr(Search, "begun", lambda self, state, change: [first])
+    monkeypatch.setattr(Search, "only_rates", lambda self, state: False)
+    monkeypatch.setattr(Search, "_looked_at", looked_at)
+    # 600 standard deviations, then 60, which are enough to see and few enough to tell
+    monkeypatch.setattr(bench, "size", lambda state, moved: 600.0 * math.sqrt(moved.logs["size"] / first[SERVICE]))
+    found = sorted(one.values[SERVICE] / least for one in look.scan(state))
+    assert found == [pytest.approx(1e2), pytest.approx(1e4)]
+
+
+def test_an_edge_is_probed_to_some_ten_picoseconds() -> None:
+    """A cusp: no slope leads to it, and a probe that is three times as far as it misses it."""
+    truth = 50e-9
+    dial = SimpleNamespace(
+        key=DURATION, log=True, lacks=False, unit="s", off=50e-9, coordinate=math.log, value=math.exp
+    )
+
+    def cost(values: dict[Any, float]) -> dict[Any, np.ndarray]:
+        return {("flat", "edge"): np.array([math.sqrt(2e4 * abs(math.log(values[DURATION] / truth)))])}
+
+    bench: Any = SimpleNamespace(
+        moved=lambda state, models, few, only: models, residuals=lambda state, moved: cost(moved)
+    )
+    state: Any = SimpleNamespace(sensors=SimpleNamespace(changed=lambda values, phases, chips: values))
+    one: Any = SimpleNamespace(change=SimpleNamespace(dials=(dial,), shapes=()), phases={}, chips=False)
+    start = {DURATION: truth * math.exp(0.0022)}
+    square = float(cost(start)["flat", "edge"][0]) ** 2
+    found = settling.Settled((dial,), np.log([start[DURATION]]), np.eye(1), {}, {}, square, start)  # type: ignore[arg-type]
+    found = refining._probed(bench, state, one, found, [])
+    assert abs(found.values[DURATION] - truth) < 10e-12
+    assert found.covariance[0, 0] < 1e-6
+
+
+@pytest.mark.parametrize(("size", "asked"), [(0.0, False), (0.5, False), (3.0, True)])
+def test_probes_are_for_checks_that_the_candidate_moves(lab, monkeypatch, size: float, asked: bool) -> None:
+    """What fails is where the candidate leaves no trace: no number of it would mend that."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    cell = "flat", "spectrum"
+    residuals = {**state.residuals, cell: state.residuals[cell] + 1e3}
+    trace = {c: np.zeros(len(z)) for c, z in state.residuals.items()}
+    trace[cell][0] = size
+    trace["dark", "intervals"][:] = 10.0  # where nothing fails
+    monkeypatch.setattr(bench, "template", lambda state, moved: trace)
+    one = Tried(change_of(bench, "add crosstalk"), {}, NOTHING, 0.0, 1.0)
+    found: Any = SimpleNamespace(residuals=residuals)
+    assert refining._fails_its_own(bench, state, one, found) == asked
+    trace[cell][0], trace[RATES][:] = 0.0, size
+    found.residuals = {**state.residuals, RATES: np.full(len(state.residuals[RATES]), 20.0)}
+    assert refining._fails_its_own(bench, state, one, found) == asked
+
+
+def test_captures_that_show_hardly_anything_of_it_are_left_out(lab) -> None:
+    bench = bench_of(lab())
+    state = bench.state({})
+    trace = {c: np.zeros(len(z)) for c, z in state.residuals.items()}
+    trace["dark", "intervals"][0], trace["flat", "intervals"][0] = 10.0, 0.5
+    assert refining.showing(state, trace) == ["dark"]
+    trace["flat", "intervals"][0] = 2.0
+    assert refining.showing(state, trace) == ["dark", "flat"]
+
+
+def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numbers(lab, monkeypatch) -> None:
+    """Rows follow a gradient along the columns, each with a number of its own."""
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    rows, gradient, map_ = (
+        Tried(change_of(bench, name), {}, NOTHING, gain, 1.0)
+        for name, gain in (
+            ("add row_pattern", 900.0),
+            ("add illumination_gradient", 800.0),
+            ("per_pixel detection.pdp", 700.0),
+        )
+    )
+    map_.maps = {map_.change.carrier: None}  # type: ignore[dict-item]
+    monkeypatch.setattr(search.mapping, "bench_light_only", lambda sensor, change: True)
+    told = {rows.change.name: (1e-9, 40.0), gradient.change.name: (1e-9, 10.0)}
+    monkeypatch.setattr(search.mapping, "patterned", lambda free, designs: told)
+    assert look.structured(state, [rows, gradient, map_]) == [gradient, rows, map_]
+    told[gradient.change.name] = (0.5, 10.0)  # it does not stand out of the map's scatter
+    assert look.structured(state, [rows, gradient, map_]) == [rows, map_]
+    other = Tried(change_of(bench, "add crosstalk"), {}, NOTHING, 1000.0, 1.0)
+    assert look.structured(state, [other, rows, map_]) == [other, rows, map_]
+
+
+@pytest.mark.parametrize(("without", "kept"), [(0, False), (1, False), (2, True)])
+def test_a_map_goes_unless_a_check_fails_without_it(lab, monkeypatch, without: int, kept: bool) -> None:
+    course = course_of.begun(bench_of(lab()))
+    map_, last = (
+        Step(change_of(course.bench, name), {}, 1.0, 9.0, "")
+        for name in ("per_pixel dark_counts.rate", "add blinking_dark_counts")
+    )
+    course.steps, course.search.accepted = [map_, last], [map_.change, last.change]
+    monkeypatch.setattr(course_of, "settle_all", lambda course: None)
+    monkeypatch.setattr(
+        course_of.Course, "failed", property(lambda self: ["a check"] * (1 if map_ in self.steps else without))
+    )
+    course_of.drop_needless(course)
+    assert course.steps == ([map_, last] if kept else [last])
+    assert course.search.accepted == [step.change for step in course.steps]
+    assert (course.ladder[-1]["model"] == "start") == kept
+
+
+def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) -> None:
+    """The same answer, by fewer recordings."""
+    made = lab("    crosstalk: {probability: 3 %}\n", light=400)
+    courses = [course_of.begun(bench_of(made)) for _ in range(2)]
+    for course, weighed in zip(courses, (False, True), strict=True):
+        one = given(course, "add crosstalk", {CROSSTALK: 0.03}, settle=True)
+        before = course.bench.simulations
+        if weighed:
+            refining.state_of(course.bench, one)
+            assert course.bench.simulations - before == 2 * 16
+            before = course.bench.simulations
+        course_of.accept(course, one, 1.0)
+        course.bench.simulations -= before
+    plain, known = courses
+    assert plain.bench.simulations - known.bench.simulations == 2 * 16
+    assert known.values == plain.values and known.steps[0].values == plain.steps[0].values
+    assert known.state.values == plain.state.values and known.misfit == plain.misfit
+    for cell, z in plain.state.residuals.items():
+        assert np.array_equal(known.state.residuals[cell], z)
