@@ -71,6 +71,27 @@ def _json(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
 
 
+def _beside(command: F) -> F:
+    """What every verb has that sets a model beside a measurement."""
+    path = click.Path(path_type=Path)
+    for part in (
+        _plugin,
+        _jobs,
+        click.option(
+            "--seed",
+            type=click.IntRange(0, 2**63 - 1),
+            default=0,
+            metavar="N",
+            help="Of the simulations.  [default: 0]",
+        ),
+        click.option("--json", "json_file", type=path, metavar="FILE", help="Write the answer there, as JSON."),
+        click.argument("measurement", type=path),
+        click.argument("sensor", type=path),
+    ):
+        command = part(command)
+    return command
+
+
 @cli.command(short_help="Make the dataset of a config.")
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option(
@@ -577,11 +598,6 @@ def statistics_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool)
 
 
 @cli.command(short_help="Where does a model fail?")
-@click.argument("sensor", type=click.Path(path_type=Path))
-@click.argument("measurement", type=click.Path(path_type=Path))
-@click.option(
-    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
-)
 @click.option(
     "--output",
     "-o",
@@ -594,11 +610,7 @@ def statistics_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool)
     metavar="X",
     help='What is smaller does not matter: "0.5 %" of the detections or of the rate.',
 )
-@click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
-)
-@_jobs
-@_plugin
+@_beside
 def compare(
     sensor: Path,
     measurement: Path,
@@ -619,8 +631,8 @@ def compare(
     spadmnist compare sensor.yaml lab/2025-03-01 --tolerance "0.5 %" --json answer.json
     """
     from . import config as configs
-    from . import disk, units
     from . import measurement as measurements
+    from . import units
     from .criticism import compare as criticism
     from .errors import InputError
 
@@ -646,9 +658,7 @@ def compare(
 
         found = criticism.compare(model, data, seed, smallest, jobs or _processors(), progress=told)
         progress.stop()
-    if json_file is not None:
-        with _writing(json_file):
-            disk.commit_file(json_file, (criticism.canonical(found) + "\n").encode(), json_file.parent)
+    _write_answer(json_file, criticism.canonical(found))
     if output is not None:
         page = pages.comparison(found, output)
         _say(f"Report: {page}")
@@ -658,11 +668,6 @@ def compare(
 
 
 @cli.command(short_help="Which physical effect does a model lack?")
-@click.argument("sensor", type=click.Path(path_type=Path))
-@click.argument("measurement", type=click.Path(path_type=Path))
-@click.option(
-    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
-)
 @click.option(
     "--output",
     "-o",
@@ -672,11 +677,7 @@ def compare(
 )
 @click.option("--max-steps", type=click.IntRange(1, 12), default=4, metavar="N", help="At most so many.  [default: 4]")
 @click.option("--quick", is_flag=True, help="Fewer simulations: a first answer.")
-@click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
-)
-@_jobs
-@_plugin
+@_beside
 def diagnose(
     sensor: Path,
     measurement: Path,
@@ -698,7 +699,6 @@ def diagnose(
     spadmnist diagnose sensor.yaml lab/2025-03-01 --plugin echo.py --json answer.json
     """
     from . import config as configs
-    from . import disk
     from . import measurement as measurements
     from .criticism import answer, next_sensor
     from .criticism import diagnose as criticism
@@ -716,27 +716,16 @@ def diagnose(
             found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, answer.notes(found)))
         page = pages.diagnosis(found, output)
         _say(f"Report: {page}")
-    if json_file is not None:
-        with _writing(json_file):
-            disk.commit_file(json_file, (answer.canonical(found) + "\n").encode(), json_file.parent)
+    _write_answer(json_file, answer.canonical(found))
     click.echo(answer.table(found))
 
 
 @cli.command(short_help="Settle parameters of a model.")
-@click.argument("sensor", type=click.Path(path_type=Path))
-@click.argument("measurement", type=click.Path(path_type=Path))
 @click.option("--output", "-o", type=click.Path(path_type=Path), metavar="NEXT.yaml", required=True, help="New file.")
 @click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and settle it.")
 @click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a parameter.")
 @click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a map.")
-@click.option(
-    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the answer there, as JSON."
-)
-@click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulations.  [default: 0]"
-)
-@_jobs
-@_plugin
+@_beside
 def fit(
     sensor: Path,
     measurement: Path,
@@ -756,7 +745,6 @@ def fit(
     spadmnist fit sensor.yaml lab --free dead_time.duration --per-pixel detection.pdp -o next.yaml
     """
     from . import config as configs
-    from . import disk
     from . import measurement as measurements
     from .criticism import answer, next_sensor
     from .criticism import fitted as criticism
@@ -767,10 +755,16 @@ def fit(
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
     with _writing(output):
         found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found)))
-    if json_file is not None:
-        with _writing(json_file):
-            disk.commit_file(json_file, (answer.canonical(found) + "\n").encode(), json_file.parent)
+    _write_answer(json_file, answer.canonical(found))
     click.echo(answer.table(found))
+
+
+def _write_answer(file: Path | None, text: str) -> None:
+    from . import disk
+
+    if file is not None:
+        with _writing(file):
+            disk.commit_file(file, (text + "\n").encode(), file.parent)
 
 
 @cli.command("methods", short_help="List flux reconstructions, or describe one.")
