@@ -57,6 +57,11 @@ class Capture:
     conditions: Conditions
     mean: float | None = None
 
+    @property
+    def counts_events(self) -> bool:
+        """Is every detection counted, and not the frames that have one?"""
+        return self.modality == "tr" or (self.modality == "counts" and self.conditions.counting == "counter")
+
 
 class FrameSource(Protocol):
     """Frames on disk or in memory, read in pieces."""

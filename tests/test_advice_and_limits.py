@@ -148,13 +148,13 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     end = with_residuals(course.state, {"intervals": 9.0})
     taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
     taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
-    course.state, course.judged = end, None
+    course.state, course.settled = end, None
     for step, name in zip(course.steps, ("neighbours", "intervals"), strict=True):
         step.before = dict(start.residuals)
         step.template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
     monkeypatch.setattr(course_of, "settle_all", lambda course, settled=None: None)
     assert course.failed
-    course_of.drop_mimics(course, start)
+    course_of.drop_mimics(course, start, True)
     assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
     # what is left is kept if it explains nearly all, whatever its own cells have
     foul = with_residuals(end, {"neighbours": 5.0})
@@ -163,7 +163,7 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     assert names(course) == ["add crosstalk"]
     # and nothing is left of steps that made all of it worse
     course.state = with_residuals(end, {"intervals": 30.0})
-    course_of.drop_mimics(course, start)
+    course_of.drop_mimics(course, start, True)
     assert not course.steps and not course.values
 
 

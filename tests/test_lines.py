@@ -76,6 +76,21 @@ def test_a_line_of_the_dark_capture_alone_is_seen_too() -> None:
     assert len(found) == 1 and abs(found[0].frequency - 1000.0) < 10.0
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_lamp_that_fluctuates_has_no_line_but_one_that_also_swings(seed: int) -> None:
+    """Power of 50 times the noise that falls off with the frequency. False alarms: 1e-3 of a set, 2 % of them all."""
+    powers = noise(seed)
+    for id in powers:
+        frequency = STEPS[id] * np.arange(1, BINS + 1)
+        powers[id] *= 1 + (id != "dark") * 50 / (1 + (frequency / 1500.0) ** 2)
+    assert not lines(*beside(powers))
+    for id, power in powers.items():
+        if id != "dark":
+            power[round(2000.0 / STEPS[id]) - 1] += 400.0
+    found = lines(*beside(powers))
+    assert found and abs(found[0].frequency - 2000.0) < 70.0
+
+
 def test_what_few_recordings_hide_their_neighbours_tell() -> None:
     """7 more in each of three bins are seen in 55 of 60 sets; each beside its own mean of 32 recordings, in 11."""
     found = [lines(*beside(swinging(seed, 200.0, 7.0))) for seed in range(60)]

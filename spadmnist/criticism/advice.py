@@ -37,7 +37,7 @@ def between(search: Search, state: State, found: Change, other: Tried) -> list[d
     bench.say("which capture would tell")
     best: tuple[float, str] | None = None
     for words, capture, like in _menu(bench, state):
-        z = _apart(bench, state.sensors, other.sensors, capture, like)
+        z = _apart(bench, state, other.sensors, capture, like)
         if best is None or z > best[0]:
             best = z, words
     if best is None:
@@ -99,8 +99,8 @@ def _brighter(bench: Bench, id: str, rate: float, times: float) -> Iterator[tupl
     yield words, replace(capture, light=replace(capture.light, level=level * times)), id
 
 
-def _apart(bench: Bench, one: Sensors, other: Sensors, capture: Capture, like: str) -> float:
-    """Standard deviations by which two models differ in a capture that was not taken."""
+def _apart(bench: Bench, known: State, other: Sensors, capture: Capture, like: str) -> float:
+    """Standard deviations by which another model differs from a known one in a capture that was not taken."""
     new = copy.copy(bench)
     capture = replace(capture, id=f"{capture.id} again")
 
@@ -108,8 +108,9 @@ def _apart(bench: Bench, one: Sensors, other: Sensors, capture: Capture, like: s
         typical = (lambda id: sensors.usual(like)) if sensors.typical else None
         return Sensors(lambda id, number: sensors.of(like, number), sensors.one, sensors.alike, typical)
 
-    first, second = there(one), there(other)
-    level = 1.0 if capture.light.dark else twin.photons_at(capture, bench.start.layout) or 0.0
+    first, second = there(known.sensors), there(other)
+    stated = twin.photons_at(capture, bench.start.layout)
+    level = 1.0 if capture.light.dark else stated or known.rates[like].level
     sensor = first.of(capture.id, 0)
     sensor = recordings.InTheDark.of(sensor) if capture.light.dark else sensor
     number = np.array([10_000], np.uint64)

@@ -59,10 +59,18 @@ def blocks(bench: Bench, state: State, residuals: Mapping[Cell, np.ndarray]) -> 
 
 
 def failing(checks: Sequence[Block], level: float = comparing.FALSE_ALARM) -> list[Block]:
-    """Those that a right model would show once in a hundred times (Holm)."""
-    out = []
-    for rank, block in enumerate(checks):
-        if block.p > level / (len(checks) - rank):
+    """Those that a right model would show once in a hundred times (Holm), the clearest first.
+
+    The totals together have as large a share of these as `compare` gives them, and all else has the rest.
+    """
+    totals = sum(block.cell[0] == "" for block in checks)
+    others = len(checks) - totals
+    share = comparing.SHARE_OF_TOTALS if totals and others else float(bool(totals))
+    weights = [share / totals if block.cell[0] == "" else (1 - share) / others for block in checks]
+    out, left = [], 1.0
+    for block, weight in sorted(zip(checks, weights, strict=True), key=lambda pair: pair[0].p / pair[1]):
+        if block.p > level * weight / max(left, weight):
             break
         out.append(block)
-    return out
+        left -= weight
+    return sorted(out, key=lambda block: (block.p, -abs(block.z)))

@@ -30,8 +30,10 @@ from .nulls import Judgement, Null, poisson_scores
 from .recordings import REPLICATES, CaptureNull, model_of, reduced, statistics_for
 
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
+LEAST_ELASTICITY = 0.01  # of a total that says something of the light
 _SHARES = {"light": 0.25, "rate": 0.25}  # of the false alarms that are allowed
-_REST = 0.5
+SHARE_OF_TOTALS = sum(_SHARES.values())
+_REST = 1 - SHARE_OF_TOTALS
 _MAP = "pixel_map"
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio says something
 _LEAST_P = 1e-300  # a p-value is never 0
@@ -278,8 +280,8 @@ def _level_checks(
     levels: list[tuple[Capture, float, float, float]],
 ) -> list[Check]:
     """The total of a dark capture against the model's; that of a lit one becomes a light level."""
-    level, error, elasticity = made.level_of(total)
-    if made.stated is None or elasticity <= 0.01:
+    level, error, elasticity = made.level_of(max(total, 0.5))
+    if made.stated is None or elasticity <= LEAST_ELASTICITY:
         return []
     log = math.log(level / made.stated)
     if not capture.light.dark:

@@ -44,7 +44,12 @@ class Course:
     values: dict[Key, Any]
     steps: list[Step]
     ladder: list[dict[str, Any]]
-    judged: dict[Cell, np.ndarray] | None = None  # residuals of each capture by parameters settled without it
+    settled: Settled | None = None  # the numbers of all steps, with how the cells follow them
+
+    @property
+    def judged(self) -> dict[Cell, np.ndarray]:
+        """Residuals of each capture, the numbers being settled without it as far as there are others."""
+        return self.state.residuals if self.settled is None else _unseen(self.state, self.settled)
 
     @property
     def failed(self) -> list[checks.Block]:
@@ -54,21 +59,21 @@ class Course:
     @property
     def misfit(self) -> float:
         """On captures that the numbers were not settled with, as far as there are any; 1 is noise."""
-        return checks.misfit(self.state, self.judged or self.state.residuals)
+        return checks.misfit(self.state, self.judged)
 
     def kept(self) -> tuple[Any, ...]:
         """All that a step changes."""
-        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.judged)
+        own = (self.state, dict(self.values), list(self.steps), list(self.ladder), self.settled)
         return (*own, list(self.search.accepted), dict(self.search.phases))
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """As it was before a step."""
-        self.state, self.values, self.steps, self.ladder, self.judged = kept[:5]
+        self.state, self.values, self.steps, self.ladder, self.settled = kept[:5]
         self.search.accepted, self.search.phases = kept[5:]
 
     def rung(self, name: str) -> None:
         """A row more in the ladder of errors: the model as it is now."""
-        errors = errors_of(self.bench, self.state, self.judged or self.state.residuals)
+        errors = errors_of(self.bench, self.state, self.judged)
         self.ladder.append(row(name, self.misfit, errors))
 
 
@@ -112,8 +117,10 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
     course.search.accepted += best.changes
     course.search.phases.update(best.phases)
     course.steps += new
-    course.values = {**course.values, **best.values}
-    settle_all(course, best.settled, best.state)
+    known = best.state if not any(change.carrier for change in course.search.accepted) else None
+    # a model that has been simulated has the earlier numbers where they were simulated, a last step short of settled
+    course.values = {**(course.values if known is None else before.values), **best.values}
+    settle_all(course, best.settled, known)
     for step in new:
         step.misfit = course.misfit
     course.rung("+ " + " + ".join(title(step.change) for step in new))
@@ -126,20 +133,14 @@ def settle_all(course: Course, settled: Settled | None = None, known: State | No
     settled: the numbers of the last step; known: the model with it, where it has been simulated already.
     """
     sensors, maps = _model(course)
-    if known is None or maps:
-        state = course.bench.state(course.values, sensors)
-    else:
-        state = replace(known, values=dict(course.values), sensors=sensors)
+    state = replace(known, values=dict(course.values)) if known else course.bench.state(course.values, sensors)
     dials = tuple(d for step in course.steps for d in step.dials)
     found: Settled | None = None
     if dials:
         found, state, maps = _followed(course, state, maps, dials, errors_known(course, settled))
         found = found or (settled if settled is not None and settled.dials == dials else None)
     course.state = state
-    course.judged = None
-    if found is not None:
-        found = _held(course, found)
-        course.judged = _unseen(state, found)
+    course.settled = found = None if found is None else _held(course, found)
     _written(course, found, maps)
 
 
@@ -260,7 +261,8 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             v = step.values[dial.parameter]
             assert v.low is not None and v.high is not None
             errors[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * _HALF)
-    found = likelihood.settled(sensor, data, wanted, start=start, errors=errors)
+    mapped = any(step.change.carrier for step in course.steps)
+    found = likelihood.settled(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
     if isinstance(found, str):
         return
     moved = 0.0
@@ -307,6 +309,13 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
         low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
         high = float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
         told[name] = Value(told[name].value, low, high)
+    low_ones, _ = mapping.odd(map_)
+    if low_ones.any():  # without any there is no ratio of theirs
+        mean = told["low_ratio"].value
+        own = float(np.mean(map_.error[low_ones] ** 2))
+        apart = float(np.var(map_.estimate[low_ones], ddof=1)) if low_ones.sum() > 1 else 0.0
+        half = _HALF * mean * math.sqrt(max(own, apart) / int(low_ones.sum()))
+        told["low_ratio"] = Value(mean, max(mean - half, 0.0), mean + half)
     return told
 
 
@@ -403,14 +412,15 @@ def _keys_of(change: Change, course: Course) -> set[Key]:
     return {(change.effect, change.parameter or "")}
 
 
-def drop_mimics(course: Course, start: State) -> None:
+def drop_mimics(course: Course, start: State, totals: bool) -> None:
     """Where something remains, steps that only happen to look like it are no findings.
 
     The cells that a step speaks of must be in order with it; and of totals alone, whatever remains may be the cause.
+    start: the model without any; totals: are they a matter of the model, and not of the set-up?
     """
-    while course.steps and course.failed:
+    while course.steps and any(totals or block.cell[0] for block in course.failed):
         # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
-        left = {id(s): _left_of_own(s, course.state) for s in course.steps}
+        left = {id(s): _left_of_own(s, course.state, totals) for s in course.steps}
         worst = max(course.steps, key=lambda s: left[id(s)])
         now, then = (checks.misfit(state, state.residuals) for state in (course.state, start))
         mostly = len(course.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
@@ -423,17 +433,25 @@ def drop_mimics(course: Course, start: State) -> None:
         course.search.accepted = [c for c in course.search.accepted if any(c is s.change for s in kept)]
         known = set().union(*(_keys_of(s.change, course) for s in kept))
         course.values = {k: v for k, v in course.values.items() if k in known}
+        listed = {effect.name for effect in course.bench.start.effects}
+        swinging = listed | {change.effect for change in course.search.accepted}
+        course.search.phases = {at: p for at, p in course.search.phases.items() if at[1][0] in swinging}
         if kept:
             settle_all(course)
             course.rung("without what only looks alike")
+        else:
+            course.state, course.settled = start, None
 
 
-def _left_of_own(step: Step, state: State) -> float:
-    """What is left of the cells that a step speaks of; from 1 on it only happens to look like what is there."""
+def _left_of_own(step: Step, state: State, totals: bool) -> float:
+    """What is left of the cells that a step speaks of; from 1 on it only happens to look like what is there.
+
+    totals: are they among them?
+    """
     weight, after, before, shape, shapes = 0.0, 0.0, 0.0, 0.0, 0.0
     for cell, t in step.template.items():
         z, old = state.residuals.get(cell), step.before.get(cell)
-        if z is None or old is None or len(z) != len(t) or len(old) != len(t):
+        if z is None or old is None or len(z) != len(t) or len(old) != len(t) or (cell == RATES and not totals):
             continue
         w = t**2
         weight, after, before = weight + float(w.sum()), after + float(w @ z**2), before + float(w @ old**2)

@@ -65,7 +65,7 @@ class _Beside:
     """What a diagnosis says beside its steps.
 
     explained: is what fails in the totals the set-up's? bent: or that of a nonlinearity that no effect here has? tried:
-    candidates as they were last looked at.
+    candidates as they were last looked at. looked: the model beside which they were looked at in all captures.
     """
 
     setup: list[dict[str, Any]]
@@ -75,18 +75,19 @@ class _Beside:
     rival: Tried | None = None
     placebo: dict[str, Any] | None = None
     tried: list[Tried] = field(default_factory=list)
+    looked: State | None = None
 
 
 def _diagnosed(
     bench: Bench, measurement: Measurement, max_steps: int, quick: bool, short: Mapping[str, tuple[float, float]]
 ) -> Diagnosis:
     course = begun(bench)
-    start, beside = course.state, _Beside(_too_short(short), bool(short))
+    start, beside = course.state, _Beside(_too_short(short), False)
     while len(course.steps) < max_steps and _another(course, beside):
         pass
     if course.steps:
         drop_needless(course)
-        drop_mimics(course, start)
+        drop_mimics(course, start, not beside.explained)
     if course.steps and not short:
         settle_exactly(course, measurement)
     open_ends(course)
@@ -95,7 +96,7 @@ def _diagnosed(
         left = []
     verdict = _verdict(course, left, beside)
     if not course.steps:
-        course.state, course.judged, course.values = start, None, {}
+        course.state, course.settled, course.values = start, None, {}
         course.ladder = course.ladder[:1] if verdict != "unexplained" else course.ladder
     if verdict == "explained":
         verdict = _or_confused(course, beside)
@@ -111,6 +112,8 @@ def _diagnosed(
     invisible: list[dict[str, Any]] = []
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
+        if beside.looked is not course.state:  # the last step was the last one allowed, or its numbers have moved
+            beside.tried = course.search.scan(course.state, everywhere=True, known=beside.tried)
         excluded, invisible = limits.upper_limits(course.search, course.state, beside.tried)
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not course.steps)
     return Diagnosis(
@@ -150,7 +153,7 @@ def _another(course: Course, beside: _Beside) -> bool:
         # no check fails by itself: does any candidate's whole trace stand out?
         bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
         beside.tried = search.scan(course.state, everywhere=True, known=beside.tried)
-        before = course.state
+        before = beside.looked = course.state
         if _stands_out(course, beside.tried, _TRACE if not course.steps else _LATER_TRACE):
             closer = course.state
             if closer is not before:  # which may show lines that the few recordings did not
@@ -237,7 +240,7 @@ def _few(course: Course) -> bool:
 def _closer(course: Course) -> State:
     """The model as it is, simulated more often."""
     course.bench.say("a closer look at what may be there")
-    return course.bench.state(course.values, course.state.sensors, _CLOSER, course.state)
+    return course.bench.state(course.state.values, course.state.sensors, _CLOSER, course.state)
 
 
 # --- the verdict -------------------------------------------------------------------------------------------------

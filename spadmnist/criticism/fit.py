@@ -25,7 +25,7 @@ from ..sensor import Sensor
 from ..statistics import Summary
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
-from .nulls import Null, _standardized, learn
+from .nulls import Null, _standardized, learn, poisson_scores
 from .shifts import beyond_noise, difference
 
 Cell = tuple[str, str]  # capture, statistic
@@ -33,6 +33,10 @@ RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point falls into the widest gap
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
+_LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than these are none
+_NORMAL = 30.0  # detections whose logarithm is as good as normal
+_SOME = 0.3  # standard deviations: less says nothing of the size of one
+_FAINT = 1e-6  # of the light: none
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
@@ -101,6 +105,16 @@ class Moved:
         noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
         even = None if self.even is None else self.even.only(ids)
         return Moved(shifts, noise, self.logs, self.nothing, even)
+
+    def beside(self, other: Moved, ids: Collection[str]) -> Moved:
+        """The same, and what `other` does in some captures of which this says the totals alone."""
+        there = other.only(ids)
+        logs = {**self.logs, **{id: log for id, log in other.logs.items() if id in ids}}
+        even = self.even
+        if even is not None or there.even is not None:
+            even = (even or Moved({}, {}, {})).beside(there.even or Moved({}, {}, {}), ids)
+        shifts, noise = {**self.shifts, **there.shifts}, {**self.noise, **there.noise}
+        return Moved(shifts, noise, logs, self.nothing and other.nothing, even)
 
     def at(self, times: float) -> Moved:
         """What it does at so many times its strength."""
@@ -400,9 +414,14 @@ class Bench:
         return [
             id
             for id in self.seen
-            if state.rates[id].stated is not None
-            and state.rates[id].total_at(float(state.rates[id].stated or 1.0)) >= 5
+            if state.rates[id].stated is not None and self._told(state.rates[id], self.seen[id].total)
         ]
+
+    @staticmethod
+    def _told(null: recordings.CaptureNull, total: float) -> bool:
+        """Does a total say something? Of fewer than five that are expected, if more are there."""
+        expected = null.total_at(float(null.stated or 1.0))
+        return expected >= _LEAST_TOTAL or (expected >= _NEVER and total >= _LEAST_TOTAL)
 
     def rate_space(self, state: State) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
         """(captures, elasticities, inverse root of the covariance of the log levels, the light's part in it)."""
@@ -425,10 +444,32 @@ class Bench:
     def level_error(self, state: State, id: str) -> float:
         """Standard deviation of the log of a capture's level (dark: of its rates), its own uncertainty with it."""
         null, light = state.rates[id], self.seen[id].capture.light
-        _, error, slope = null.level_of(max(self.seen[id].total, 1.0))
+        level, error, slope = null.level_of(max(self.seen[id].total, 1.0))
         if light.dark:
             error = max(error, 1 / math.sqrt(null.total_at(1.0)) / max(slope, 1e-3))
+        stated = float(null.stated or 1.0)
+        z = self._score(state, id, self.seen[id].total, null.total_at(stated))
+        if z is not None and abs(z) > _SOME:
+            level, _, _ = null.level_of(max(self.seen[id].total, 0.5))
+            error = abs(math.log(level / stated)) / abs(z)
         return max(math.hypot(error, light.own_uncertainty), 1e-6)
+
+    def _score(self, state: State, id: str, total: float, expected: float) -> float | None:
+        """Standard deviations between a total and what is expected; None where the log of a level is as good as normal.
+
+        It is not where detections are few, and where the light is faint beside the dark counts.
+        """
+        null = state.rates[id]
+        stated = float(null.stated or 1.0)
+        if self.seen[id].capture.light.dark:
+            if null.total_at(1.0) >= _NORMAL:
+                return None
+            wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
+            return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
+        if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):
+            return None
+        scatter = null.scatter * math.sqrt(1 + 2 / len(null.totals))
+        return math.log(max(total, 0.5) / expected) / max(scatter, 1e-9)
 
     def rates(self, state: State, logs: Mapping[str, float]) -> np.ndarray:
         """Residuals of the totals: independent, 1 wide; the light's common factor is among them."""
@@ -450,6 +491,10 @@ class Bench:
         for id, slope in zip(ids, slopes, strict=True):
             null = state.rates[id]
             usual = null.law[0] + null.law[1] * math.log(null.expected(float(null.level * state.factors[id][k])))
+            z = self._score(state, id, float(null.totals[k]), math.exp(usual))
+            if z is not None:
+                x.append(z * self.level_error(state, id))
+                continue
             x.append((math.log(max(null.totals[k], 0.5)) - usual) / slope)
         return root @ (np.array(x) + draw * common) if ids else np.zeros(0)
 

@@ -7,16 +7,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from joblib import Parallel
+from scipy import stats
 
 from ..errors import InputError
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import checks, fit, likelihood, recordings, settling
-from .answer import Diagnosis, Step, title
+from . import checks, fit, likelihood, mapping, recordings, settling
+from .answer import Diagnosis, Step, Value, title
 from .candidates import Change, Key, changes
+from .chance import LEAST_P, of_map
 from .course import Course, accept, begun, errors_known, material, settle_all
 from .findings import nuisances, remainder, traces
-from .fit import Bench, Moved
+from .fit import Bench, Moved, square
 from .refining import refine
 from .settling import Settled
 from .tried import Tried
@@ -107,10 +109,16 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
     bench = course.bench
     for change in sorted(wanted, key=lambda c: bool(c.carrier)):
         if change.carrier:
-            best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={})
+            p = of_map(bench, course.state, change, course.values, mapping.levels_of(bench, course.state))
+            best = Tried(change, {}, Moved({}, {}, {}), 0.0, 1.0, maps={}, chance=p)
+            accept(course, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
+            continue
+        best = refine(bench, course.state, _started(course, change), 5)
+        gain = square(course.state.residuals) - square(best.residuals or course.state.residuals)
+        if gain <= 0 and not change.dials:  # a switch that is as it should be
+            _kept(course, change)
         else:
-            best = refine(course.bench, course.state, _started(course, change), 5)
-        accept(course, best, math.sqrt(max(best.gain, 0.0)))
+            accept(course, best, math.sqrt(max(gain, 0.0)))
     ends: dict[Key, tuple[float, float]] = {}
     dials = tuple(d for step in course.steps for d in step.dials)
     if dials:
@@ -127,6 +135,15 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
             low, high = ends.get((step.change.effect, name), (value.low, value.high))
             how = "counts" if step.change.carrier else "simulation"
             step.values[name] = replace(value, low=low, high=high, method=how)
+
+
+def _kept(course: Course, change: Change) -> None:
+    """A switch that the data want as it is listed."""
+    told: dict[str, Value] = {}
+    for (effect, name), _ in change.fixed:
+        told[name] = Value(float(getattr(course.bench.start.effect(effect), name)), None, None)
+    course.steps.append(Step(change, told, course.misfit, 0.0, "mean rate +0.00%"))
+    course.rung(f"{title(change)} as it was")
 
 
 def _started(course: Course, change: Change) -> Tried:

@@ -487,8 +487,11 @@ def settled(
     *,
     start: Mapping[Key, float] | None = None,
     errors: Mapping[Key, float] | None = None,
+    mapped: bool = False,
 ) -> Exact | str:
     """What some changes' numbers are, by the likelihood of these recordings; in a word what stands in the way of it.
+
+    mapped: pixels have rates of their own that are not exactly known. Then no number that changes a rate is settled.
 
     start: values of their dials that are nearly right; without them places are tried. errors: of coordinates of dials,
     about (1 sigma). A dial that nothing follows has the interval in which it is looked for.
@@ -521,6 +524,8 @@ def settled(
     if start is not None:
         u, scales = placed({**given, **start}), {**widths, **(errors or {})}
         function.begin(u)
+        if mapped and not function.own:
+            return "maps beside what changes the rates"
         top = topped(function, u, np.array([scales[d.key] for d in dials]), ends, _FAR)
     if top is None:
         u, scale = placed(given), np.array([widths[d.key] for d in dials])

@@ -111,6 +111,8 @@ def _telling(bench: Bench, state: State, moved: Moved) -> tuple[str, ...]:
         if cell[0] in told:
             told[cell[0]] += float(t @ t)
     best = sorted(told, key=lambda id: -told[id])
+    if not best:  # means alone: nothing was simulated
+        return ()
     so_far = np.cumsum([told[id] for id in best])
     return tuple(best[: 1 + int(np.searchsorted(so_far, _MOST_OF * so_far[-1]))])
 

@@ -16,6 +16,7 @@ _CLEAR = 1e-3  # p-value of a line, all frequencies that were looked at taken in
 _MOST = 2  # lines
 _APART = 2.5  # bins of the shortest capture between two lines
 _BESIDE, _OWN = 12, 3.0  # bins to each side that are alike; standard deviations of a line that the model has
+_NEXT, _RAISED = 2, 3.0  # bins to each side that a line leaks into; standard deviations of bins beside that are raised
 _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 
@@ -82,12 +83,20 @@ def lines(bench: Bench, state: State) -> list[Line]:
 
 def _surprise(null: Null, power: np.ndarray, z: np.ndarray, total: float) -> np.ndarray:
     """-log p of each bin. What the model's few recordings have there is known better from the bins beside it, unless
-    they have a line of their own."""
+    they have a line of their own. Where the data have more all around, a line must stand out of that: a lamp that
+    fluctuates has no line."""
     expected, _ = null.expected(total)
     beside = ndimage.uniform_filter1d(expected, 2 * _BESIDE + 1, mode="nearest")
     own = expected > beside * (1 + _OWN / math.sqrt(null.recordings))
     many = null.recordings * 2 * _BESIDE
-    return np.where(own, -stats.norm.logsf(z), many * np.log1p(power / np.maximum(beside, 1e-30) / many))
+    ratio = power / np.maximum(beside, 1e-30)
+    around = 2 * (_BESIDE - _NEXT)
+    whole, near = (ndimage.uniform_filter1d(ratio, 2 * k + 1) * (2 * k + 1) for k in (_BESIDE, _NEXT))
+    level = (whole - near) / around
+    raised = level > 1 + _RAISED / math.sqrt(around)
+    alone = np.where(own, -stats.norm.logsf(z), many * np.log1p(ratio / many))
+    beyond = power / np.maximum(np.where(own, expected, beside), 1e-30) / np.maximum(level, 1.0)
+    return np.where(raised, around * np.log1p(beyond / around), alone)
 
 
 def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:

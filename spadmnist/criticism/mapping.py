@@ -109,13 +109,13 @@ class _Line:
     def __init__(self, bench: Bench, id: str, level: float):
         self.seen, self.id, self.level = bench.seen[id], id, level
         self.conditions = self.seen.capture.conditions
-        self.frames = self.seen.capture.modality != "tr"
+        self.frames = not self.seen.capture.counts_events
 
     def expected(self, sensor: Sensor) -> np.ndarray:
         if self.seen.capture.light.dark:
             sensor = InTheDark.of(sensor)
         light = np.full((1, sensor.layout.pixels), self.level)
-        if not self.frames or (self.conditions.counting == "counter" and self.seen.capture.modality == "counts"):
+        if not self.frames:
             return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
         return np.maximum(self.conditions.frames * in_frames(sensor, light, self.conditions)[0], 1e-9)
 
@@ -496,16 +496,21 @@ def _spread_p(map_: Map) -> float:
     return float(stats.chi2.sf(float(z.sum()), int(told.sum()) - 1))
 
 
-def summary(map_: Map) -> dict[str, float]:
-    """sigma, low_fraction, low_ratio, high_fraction of a map."""
-    ratio = np.exp(map_.estimate - _middle(map_.estimate))
+def odd(map_: Map) -> tuple[np.ndarray, np.ndarray]:
+    """(groups,) bool: which are far below all others, and which far above."""
     inner = map_.estimate - _middle(map_.estimate)
     # of the bulk: beyond its noise, without the odd pixels
     width = 1.4826 * float(np.median(np.abs(map_.raw - np.median(map_.raw))))
     noise = float(np.median(map_.raw_error))
     bulk = math.sqrt(max(width**2 - noise**2, 0.0))
     beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
-    low, high = inner < -beyond, inner > beyond
+    return inner < -beyond, inner > beyond
+
+
+def summary(map_: Map) -> dict[str, float]:
+    """sigma, low_fraction, low_ratio, high_fraction of a map."""
+    low, high = odd(map_)
+    ratio = np.exp(map_.estimate - _middle(map_.estimate))
     rest = ~(low | high)
     spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
     return {

@@ -294,7 +294,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     expected = closed_form(InTheDark.of(sensor) if dark else sensor, capture)
     level = stated if stated is not None else level_for(expected, total, None)
     mean = max(expected(level), 1e-9)
-    share = 1.0 if capture.modality == "tr" else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
+    share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
     digits = total / sensor.layout.pixels
     rounding = _last_digit(digits) / math.sqrt(12) / max(digits, 1e-9)
     scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2)
@@ -317,7 +317,7 @@ def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
     @functools.lru_cache(maxsize=4096)
     def detections(level: float) -> float:
         light = np.full((1, sensor.layout.pixels), level)
-        if capture.modality == "tr" or (capture.modality == "counts" and conditions.counting == "counter"):
+        if capture.counts_events:
             return max(float(sensor.expected(light, conditions)[1].sum()), 1e-9)
         return max(float(conditions.frames * in_frames(sensor, light, conditions).sum()), 1e-9)
 

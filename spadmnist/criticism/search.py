@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -161,7 +161,7 @@ class Search:
         """Every candidate at its templates, the best first. everywhere: in all captures, not the telling ones alone.
 
         known: what they did to an earlier model. That is taken for what they do to this one, but where the data
-        resemble it.
+        resemble it; captures that it was not looked at in are added.
         """
         tries: list[tuple[Change, dict[Key, Any]]] = []
         for change in changes(state.sensors.one):
@@ -172,9 +172,8 @@ class Search:
         if self.only_rates(state):
             out = self._by_totals(state, tries)
         else:
-            some = () if everywhere else self.telling(state)
-            seen = set.intersection(*(t.seen for t in known)) if known else set()
-            old = self._still(state, tries, known) if everywhere or set(some) <= seen else []
+            some = [] if everywhere else self.telling(state)
+            old = self._completed(state, self._still(state, tries, [t for t in known if t.seen]), some or state.made)
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = old + self._raised(state, self._looked_at(state, tries, some), some)
             out += self._lowered(state, out, some)
@@ -227,6 +226,23 @@ class Search:
             if now.gain >= _PROMISING / 4:
                 promising.add((now.change.name, shape_of(now)))
         return [t for t in out if (t.change.name, shape_of(t)) not in promising]
+
+    def _completed(self, state: State, known: Sequence[Tried], wanted: Collection[str]) -> list[Tried]:
+        """Candidates with what they do in captures in which they have not been looked at, too."""
+        out = [one for one in known if set(wanted) <= one.seen]
+        groups: dict[frozenset[str], list[Tried]] = {}
+        for one in known:
+            if not set(wanted) <= one.seen:
+                sensors = state.sensors.changed(one.values, chips=one.chips)
+                groups.setdefault(frozenset(set(wanted) - one.seen), []).append(replace(one, sensors=sensors))
+        for missing, some in groups.items():
+            earlier = {id(one): one.moved for one in some}
+            for one in self._simulated(state, some, _SCAN, sorted(missing)):
+                one.moved = earlier[id(one)].beside(one.moved, missing)
+                one.seen = one.seen | missing
+                one.gain, one.times = self.line_search(state, one.moved, one.signed)
+                out.append(one)
+        return out
 
     def only_rates(self, state: State) -> bool:
         """Is nothing wrong but the totals? A line in the spectra may be what moves those of short captures."""

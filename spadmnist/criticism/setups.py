@@ -26,6 +26,7 @@ from .tried import EACH, Tried
 
 ALIKE = 6.0  # explanations so near each other cannot be told apart
 _VERIFIED = 3  # rivals that are simulated
+_MOST = 300.0  # of a logarithm: beyond any light
 _SILENT = 20.0  # detections that are missing at the end of a capture that stopped early
 
 
@@ -122,7 +123,7 @@ def entries(bench: Bench, state: State, likely: Sequence[Explanation]) -> list[d
     seen: set[tuple[str | None, str]] = set()
     for number, one in enumerate(likely):
         for factor, log, error in zip(one.factors, one.logs, one.errors, strict=True):
-            value, low, high = (plain(math.exp(log + k * error)) for k in (0.0, -1.96, 1.96))
+            value, low, high = (plain(math.exp(min(log + k * error, _MOST))) for k in (0.0, -1.96, 1.96))
             for id in factor.captures:
                 names = _names(bench, state, factor, id, float(log), float(error))
                 for name in names:
