@@ -159,12 +159,49 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     # what is left is kept if it explains nearly all, whatever its own cells have
     foul = with_residuals(end, {"neighbours": 5.0})
     course.state = foul
-    course_of.drop_mimics(course, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}))
+    course_of.drop_mimics(course, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}), True)
     assert names(course) == ["add crosstalk"]
     # and nothing is left of steps that made all of it worse
     course.state = with_residuals(end, {"intervals": 30.0})
     course_of.drop_mimics(course, start, True)
-    assert not course.steps and not course.values
+    assert not course.steps and not course.values and course.state is start
+
+
+@pytest.mark.parametrize("totals", [True, False])
+def test_totals_that_the_set_up_explains_take_no_step_away(lab, totals):
+    """Where nothing but totals fails; and what swings takes its phases with it when it goes."""
+    course = course_of.begun(bench_of(lab()))
+    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 20.0})
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    step = course.steps[0]
+    step.before = dict(start.residuals)
+    step.template = {c: np.full(len(z), 5.0 * (c == fit.RATES)) for c, z in start.residuals.items()}
+    step.template["flat", "neighbours"][:] = 1.0
+    course.state = with_residuals(course.state, {"intervals": 15.0})
+    course.state.residuals[fit.RATES][:] = 20.0
+    course.search.phases = {("flat", ("flicker", "phase")): 1.0}
+    assert course.failed
+    course_of.drop_mimics(course, start, totals)
+    assert names(course) == ([] if totals else ["add crosstalk"])
+    assert course.search.phases == ({} if totals else {("flat", ("flicker", "phase")): 1.0})
+
+
+def test_means_alone_have_limits_too(lab) -> None:
+    """Nothing was simulated, so no capture shows a trace."""
+    bench = bench_of(lab())
+    state = replace(bench.state({}), made={})
+    assert limits._telling(bench, state, Moved({}, {}, {})) == ()
+
+
+def test_a_light_that_is_not_stated_is_the_one_that_fits(lab) -> None:
+    """A longer capture of it has as many detections in a second, not those of the dark."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    flat = bench.seen["flat"].capture
+    free = replace(flat, light=replace(flat.light, level=None))
+    other = state.sensors.changed({CROSSTALK: 0.3})
+    stated, found = (advice._apart(bench, state, other, one, "flat") for one in (flat, free))
+    assert found == pytest.approx(stated, rel=0.3) and found > 1
 
 
 # --- two that look the same --------------------------------------------------------------------------------------

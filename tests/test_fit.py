@@ -12,7 +12,7 @@ from joblib import Parallel
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
-from spadmnist.criticism import candidates, fit, fitted, mapping, settling
+from spadmnist.criticism import candidates, course, fit, fitted, likelihood, mapping, recordings, settling
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.recording import Capture, Light
@@ -208,3 +208,42 @@ def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
         assert one["low"] < truth < one["high"]
         assert one["low"] < two["high"] and two["low"] < one["high"]
         assert one["high"] - one["low"] < 1.1 * (two["high"] - two["low"])
+
+
+def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
+    """The only other place that a switch has is the wrong one."""
+    sensor, captures, map_ = made
+    sensor = candidates.with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
+    monkeypatch.setattr(recordings, "REPLICATES", 16)
+    data = measured(tmp_path, sensor, captures)
+    found = fitted.fitted(sensor, data, free=["dead_time.paralyzable"], jobs=1)
+    assert found.steps[0].values["paralyzable"].value == 0 and not found.values
+    assert found.steps[0].significance == 0
+    blind = candidates.with_values(sensor, {("dead_time", "paralyzable"): True})
+    found = fitted.fitted(blind, data, free=["dead_time.paralyzable"], jobs=1)
+    assert found.steps[0].values["paralyzable"].value == 0
+    assert found.values["dead_time", "paralyzable"] is False and found.steps[0].significance > 3
+
+
+def test_beside_maps_no_number_that_changes_rates_is_settled_by_likelihood(made):
+    """Which takes the pixels' rates for known; of a dead time it need not know them."""
+    sensor, captures, _ = made
+    data = [recording for _, _, recording in captures]
+    every = {change.name: change for change in candidates.changes(sensor.settled())}
+    for name, able in (("set dead_time.duration", True), ("set dark_counts.rate", False)):
+        found = likelihood.settled(sensor.settled(), data, [every[name]], mapped=True)
+        assert isinstance(found, likelihood.Exact) == able, found
+
+
+def test_lazy_pixels_have_an_interval():
+    """Of what is left to them, by how much they differ among each other and how well each is known."""
+    rng = np.random.default_rng(2)
+    error = np.full(400, 0.02)
+    logs = 0.01 * rng.standard_normal(400)
+    logs[:16] = np.log(0.5) + 0.1 * rng.standard_normal(16)
+    one = mapping.Map(("detection", "relative"), 1.0, np.arange(400), logs, error, logs, error, 0.01)
+    told = course._map_values(one)["low_ratio"]
+    assert told.low < 0.5 < told.high
+    assert (told.high - told.low) / 2 == pytest.approx(1.96 * 0.5 * 0.1 / 4, rel=0.5)
+    logs[:16] = 0.0
+    assert course._map_values(one)["low_ratio"].low is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -153,3 +154,52 @@ def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) ->
     assert known.state.values == plain.state.values and known.misfit == plain.misfit
     for cell, z in plain.state.residuals.items():
         assert np.array_equal(known.state.residuals[cell], z)
+
+
+def test_numbers_that_were_settled_since_do_not_move_twice(lab, monkeypatch) -> None:
+    """The last step of a number is not simulated: a model that was has it where it was before that step."""
+    course = course_of.begun(bench_of(lab()))
+    before = course.state = replace(course.state, values={CROSSTALK: 0.02})
+    course.values = {CROSSTALK: 0.025}
+    duration = change_of(course.bench, "set dead_time.duration")
+    one = Tried(duration, {DURATION: 60e-9}, NOTHING, 20.0, 1.0, before.sensors)
+    seen = []
+    monkeypatch.setattr(course_of, "settle_all", lambda course, settled, known: seen.append((course.values, known)))
+    course_of.accept(course, one, 1.0)
+    course.values, course.steps, course.search.accepted = {CROSSTALK: 0.025}, [], []
+    course_of.accept(course, replace(one, state=before), 1.0)
+    assert seen == [
+        ({CROSSTALK: 0.025, DURATION: 60e-9}, None),
+        ({CROSSTALK: 0.02, DURATION: 60e-9}, before),
+    ]
+
+
+def test_a_look_at_all_captures_is_one_at_those_that_were_left_out(lab, monkeypatch) -> None:
+    """What is known of some captures is kept, what the others show is added; of totals alone nothing is known."""
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add crosstalk")
+    monkeypatch.setattr(search, "changes", lambda sensor: [change])
+    monkeypatch.setattr(Search, "begun", lambda self, state, change: [{CROSSTALK: 0.05}])
+    flat, dark = ("flat", "neighbours"), ("dark", "neighbours")
+    size = len(state.residuals[flat])
+    known = Tried(change, {CROSSTALK: 0.05}, Moved({flat: np.full(size, 3.0)}, {}, {}), 0.0, 1.0, seen={"flat"})
+    asked: list[Any] = []
+
+    def simulated(self: Search, state: Any, tried: Any, few: int, only: Any = ()) -> list[Tried]:
+        asked.append(list(only))
+        for one in tried:
+            one.moved = Moved({cell: np.full(size, 7.0) for cell in (flat, dark)}, {}, {"flat": 1.0, "dark": 2.0})
+        return list(tried)
+
+    monkeypatch.setattr(Search, "_simulated", simulated)
+    monkeypatch.setattr(Search, "_raised", lambda self, state, tried, some: tried)
+    monkeypatch.setattr(Search, "_lowered", lambda self, state, tried, some: [])
+    (one,) = (t for t in look.scan(state, everywhere=True, known=[known]))
+    assert [only for only in asked if only] == [["dark"]]
+    assert one.moved.shifts[flat][0] == 3.0 and one.moved.shifts[dark][0] == 7.0
+    assert one.moved.logs == {"dark": 2.0} and one.seen == {"flat", "dark"}
+    asked.clear()
+    totals = replace(known, moved=Moved({}, {}, {"flat": 0.1, "dark": 0.1}), seen=set())
+    (one,) = look.scan(state, everywhere=True, known=[totals])
+    assert [] in asked and one.moved.shifts[flat][0] == 7.0

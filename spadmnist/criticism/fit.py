@@ -34,7 +34,6 @@ _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point falls into the widest gap
 _LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than these are none
-_NORMAL = 30.0  # detections whose logarithm is as good as normal
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
 FEW = 4  # recordings that tell the difference between two models
@@ -457,13 +456,11 @@ class Bench:
     def _score(self, state: State, id: str, total: float, expected: float) -> float | None:
         """Standard deviations between a total and what is expected; None where the log of a level is as good as normal.
 
-        It is not where detections are few, and where the light is faint beside the dark counts.
+        It is not that of few dark counts, nor where the light is faint beside these.
         """
         null = state.rates[id]
         stated = float(null.stated or 1.0)
         if self.seen[id].capture.light.dark:
-            if null.total_at(1.0) >= _NORMAL:
-                return None
             wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
             return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
         if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):

@@ -520,12 +520,12 @@ def settled(
     def placed(there: Mapping[Key, float]) -> np.ndarray:
         return np.clip([d.coordinate(there[d.key]) for d in dials], *ends)
 
+    function.begin(placed({**given, **(start or {})}))
+    if mapped and not function.own:
+        return "maps beside what changes the rates"
     top = None
     if start is not None:
         u, scales = placed({**given, **start}), {**widths, **(errors or {})}
-        function.begin(u)
-        if mapped and not function.own:
-            return "maps beside what changes the rates"
         top = topped(function, u, np.array([scales[d.key] for d in dials]), ends, _FAR)
     if top is None:
         u, scale = placed(given), np.array([widths[d.key] for d in dials])

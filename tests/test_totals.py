@@ -1,0 +1,124 @@
+"""Totals: how far from what is expected, where detections are few and where the light is faint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from tinylab import bench_of
+
+from spadmnist.criticism import checks, compare, findings, fit, mapping, recordings
+from spadmnist.effects import Conditions
+from spadmnist.recording import Capture, Light
+
+
+def null_of(expected: Any, scatter: float) -> Any:
+    """A capture's law: level -> detections, known without error."""
+    draws = 1000
+    return recordings.CaptureNull(1.0, 1.0, np.ones(draws), expected, (0.0, 1.0), scatter, {})
+
+
+def score_of(bench: fit.Bench, state: fit.State, id: str, total: float) -> float:
+    """Standard deviations of a total, as the checks have it."""
+    seen = bench.seen[id]
+    bench.seen[id] = replace(seen, total=total)
+    state = replace(state, space=None)
+    x = bench.levels(state, [id], {id: math.log(max(total, 0.5))})[0]
+    z = x / bench.level_error(state, id)
+    bench.seen[id] = seen
+    return float(z)
+
+
+@pytest.mark.parametrize("mean", [5.6, 8.0, 15.0, 31.0, 100.0, 1000.0])
+def test_few_dark_counts_alarm_as_often_as_they_should(lab, mean: float) -> None:
+    """All totals that Poisson's law has, each with its probability: twice the level is allowed, for it is discrete."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    state.rates["dark"] = null_of(lambda level: mean * level, 1 / math.sqrt(mean))
+    totals = np.arange(int(mean + 12 * math.sqrt(mean)))
+    z = np.array([score_of(bench, state, "dark", float(n)) for n in totals])
+    assert np.all(np.diff(z) > 0)
+    for level in (1e-2, 1e-3):
+        p = stats.poisson.pmf(totals, mean)[2 * stats.norm.sf(np.abs(z)) < level].sum()
+        assert p < 2 * level
+
+
+def test_a_light_beside_which_the_dark_is_bright_is_judged_where_it_is_stated(lab) -> None:
+    """10,000 dark counts and 200 of the light: their sum is normal, the logarithm of the light's level is not."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    spread = 1 / math.sqrt(10_200)
+    state.rates["flat"] = null_of(lambda level: 10_000 + 200 * level, spread)
+    for z in (-1.5, 1.0, 2.0, 3.0, 4.0):
+        total = 10_200 * math.exp(z * spread)
+        assert score_of(bench, state, "flat", total) == pytest.approx(z, rel=0.02)
+
+
+def test_a_leak_where_hardly_anything_is_expected_is_a_total(lab) -> None:
+    bench = bench_of(lab())
+    state = bench.state({})
+    for expected, total, told in ((4.0, 400.0, True), (4.0, 3.0, False), (0.1, 400.0, False), (6.0, 0.0, True)):
+        state.rates["dark"] = null_of(lambda level, n=expected: n * level, 0.5)
+        bench.seen["dark"] = replace(bench.seen["dark"], total=total)
+        assert ("dark" in bench.rate_space(replace(state, space=None))[0]) == told
+
+
+def test_totals_have_the_share_of_false_alarms_that_compare_gives_them() -> None:
+    def block(name: str, p: float) -> checks.Block:
+        return checks.Block((name, "map"), p, 0, 0.0)
+
+    others = [block("flat", 0.5) for _ in range(50)]
+    share = compare.SHARE_OF_TOTALS * compare.FALSE_ALARM
+    for p, fails in ((0.4 * share, True), (0.6 * share, False)):
+        totals = [block("", p), block("", 0.5)]
+        assert checks.failing([*totals, *others]) == ([totals[0]] if fails else [])
+    for p, fails in ((0.9, True), (1.1, False)):  # without totals all of it is for the others
+        one = block("flat", p * compare.FALSE_ALARM / 51)
+        assert checks.failing([one, *others]) == ([one] if fails else [])
+    # false alarms of 2 totals and 50 others, all independent: of 4000 sets 40 are expected, 76 at most (1e-6)
+    rng = np.random.default_rng(1)
+    sets = rng.uniform(size=(4000, 52))
+    alarms = sum(
+        bool(checks.failing([block("" if k < 2 else "flat", float(p)) for k, p in enumerate(row)])) for row in sets
+    )
+    assert 14 < alarms < 76
+
+
+def test_a_capture_without_a_detection_says_nothing_of_the_light(lab) -> None:
+    """Neither a traceback nor a light of a millionth."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    bench.seen["flat"] = replace(bench.seen["flat"], total=0.0)
+    state.rates["flat"] = null_of(lambda level: 6.0 + level, 0.4)
+    for one in findings.nuisances(bench, state):
+        assert all(math.isfinite(one[name]) for name in ("value", "low", "high", "pull"))
+        assert one["value"] > 0.01
+
+
+def counter(frames: int) -> Capture:
+    conditions = Conditions(frames * 1e-4, frames, 1e-4, 1e-4, 500e-9, 12, "counter")
+    return Capture("flat", "counts", Light(500e-9, 1.0, "irradiance", 0.0), conditions, 500.0)
+
+
+def test_a_counter_has_more_than_one_detection_in_a_frame() -> None:
+    """Poisson's scatter, not that of frames which are full."""
+    seen = SimpleNamespace(capture=counter(100), counts=np.full(4, 500.0))
+    line = mapping._Line(SimpleNamespace(seen={"flat": seen}), "flat", 1.0)  # type: ignore[arg-type]
+    assert line.variance(np.array([500.0]), 0.0)[0] == pytest.approx(500.0)
+    assert not line.saturated(np.full(4, 500.0))
+    expected = np.array([450.0, 500.0, 550.0])
+    fit_ = [line.log_likelihood(np.full(4, x)).sum() for x in expected]
+    assert fit_[1] > max(fit_[0], fit_[2])
+
+
+def test_the_mean_of_a_counter_scatters_as_its_detections(lab, monkeypatch) -> None:
+    bench = bench_of(lab())
+    monkeypatch.setattr(recordings, "closed_form", lambda sensor, capture: lambda level: 500.0 * 256)
+    monkeypatch.setattr(recordings.twin, "photons_at", lambda capture, layout: 1.0)
+    null, _ = recordings.of_mean(bench.start, counter(100), 500.0 * 256, 16)
+    assert null.scatter == pytest.approx(1 / math.sqrt(500 * 256), rel=0.1)
