@@ -91,6 +91,18 @@ def test_a_lamp_that_fluctuates_has_no_line_but_one_that_also_swings(seed: int) 
     assert found and abs(found[0].frequency - 2000.0) < 70.0
 
 
+@pytest.mark.parametrize("bin_", [1, 3, 6, 200, BINS - 2])
+def test_a_strong_line_is_seen_wherever_it_is_and_beside_another(bin_: int) -> None:
+    """It does not raise its own neighbourhood, at neither end of the spectrum, and two do not hide each other."""
+    for others in ((), (bin_ + 8,)):
+        powers = noise(5)
+        for k in (bin_, *others):
+            powers["dark"][min(k, BINS - 1)] += 300.0
+        found = lines(*beside(powers))
+        assert found and found[0].log_p < -50
+        assert min(abs(found[0].frequency - 10.0 * (k + 1)) for k in (bin_, *others)) < 10.0
+
+
 def test_what_few_recordings_hide_their_neighbours_tell() -> None:
     """7 more in each of three bins are seen in 55 of 60 sets; each beside its own mean of 32 recordings, in 11."""
     found = [lines(*beside(swinging(seed, 200.0, 7.0))) for seed in range(60)]

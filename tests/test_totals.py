@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joblib import Parallel
 from scipy import stats
 from tinylab import bench_of
 
 from spadmnist.criticism import checks, compare, findings, fit, mapping, recordings
 from spadmnist.effects import Conditions
 from spadmnist.recording import Capture, Light
+from spadmnist.sensor import Sensor
 
 
 def null_of(expected: Any, scatter: float) -> Any:
@@ -66,6 +68,16 @@ def test_a_leak_where_hardly_anything_is_expected_is_a_total(lab) -> None:
         state.rates["dark"] = null_of(lambda level, n=expected: n * level, 0.5)
         bench.seen["dark"] = replace(bench.seen["dark"], total=total)
         assert ("dark" in bench.rate_space(replace(state, space=None))[0]) == told
+
+
+def test_a_sensor_without_dark_counts_is_not_judged_by_how_many_there_are(lab) -> None:
+    """Nothing is expected, and no factor on nothing is more: what adds some is found by all else."""
+    sensor, data = lab()
+    bare = Sensor(sensor.layout, [e for e in sensor.effects if e.name != "dark_counts"], sensor.rules)
+    bench = fit.Bench(bare, data, 0, Parallel(n_jobs=1), 16)
+    state = bench.state({})
+    assert bench.seen["dark"].total > 300 and bench.rate_space(state)[0] == ["flat"]
+    assert np.all(np.isfinite(state.residuals[fit.RATES]))
 
 
 def test_totals_have_the_share_of_false_alarms_that_compare_gives_them() -> None:

@@ -419,8 +419,10 @@ class Bench:
     @staticmethod
     def _told(null: recordings.CaptureNull, total: float) -> bool:
         """Does a total say something? Of fewer than five that are expected, if more are there."""
-        expected = null.total_at(float(null.stated or 1.0))
-        return expected >= _LEAST_TOTAL or (expected >= _NEVER and total >= _LEAST_TOTAL)
+        stated = float(null.stated or 1.0)
+        # by the closed form: the law of recordings takes none for half a detection
+        few = null.expected(stated) >= _NEVER and total >= _LEAST_TOTAL
+        return few or null.total_at(stated) >= _LEAST_TOTAL
 
     def rate_space(self, state: State) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
         """(captures, elasticities, inverse root of the covariance of the log levels, the light's part in it)."""
@@ -448,9 +450,10 @@ class Bench:
             error = max(error, 1 / math.sqrt(null.total_at(1.0)) / max(slope, 1e-3))
         stated = float(null.stated or 1.0)
         z = self._score(state, id, self.seen[id].total, null.total_at(stated))
-        if z is not None and abs(z) > _SOME:
+        if z is not None:
             level, _, _ = null.level_of(max(self.seen[id].total, 0.5))
-            error = abs(math.log(level / stated)) / abs(z)
+            apart = abs(math.log(level / stated))
+            error = apart / abs(z) if abs(z) > _SOME else max(error, apart / _SOME)
         return max(math.hypot(error, light.own_uncertainty), 1e-6)
 
     def _score(self, state: State, id: str, total: float, expected: float) -> float | None:

@@ -19,7 +19,7 @@ from .chance import LEAST_P, of_map
 from .course import Course, accept, begun, errors_known, material, settle_all
 from .findings import nuisances, remainder, traces
 from .fit import Bench, Moved, square
-from .refining import refine
+from .refining import refine, state_of
 from .settling import Settled
 from .tried import Tried
 
@@ -114,11 +114,12 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
             accept(course, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
             continue
         best = refine(bench, course.state, _started(course, change), 5)
-        gain = square(course.state.residuals) - square(best.residuals or course.state.residuals)
-        if gain <= 0 and not change.dials:  # a switch that is as it should be
-            _kept(course, change)
-        else:
-            accept(course, best, math.sqrt(max(gain, 0.0)))
+        if not change.dials:  # a switch, which may be as it should be
+            best.gain = square(course.state.residuals) - square(state_of(bench, best).residuals)
+            if best.gain <= 0:
+                _kept(course, change)
+                continue
+        accept(course, best, math.sqrt(max(best.gain, 0.0)))
     ends: dict[Key, tuple[float, float]] = {}
     dials = tuple(d for step in course.steps for d in step.dials)
     if dials:

@@ -17,6 +17,8 @@ _MOST = 2  # lines
 _APART = 2.5  # bins of the shortest capture between two lines
 _BESIDE, _OWN = 12, 3.0  # bins to each side that are alike; standard deviations of a line that the model has
 _NEXT, _RAISED = 2, 3.0  # bins to each side that a line leaks into; standard deviations of bins beside that are raised
+_AROUND = [d for d in range(-_BESIDE, _BESIDE + 1) if abs(d) > _NEXT]
+_OTHERS = 2  # of the bins beside, that may be another line
 _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 
@@ -90,13 +92,27 @@ def _surprise(null: Null, power: np.ndarray, z: np.ndarray, total: float) -> np.
     own = expected > beside * (1 + _OWN / math.sqrt(null.recordings))
     many = null.recordings * 2 * _BESIDE
     ratio = power / np.maximum(beside, 1e-30)
-    around = 2 * (_BESIDE - _NEXT)
-    whole, near = (ndimage.uniform_filter1d(ratio, 2 * k + 1) * (2 * k + 1) for k in (_BESIDE, _NEXT))
-    level = (whole - near) / around
-    raised = level > 1 + _RAISED / math.sqrt(around)
+    level, sure = _around(ratio)
+    raised = level > 1 + _RAISED / np.sqrt(sure)
     alone = np.where(own, -stats.norm.logsf(z), many * np.log1p(ratio / many))
     beyond = power / np.maximum(np.where(own, expected, beside), 1e-30) / np.maximum(level, 1.0)
-    return np.where(raised, around * np.log1p(beyond / around), alone)
+    return np.where(raised, sure * np.log1p(beyond / sure), alone)
+
+
+def _around(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(mean of the bins on both sides of each one, but for the largest of them; how many it is of).
+
+    Of n exponential values the i-th smallest has the mean 1/n + 1/(n - 1) + ... of i terms.
+    """
+    padded = np.pad(ratio, _BESIDE, constant_values=np.nan)
+    around = np.sort([padded[_BESIDE + d : _BESIDE + d + ratio.size] for d in _AROUND], axis=0)  # nan are last
+    number = np.sum(np.isfinite(around), axis=0)
+    kept = np.maximum(number - _OTHERS, 1)
+    usual = np.ones(len(_AROUND) + 1)
+    for n in range(_OTHERS + 1, usual.size):
+        usual[n] = np.cumsum(1 / np.arange(n, _OTHERS, -1.0)).mean()
+    total = np.nansum(np.where(np.arange(len(_AROUND))[:, None] < kept, around, 0.0), axis=0)
+    return total / kept / usual[number], kept
 
 
 def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:

@@ -169,7 +169,7 @@ class Search:
                 continue  # nothing swings; and with a phase for each capture it would explain any totals
             if change.strengths or change.fixed:
                 tries += [(change, tried) for tried in self.begun(state, change)]
-        if self.only_rates(state):
+        if not everywhere and self.only_rates(state):
             out = self._by_totals(state, tries)
         else:
             some = [] if everywhere else self.telling(state)
@@ -232,7 +232,9 @@ class Search:
         out = [one for one in known if set(wanted) <= one.seen]
         groups: dict[frozenset[str], list[Tried]] = {}
         for one in known:
-            if not set(wanted) <= one.seen:
+            if set(wanted) <= one.seen:
+                continue
+            with contextlib.suppress(SpadError):  # what does not fit this model any more is looked at anew
                 sensors = state.sensors.changed(one.values, chips=one.chips)
                 groups.setdefault(frozenset(set(wanted) - one.seen), []).append(replace(one, sensors=sensors))
         for missing, some in groups.items():
@@ -264,9 +266,9 @@ class Search:
         """The best candidates at the strength that suits them, on all captures; maps beside them."""
         best: list[Tried] = []
         for one in tried:
-            if one.gain > 9 and all(b.change is not one.change for b in best):
+            if one.gain > 9 and all(b.change.name != one.change.name for b in best):
                 # of what does nearly as well, what was simulated nearest to where it does so
-                alike = [t for t in tried if t.change is one.change and t.gain > _NEARLY * one.gain]
+                alike = [t for t in tried if t.change.name == one.change.name and t.gain > _NEARLY * one.gain]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
             if len(best) == _SECOND:
                 break
