@@ -214,7 +214,7 @@ def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     """The only other place that a switch has is the wrong one."""
     sensor, captures, map_ = made
     sensor = candidates.with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
-    monkeypatch.setattr(recordings, "REPLICATES", 16)
+    monkeypatch.setattr(recordings, "REPLICATES", 8)
     data = measured(tmp_path, sensor, captures)
     found = fitted.fitted(sensor, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0 and not found.values

@@ -203,3 +203,25 @@ def test_a_look_at_all_captures_is_one_at_those_that_were_left_out(lab, monkeypa
     totals = replace(known, moved=Moved({}, {}, {"flat": 0.1, "dark": 0.1}), seen=set())
     (one,) = look.scan(state, everywhere=True, known=[totals])
     assert [] in asked and one.moved.shifts[flat][0] == 7.0
+
+
+def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow(lab) -> None:
+    """N of them that differ by sigma have a slope of sigma / root(sum u^2) of their own."""
+    course = course_of.begun(bench_of(lab(side=8)))
+    gradient, map_ = (change_of(course.bench, n) for n in ("add illumination_gradient", "per_pixel detection.pdp"))
+    x, y = ("illumination_gradient", "x"), ("illumination_gradient", "y")
+    course.values = {x: 0.05, y: 0.0}
+    dials = tuple(d for d in gradient.strengths if d.key in (x, y))
+    step = Step(gradient, {}, 1.0, 9.0, "", dials=dials)
+    pixels = np.arange(64)
+    assert map_.carrier is not None
+    maps: Any = {map_.carrier: SimpleNamespace(sigma=0.02)}
+    assert not course_of._of_pixels(course, step, maps).any()  # no map is held
+    course.search.accepted = [gradient, map_]
+    u = (pixels % 8 - 3.5) / 7
+    span = course.bench.start.layout.centred[:, 0]
+    assert np.ptp(span) == pytest.approx(np.ptp(u), rel=0.2)
+    found = np.sqrt(course_of._of_pixels(course, step, maps))
+    assert found == pytest.approx(np.full(2, 0.02 / math.sqrt(float(span @ span))), rel=0.1)
+    other = Step(change_of(course.bench, "add crosstalk"), {}, 1.0, 9.0, "", dials=dials)
+    assert not course_of._of_pixels(course, other, maps).any()

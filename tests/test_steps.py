@@ -101,6 +101,7 @@ def looked_closer(course: course_of.Course, monkeypatch: pytest.MonkeyPatch, add
 
     monkeypatch.setattr(diagnose, "_stands_out", stands_out)
     monkeypatch.setattr(diagnose, "_added", added)
+    monkeypatch.setattr(course.search, "scan", lambda *_, **__: [])
     return before, closer, diagnose._another(course, diagnose._Beside([], False))
 
 

@@ -43,7 +43,7 @@ def test_a_cell_that_some_phases_leave_alone() -> None:
     assert 0.8 < found[0] < 1.2
 
 
-@pytest.mark.parametrize(("amplitude", "seed"), [(0.3, 0), (0.12, 1)])
+@pytest.mark.parametrize(("amplitude", "seed"), [pytest.param(0.3, 0, marks=pytest.mark.slow), (0.12, 1)])
 def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> None:
     """By a trace eight times as strong, or half: 20 ms of 100 Hz, about 18,000 detections of 10,000 a pixel and s.
 

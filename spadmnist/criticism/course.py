@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ..effects import Effect
 from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
@@ -31,6 +32,7 @@ _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
 _LOST = 30.0  # in chi square: what costs so much is no step to the better
+_STEP = 0.01  # of a coordinate, for how the pixels' light follows it
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -191,9 +193,11 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
     if settled is not None:
         place = {d.key: i for i, d in enumerate(settled.dials)}
         for step in course.steps:
-            for dial in step.dials:
+            beside = _of_pixels(course, step, maps)
+            for k, dial in enumerate(step.dials):
                 i = place[dial.key]
-                u, half = float(settled.point[i]), _HALF * math.sqrt(max(float(settled.covariance[i, i]), 0.0))
+                variance = max(float(settled.covariance[i, i]), 0.0) + beside[k]
+                u, half = float(settled.point[i]), _HALF * math.sqrt(variance)
                 step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
     for step in course.steps:
@@ -205,6 +209,30 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
         for (_, name), value in step.change.fixed:
             if name not in step.values and isinstance(value, (bool, int, float)):
                 step.values[name] = Value(float(value), None, None)
+
+
+def _of_pixels(course: Course, step: Step, maps: Mapping[Key, mapping.Map]) -> np.ndarray:
+    """(dials,) variances of a light pattern's coordinates that pixels which differ by themselves make.
+
+    They have by chance a slope of their own, which no measurement tells from one of the light.
+    """
+    bench, one = course.bench, course.state.sensors.one
+    lights = [c for c in course.search.accepted if c.carrier in maps and mapping.bench_light_only(one, c)]
+    lit = [id for id, seen in bench.seen.items() if seen.counts is not None and not seen.capture.light.dark]
+    pattern = getattr(Effect.registry.find(step.change.effect), "stage", "") == "light"
+    if not (pattern and step.dials and lights and lit):
+        return np.zeros(len(step.dials))
+    id = max(lit, key=lambda i: bench.seen[i].total)
+    slopes = []
+    for dial in step.dials:
+        u = dial.coordinate(float(course.values[dial.key]))
+        ends = [dial.coordinate(dial.value(u + h)) for h in (_STEP, -_STEP)]
+        rates = [mapping.expected(bench, id, course.state, {dial.key: dial.value(end)}) for end in ends]
+        slope = (np.log(rates[0]) - np.log(rates[1])) / max(ends[0] - ends[1], 1e-12)
+        slopes.append(slope - slope.mean())
+    design = np.stack(slopes, axis=1)
+    sigma = max(maps[c.carrier].sigma for c in lights if c.carrier)
+    return sigma**2 * np.diag(np.linalg.pinv(design.T @ design, rcond=1e-6, hermitian=True))
 
 
 def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, float]:

@@ -9,7 +9,7 @@ middle is what most pixels have: the listed value may be the mean of a few hot o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -361,6 +361,11 @@ def bench_light_only(sensor: Sensor, change: Change) -> bool:
     """Does the parameter act on the light alone? Then its mean is the light level's matter."""
     kind = Effect.registry.find(change.effect)
     return getattr(kind, "stage", "") in ("light", "detection")
+
+
+def expected(bench: Bench, id: str, state: Any, values: Mapping[Key, Any]) -> np.ndarray:
+    """(pixels,) detections that a model with these values changed expects in a capture."""
+    return _Line(bench, id, state.rates[id].level).expected(with_values(state.sensors.usual(id), values))
 
 
 def levels_of(bench: Bench, state: Any) -> dict[str, float]:
