@@ -499,7 +499,7 @@ VERBS = ["generate", "reconstruct", "repair", "repair manifest"]
 
 @pytest.mark.parametrize("verb", ["generate", "repair manifest"])
 def test_killed_at_some_steps_on_the_disk(verb: str, tmp_path: Path) -> None:
-    _hammered(verb, "hdf5", tmp_path, 4)
+    _hammered(verb, "hdf5", tmp_path, 3)
 
 
 @pytest.mark.slow
@@ -619,7 +619,7 @@ def kill_and_resume(file: Path, root: Path, expected: dict[str, bytes | str], ki
 
 
 def test_killed_and_resumed(many: tuple[Path, Path], tmp_path: Path) -> None:
-    kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 3, random.Random(1))
+    kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 2, random.Random(1))
 
 
 @pytest.mark.slow

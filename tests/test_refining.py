@@ -137,7 +137,7 @@ def test_a_map_goes_unless_a_check_fails_without_it(lab, monkeypatch, without: i
 
 def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) -> None:
     """The same answer, by fewer recordings."""
-    made = lab("    crosstalk: {probability: 3 %}\n", light=400)
+    made = lab("    crosstalk: {probability: 3 %}\n")
     courses = [course_of.begun(bench_of(made)) for _ in range(2)]
     for course, weighed in zip(courses, (False, True), strict=True):
         one = given(course, "add crosstalk", {CROSSTALK: 0.03}, settle=True)

@@ -155,7 +155,7 @@ def damaged_and_repaired(made: Path, work: Path, count: int, seed: int) -> None:
 
 
 def test_some_damages(made: Path, tmp_path: Path) -> None:
-    damaged_and_repaired(made, tmp_path, 24, seed=1)
+    damaged_and_repaired(made, tmp_path, 16, seed=1)
 
 
 @pytest.mark.slow
