@@ -337,13 +337,9 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
         low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
         high = float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
         told[name] = Value(told[name].value, low, high)
-    low_ones, _ = mapping.odd(map_)
-    if low_ones.any():  # without any there is no ratio of theirs
-        mean = told["low_ratio"].value
-        own = float(np.mean(map_.error[low_ones] ** 2))
-        apart = float(np.var(map_.estimate[low_ones], ddof=1)) if low_ones.sum() > 1 else 0.0
-        half = _HALF * mean * math.sqrt(max(own, apart) / int(low_ones.sum()))
-        told["low_ratio"] = Value(mean, max(mean - half, 0.0), mean + half)
+    ratio, error = mapping.low_ratio(map_)
+    if math.isfinite(error):  # without lazy ones there is no ratio of theirs
+        told["low_ratio"] = Value(ratio, max(ratio - _HALF * error, 0.0), ratio + _HALF * error)
     return told
 
 

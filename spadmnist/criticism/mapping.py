@@ -512,16 +512,30 @@ def odd(map_: Map) -> tuple[np.ndarray, np.ndarray]:
     return inner < -beyond, inner > beyond
 
 
+def low_ratio(map_: Map) -> tuple[float, float]:
+    """(mean of the values that are far below all others, relative to the middle; its standard deviation); 1, inf
+    without any."""
+    low, _ = odd(map_)
+    if not low.any():
+        return 1.0, math.inf
+    # by themselves, as far as they tell: what keeps noise out pulls them to the others
+    told = map_.raw_error < _TELLING
+    logs = np.where(told, map_.raw, map_.estimate)[low] - _middle(map_.estimate)
+    own = float(np.mean(np.where(told, map_.raw_error, map_.error)[low] ** 2))
+    apart = float(np.var(logs, ddof=1)) if low.sum() > 1 else 0.0
+    mean = float(np.exp(logs).mean())
+    return mean, mean * math.sqrt(max(own, apart) / int(low.sum()))
+
+
 def summary(map_: Map) -> dict[str, float]:
     """sigma, low_fraction, low_ratio, high_fraction of a map."""
     low, high = odd(map_)
-    ratio = np.exp(map_.estimate - _middle(map_.estimate))
     rest = ~(low | high)
     spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
     return {
         "sigma": math.sqrt(max(float(spread), 0.0)),
         "low_fraction": float(low.mean()),
-        "low_ratio": float(ratio[low].mean()) if low.any() else 1.0,
+        "low_ratio": low_ratio(map_)[0],
         "high_fraction": float(high.mean()),
     }
 
