@@ -164,6 +164,7 @@ def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:
     assert tolerant.verdict == "adequate"
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer_from_memory_and_anew(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -286,6 +287,7 @@ def test_hidden_effects_are_seen_where_they_are(name: str) -> None:
     assert failing >= PLACES[name], PLACES[name] - failing
 
 
+@pytest.mark.slow
 @challenge
 def test_one_case_of_the_challenge_in_short() -> None:
     folder = CHALLENGE / "open-qis-gate"

@@ -497,11 +497,6 @@ def _hammered(verb: str, format: str, folder: Path, kills: int) -> None:
 VERBS = ["generate", "reconstruct", "repair", "repair manifest"]
 
 
-@pytest.mark.parametrize("verb", ["generate", "repair manifest"])
-def test_killed_at_some_steps_on_the_disk(verb: str, tmp_path: Path) -> None:
-    _hammered(verb, "hdf5", tmp_path, 3)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", VERBS)
 def test_killed_at_many_steps_on_the_disk(verb: str, format: str, tmp_path: Path) -> None:

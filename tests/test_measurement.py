@@ -768,6 +768,7 @@ def write(root, frames=4000, at=lambda start: None):
     return subprocess.run([sys.executable, "-c", head + script], capture_output=True, text=True, cwd=folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="counts in kB")
 def test_writing_takes_little_memory(tmp_path: Path) -> None:
     """A file of 131 MB, of which a part is in memory at a time."""

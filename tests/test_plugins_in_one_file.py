@@ -193,6 +193,7 @@ def test_the_mean_rate_changes_as_the_effect_says(name: str, folder: Path) -> No
     assert np.array_equal(part.tr[7:9].counts, np.concatenate([part.tr[7].counts, part.tr[8].counts]))
 
 
+@pytest.mark.slow
 def test_a_new_effect_from_listing_to_dataset(folder: Path) -> None:
     name = "lossy_bus"
     file = folder / "mine.py"
@@ -224,6 +225,7 @@ def test_a_new_effect_from_listing_to_dataset(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == ["c.yaml", f"{name}.yaml", "mine.py", "out"]
 
 
+@pytest.mark.slow
 def test_a_new_method_from_listing_to_dataset(folder: Path) -> None:
     file = folder / "mine.py"
     file.write_text(METHOD)

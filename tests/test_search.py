@@ -38,6 +38,7 @@ def test_what_both_signs_do_is_told_apart() -> None:
     assert both.at(0.5).shifts[CELL] == pytest.approx([0.5 * 4 + 0.25 * 1, 0.25 * 1])
 
 
+@pytest.mark.slow
 def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
     """Its trend has a sign, the variance of the counts has none."""
     bench = bench_of(lab("    source_drift: {slope: -0.3}\n", light=900, side=8))

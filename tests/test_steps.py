@@ -33,6 +33,7 @@ def test_a_closer_look_only_adds_recordings(lab):
         np.testing.assert_array_equal(more.made[id].totals, made.totals)
 
 
+@pytest.mark.slow
 def test_levels_are_evenly_spread_however_many_they_are(lab):
     """So that the first recordings are a fair sample of all, and every fourth of them is, too."""
     for number in (16, 32, 96):

@@ -154,10 +154,6 @@ def damaged_and_repaired(made: Path, work: Path, count: int, seed: int) -> None:
     assert not wrong, "\n".join([f"{len(wrong)} of {count}", *wrong[:30]])
 
 
-def test_some_damages(made: Path, tmp_path: Path) -> None:
-    damaged_and_repaired(made, tmp_path, 16, seed=1)
-
-
 @pytest.mark.slow
 def test_many_damages(made: Path, tmp_path: Path) -> None:
     damaged_and_repaired(made, tmp_path, 500, seed=2)
