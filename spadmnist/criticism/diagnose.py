@@ -69,7 +69,7 @@ class _Beside:
     """
 
     setup: list[dict[str, Any]]
-    explained: bool
+    explained: bool = False
     bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Tried | None = None
@@ -82,7 +82,7 @@ def _diagnosed(
     bench: Bench, measurement: Measurement, max_steps: int, quick: bool, short: Mapping[str, tuple[float, float]]
 ) -> Diagnosis:
     course = begun(bench)
-    start, beside = course.state, _Beside(_too_short(short), False)
+    start, beside = course.state, _Beside(_too_short(short))
     while len(course.steps) < max_steps and _another(course, beside):
         pass
     if course.steps:
