@@ -17,7 +17,7 @@ from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
 from .ladder import errors_of, row
-from .refining import EXCLUDED, showing
+from .refining import EXCLUDED, shown
 from .search import Search
 from .settling import Settled
 from .swings import turned
@@ -259,7 +259,7 @@ def open_ends(course: Course) -> None:
                 tests += [(step, dial, end) for end in (dial.low, dial.high) if not v.low <= end <= v.high]
     state, bench = course.state, course.bench
     models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
-    some = [showing(state, step.template) for step, _, _ in tests]
+    some = [shown(step.template) for step, _, _ in tests]
     now = square(state.residuals)
     for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW, only_of=some), strict=True):
         if not isinstance(moved, str) and square(bench.residuals(state, moved)) < now + EXCLUDED:

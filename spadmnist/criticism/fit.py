@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -27,7 +27,9 @@ from . import recordings
 from .candidates import Key, Values, on_chip, with_values
 from .nulls import Null, _standardized, learn, poisson_scores
 from .shifts import beyond_noise, difference
+from .showing import Shown
 
+T = TypeVar("T")
 Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
@@ -82,6 +84,31 @@ class State:
     exact: list[Cell]
     space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `Bench.rate_space`
     weights: dict[Cell, list[Callable[[np.ndarray], np.ndarray]]] = field(default_factory=dict)  # see `chance.along`
+    _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict)  # what many candidates need
+
+    def before(self, cell: Cell, few: int) -> tuple[np.ndarray, np.ndarray]:
+        """((few, cells) what the model's first recordings have beyond its expectation, (cells,) its scatter)."""
+
+        def make() -> tuple[np.ndarray, np.ndarray]:
+            null, made = self.nulls[cell], self.made[cell[0]]
+            beyond = made.values[cell[1]][:few] - null.expected_all(made.totals[:few])[0]
+            return beyond, _spread_of(null, made)
+
+        return self._once(("before", cell, few), make)
+
+    def usual(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
+        """What a statistic's null expects of so many detections, see `Null.expected`."""
+        return self._once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
+
+    def square(self, cell: Cell) -> float:
+        """Sum of the squared residuals of the data in one statistic."""
+        return self._once(("square", cell), lambda: float(self.residuals[cell] @ self.residuals[cell]))
+
+    def _once(self, name: tuple[Any, ...], make: Callable[[], T]) -> T:
+        if name not in self._kept:
+            self._kept[name] = make()
+        found: T = self._kept[name]
+        return found
 
 
 @dataclass
@@ -98,16 +125,21 @@ class Moved:
     nothing: bool = False
     even: Moved | None = None
 
-    def only(self, ids: Collection[str]) -> Moved:
-        """The same, seen in some captures alone; of the others, the totals."""
-        shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
-        noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
-        even = None if self.even is None else self.even.only(ids)
+    def only(self, shown: Shown) -> Moved:
+        """The same, seen in these cells alone; of captures, the totals."""
+
+        def inside(cell: Cell) -> bool:
+            names = shown.get(cell[0], ())
+            return names is None or cell[1] in names
+
+        shifts = {cell: x for cell, x in self.shifts.items() if inside(cell)}
+        noise = {cell: x for cell, x in self.noise.items() if inside(cell)}
+        even = None if self.even is None else self.even.only(shown)
         return Moved(shifts, noise, self.logs, self.nothing, even)
 
     def beside(self, other: Moved, ids: Collection[str]) -> Moved:
         """The same, and what `other` does in some captures of which this says the totals alone."""
-        there = other.only(ids)
+        there = other.only(dict.fromkeys(ids))
         logs = {**self.logs, **{id: log for id, log in other.logs.items() if id in ids}}
         even = self.even
         if even is not None or there.even is not None:
@@ -193,16 +225,16 @@ def _task(
     numbers: np.ndarray,
     seed: int,
     dead: float,
-    hasty: bool = False,
+    names: Collection[str] | None = None,
 ) -> Made | str:
     """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each.
 
-    hasty: without statistics that cost much.
+    names: of these statistics; None: all.
     """
     keep_freed_memory()
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
+    known = [s for s in recordings.statistics_for(capture.modality) if names is None or s.name in names]
 
     def take(recording: Recording) -> None:
         recording = replace(recording, dead_time=dead, _kept={})
@@ -281,18 +313,21 @@ class Bench:
     # --- simulating ----------------------------------------------------------------------------------------------
 
     def simulate(
-        self, wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]], pieces: int = 1, hasty: bool = False
+        self,
+        wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]],
+        pieces: int = 1,
+        names: Sequence[Collection[str] | None] | None = None,
     ) -> list[Made | str]:
-        """Recordings for each of (sensors, capture, photons, numbers), in their order."""
+        """Recordings for each of (sensors, capture, photons, numbers), in their order. names: of its statistics."""
         tasks = []
-        for sensors, id, photons, numbers in wanted:
+        for (sensors, id, photons, numbers), some in zip(wanted, names or [None] * len(wanted), strict=True):
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             for part in parts:
                 if sensors.alike:
                     models = [recordings.Packed.of(sensors.of(id, 0))]
                 else:
                     models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
-                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, hasty))
+                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, some))
         self.simulations += sum(len(n) for _, _, _, n in wanted)
         results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
         out: list[Made | str] = []
@@ -505,25 +540,28 @@ class Bench:
         state: State,
         models: Sequence[Sensors],
         few: int = FEW,
-        only: Sequence[str] = (),
+        only: Shown | None = None,
         hasty: bool = True,
         kept: Kept = "likely",
-        only_of: Sequence[Collection[str]] | None = None,
+        only_of: Sequence[Shown | None] | None = None,
     ) -> list[Moved | str]:
         """What each of these models would change.
 
-        few: recordings of each capture; only: of some captures; hasty: without statistics that cost much; kept: of what
-        the recordings show, what is hardly ever chance (a trace), what is hardly all chance (a slope, which would be
-        too small without it), or all. only_of: captures of each model by itself.
+        few: recordings of each capture; only: of these captures, and of what they show; hasty: without statistics that
+        cost much; kept: of what the recordings show, what is hardly ever chance (a trace), what is hardly all chance
+        (a slope, which would be too small without it), or all. only_of: as `only`, of each model by itself.
         """
         numbers = np.arange(few, dtype=np.uint64)
-        ids_of = [[id for id in state.made if not some or id in some] for some in only_of or [only] * len(models)]
-        wanted = []
-        for sensors, ids in zip(models, ids_of, strict=True):
+        everything: Shown = dict.fromkeys(state.made)
+        shown_of = [everything if some is None else some for some in only_of or [only] * len(models)]
+        ids_of = [[id for id in state.made if id in shown] for shown in shown_of]
+        wanted, names = [], []
+        for sensors, ids, shown in zip(models, ids_of, shown_of, strict=True):
             for id in ids:
+                names.append(_names(self.seen[id].capture, shown[id], hasty))
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = iter(self.simulate(wanted, pieces=1, hasty=hasty))
+        results = iter(self.simulate(wanted, names=names))
         out: list[Moved | str] = []
         for sensors, ids in zip(models, ids_of, strict=True):
             made = {id: next(results) for id in ids}
@@ -560,14 +598,13 @@ class Bench:
                 nothing = nothing and np.array_equal(values, base.values[name][some])
                 # chips with odd pixels may have many more detections; so far off no expectation was learnt
                 learnt = np.clip(other.totals, base.totals.min(), base.totals.max())
-                new = values - np.stack([null.expected(t)[0] for t in learnt])
-                old = base.values[name][some] - np.stack([null.expected(t)[0] for t in base.totals[some]])
-                spread = _spread_of(null, base)
+                new = values - null.expected_all(learnt)[0]
+                old, spread = state.before(cell, len(some))
                 shift, left, beta = difference(new, old, spread)
                 if kept != "all":
                     # where the recordings have nothing in common, the null's own chance is in the shift, too
                     chance = left + 3.0 * (1 - beta) / null.recordings
-                    usual_here = null.expected(float(base.totals.mean()))[0]
+                    usual_here, _ = state.usual(cell, float(base.totals.mean()))
                     shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
@@ -588,8 +625,14 @@ class Bench:
             if cell not in moved.shifts:
                 out[cell] = state.residuals[cell]
                 continue
-            out[cell] = _judged(null, values, seen.total, moved.shifts[cell], moved.noise.get(cell, 0.0) * noisy)
+            usual = state.usual(cell, seen.total)
+            out[cell] = _judged(null, values, usual, moved.shifts[cell], moved.noise.get(cell, 0.0) * noisy)
         return out
+
+    def gain(self, state: State, moved: Moved, times: float = 1.0) -> float:
+        """By how much the squares of the data's residuals fall if the shifts were `times` as large."""
+        found = self.residuals(state, moved, times)
+        return sum(state.square(cell) - float(z @ z) for cell, z in found.items() if z is not state.residuals[cell])
 
     def size(self, state: State, moved: Moved) -> float:
         """Standard deviations of what a model would change."""
@@ -598,7 +641,8 @@ class Bench:
     def judged(self, state: State, cell: Cell, shift: np.ndarray) -> np.ndarray:
         """The data's residuals of one block if its expectation were shifted."""
         seen = self.seen[cell[0]]
-        return _judged(state.nulls[cell], seen.summaries[cell[1]].values, seen.total, shift, 0.0)
+        usual = state.usual(cell, seen.total)
+        return _judged(state.nulls[cell], seen.summaries[cell[1]].values, usual, shift, 0.0)
 
     def template(self, state: State, moved: Moved) -> dict[Cell, np.ndarray]:
         """The residuals that a model at this state would see in data of the other."""
@@ -610,17 +654,23 @@ class Bench:
                 out[cell] = -(root @ np.array([moved.logs.get(i, 0.0) for i in ids])) if ids else np.zeros(0)
                 continue
             null = state.nulls[cell]
-            expected, _ = null.expected(self.seen[cell[0]].total)
             shift = moved.shifts.get(cell)
             if shift is None:
-                out[cell] = np.zeros(len(expected))
+                out[cell] = np.zeros(len(state.residuals[cell]))
                 continue
+            expected, _ = state.usual(cell, self.seen[cell[0]].total)
             scale = null.spread_at(expected)
             if null.law == "exponential":
                 out[cell] = shift / np.maximum(expected, 1e-9)
             else:
                 out[cell] = shift / np.maximum(scale, 0.5 if null.law == "poisson" else 1e-30)
         return out
+
+
+def _names(capture: Capture, shown: Collection[str] | None, hasty: bool) -> list[str]:
+    """The statistics that are looked at: all, or those that show something; hasty: without those that cost much."""
+    known = recordings.statistics_for(capture.modality)
+    return [s.name for s in known if (shown is None or s.name in shown) and not (hasty and s.costly)]
 
 
 def _joined(parts: Sequence[Made]) -> Made:
@@ -635,12 +685,10 @@ def _joined(parts: Sequence[Made]) -> Made:
 
 def _own(null: Null, made: Made, values: np.ndarray) -> np.ndarray:
     """(recordings, cells) residuals of the model's own recordings."""
-    out = []
-    for v, total in zip(values, made.totals, strict=True):
-        expected, leverage = null.expected(float(total))
-        z = _standardized(null.law, v, expected, null.spread, -min(leverage, 0.9), null.recordings, null.scaled)
-        out.append(z / null.factor)
-    return np.stack(out)
+    expected, leverage = null.expected_all(made.totals)
+    close = -np.minimum(leverage, 0.9)[:, None]
+    z = _standardized(null.law, values, expected, null.spread, close, null.recordings, null.scaled)
+    return np.asarray(z / null.factor)
 
 
 def _spread_of(null: Null, made: Made) -> np.ndarray:
@@ -648,13 +696,14 @@ def _spread_of(null: Null, made: Made) -> np.ndarray:
     return np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
 
 
-def _judged(null: Null, values: np.ndarray, total: float, shift: np.ndarray, noise: float) -> np.ndarray:
-    usual, leverage = null.expected(total)
-    expected = usual + shift
+def _judged(
+    null: Null, values: np.ndarray, usual: tuple[np.ndarray, float], shift: np.ndarray, noise: float
+) -> np.ndarray:
+    expected, leverage = usual[0] + shift, usual[1]
     if null.law in ("poisson", "exponential"):
         expected = np.maximum(expected, 0.5 / null.recordings)
     if null.law == "exponential":  # detections by chance alone have their power, whatever else there is
-        expected = np.maximum(expected, _LEAST_POWER * usual)
+        expected = np.maximum(expected, _LEAST_POWER * usual[0])
     z = _standardized(null.law, values, expected, null.spread, leverage + noise, null.recordings, null.scaled)
     return np.asarray(z / null.factor)
 

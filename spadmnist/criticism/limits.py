@@ -6,18 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from . import fit
 from .answer import plain
 from .chance import along
-from .fit import Bench, Moved, State
+from .fit import State
 from .search import Search
+from .showing import Shown, showing
 from .tried import Tried
 
 _ONE_SIDED = 1.645  # 95 %
 _CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a trace that chance does not hide, and of one that it does
-_MOST_OF = 0.9  # of the square of a trace, which so many captures show
+_UNSEEN = 0.1  # of the square of a trace: how it grows, the rest tells
 _SATURATED = 1000.0  # of a trace that hardly grows any more
 _LOOKS = 5  # at other strengths, until that is found
 
@@ -72,11 +71,11 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
     out: dict[tuple[str, int], float] = {}
     open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
     needed: dict[tuple[str, int], float] = {}
-    where: dict[tuple[str, int], tuple[str, ...]] = {}
+    where: dict[tuple[str, int], Shown] = {}
     for name, (times, size, one) in weakest.items():
         out[name] = times
         if size > 2 * _CLEARLY:
-            where[name] = _telling(bench, state, one.moved)
+            where[name] = showing(bench.template(state, one.moved), _UNSEEN)
             seen = along(bench, state, one.moved.only(where[name])).size
             needed[name] = times * seen
             open_[name] = 1.0, seen, _CLEARLY / seen
@@ -102,19 +101,6 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
             elif there > 6 * _CLEARLY:
                 open_[name] = try_, there, try_ * _CLEARLY / there
     return out
-
-
-def _telling(bench: Bench, state: State, moved: Moved) -> tuple[str, ...]:
-    """The captures that show most of what a model changes."""
-    told = dict.fromkeys(state.made, 0.0)
-    for cell, t in bench.template(state, moved).items():
-        if cell[0] in told:
-            told[cell[0]] += float(t @ t)
-    best = sorted(told, key=lambda id: -told[id])
-    if not best:  # means alone: nothing was simulated
-        return ()
-    so_far = np.cumsum([told[id] for id in best])
-    return tuple(best[: 1 + int(np.searchsorted(so_far, _MOST_OF * so_far[-1]))])
 
 
 def _strength(one: Tried, times: float) -> float | None:

@@ -61,12 +61,17 @@ class Null:
 
     def expected(self, total: float) -> tuple[np.ndarray, float]:
         """((cells,) expectation for a capture with so many detections, relative variance of that expectation)."""
-        terms = _terms(np.array([total / self.middle - 1.0]), len(self.coefficients))
-        expected = (terms @ self.coefficients)[0]
+        expected, leverage = self.expected_all(np.array([total]))
+        return expected[0], float(leverage[0])
+
+    def expected_all(self, totals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `expected`, for several captures: ((captures, cells), (captures,))."""
+        terms = _terms(totals / self.middle - 1.0, len(self.coefficients))
+        expected = terms @ self.coefficients
         if self.law == "poisson":
             # what none of the recordings had may still be there once in a while
             expected = np.maximum(expected, 0.5 / self.recordings)
-        return expected, float((terms @ self.inverse @ terms.T)[0, 0])
+        return expected, np.einsum("ij,jk,ik->i", terms, self.inverse, terms)
 
     def judge(self, values: np.ndarray, total: float) -> Judgement:
         """values: (cells,) of the measured summary; total: detections of its capture."""

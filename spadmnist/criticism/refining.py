@@ -13,11 +13,12 @@ from . import checks, fit, settling
 from .candidates import Dial, Key
 from .fit import RATES, Bench, Cell, State, square, stacked
 from .settling import Settled
+from .showing import Shown, showing
 from .swings import NEAR, turned
 from .tried import Tried, is_edge, room_of
 
 _ASIDE = 0.1  # of a logarithm, for the slope of what swings
-_SHOWS = 0.01  # of the square of a trace, in a capture that tells it
+_UNSEEN = 0.01, 4.0  # of the square of a trace, by its share and by its size: where so little is, nobody looks
 STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
@@ -40,7 +41,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     given = one.scaled()
     dials = [d for d in one.change.dials if d.key in given and not d.whole]
     boost, power = _boost(bench, state, one, given)
-    some = showing(state, bench.template(state, one.moved))
+    some = shown(bench.template(state, one.moved))
 
     def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
         return settling.settle(
@@ -79,14 +80,12 @@ def state_of(bench: Bench, one: Tried) -> State:
     return one.state
 
 
-def showing(state: State, trace: Mapping[Cell, np.ndarray]) -> list[str]:
-    """The captures that show what a model does: all but those that have hardly any of its trace."""
-    share = dict.fromkeys(state.made, 0.0)
-    for (id, _), t in trace.items():
-        if id in share:
-            share[id] += float(t @ t)
-    least = _SHOWS * max(sum(share.values()), 1e-12)
-    return [id for id, x in share.items() if x >= least]
+def shown(trace: Mapping[Cell, np.ndarray]) -> Shown | None:
+    """Where numbers are settled: in all that shows what a model does, but for where hardly anything of it is.
+
+    None where nothing but totals shows it.
+    """
+    return showing(trace, *_UNSEEN) or None
 
 
 def _fails_its_own(bench: Bench, state: State, one: Tried, found: Settled) -> bool:
@@ -127,10 +126,10 @@ def _boost(bench: Bench, state: State, one: Tried, given: Mapping[Key, Any]) -> 
     return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
 
 
-def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Sequence[str]) -> Settled:
+def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Shown | None) -> Settled:
     """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge.
 
-    only: captures that are simulated for it.
+    only: what is looked at for it.
     """
     for dial in one.change.dials:
         if dial not in found.dials or not dial.log:
@@ -148,7 +147,7 @@ def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Sequen
 
 
 def _nearest(
-    bench: Bench, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float], only: Sequence[str]
+    bench: Bench, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float], only: Shown | None
 ) -> tuple[Settled, bool]:
     """(the best of the probes to both sides of a number, or what was settled; is it one of the probes?)."""
     at, before = float(found.values[dial.key]), found

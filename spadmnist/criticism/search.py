@@ -58,12 +58,11 @@ class Search:
 
     def line_search(self, state: State, moved: Moved, signed: bool) -> tuple[float, float]:
         """(gain in chi square, times the strength at which it is largest)."""
-        now = square(state.residuals)
         best = 0.0, 1.0
         tries = [*TIMES, *([-t for t in TIMES] if signed else [])]
         for _ in range(2):
             for times in tries:
-                gain = now - square(self.bench.residuals(state, moved, times))
+                gain = self.bench.gain(state, moved, times)
                 if gain > best[0]:
                     best = gain, times
             if best[0] < _PROMISING:
@@ -146,7 +145,7 @@ class Search:
         """
         down = {i: opposite for i, one in enumerate(tried) if (opposite := _opposite(state, one))}
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = self.bench.moved(state, [*models, *down.values()], few, only, kept="sure")
+        made = self.bench.moved(state, [*models, *down.values()], few, dict.fromkeys(only or state.made), kept="sure")
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):

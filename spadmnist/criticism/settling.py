@@ -14,6 +14,7 @@ import numpy as np
 
 from .candidates import Dial, Key
 from .fit import FEW, Bench, Cell, Sensors, State, stacked
+from .showing import Shown
 
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _CLOSE = 0.02  # and no nearer
@@ -57,12 +58,12 @@ def settle(
     rounds: int = 3,
     few: int = FEW,
     stronger: tuple[float, float] = (1.0, 1.0),
-    only: Sequence[str] = (),
+    only: Shown | None = None,
 ) -> Settled | str:
     """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated.
 
-    only: of these captures; the others' cells are taken not to follow. stronger: (factor, power). Of faint effects,
-    what one `factor` times as strong does is simulated, and taken for factor^power times what it does itself.
+    only: of what these captures show; all other cells are taken not to follow. stronger: (factor, power). Of what is
+    faint, what one `factor` times as strong does is simulated, and taken for factor^power times what it does itself.
     """
     dials = tuple(dials)
     keys = list(state.residuals)

@@ -44,8 +44,8 @@ def beyond_noise(
     if null.law == "exponential":
         return np.where(square > noise * _line_beyond(few, null.recordings, n), shift, 0.0)
     if not sure:
-        by_own, one = float(stats.chi2.isf(_CHANCE, n)) / n, float(stats.chi2.isf(_CHANCE_CELL, 1))
-        return shift if float(square.mean()) > noise * 1.2 * by_own else np.where(square > noise * one, shift, 0.0)
+        _, by_own, _, one = _beyond(n, 1)
+        return shift if float(square.mean()) > noise * by_own else np.where(square > noise * one, shift, 0.0)
     mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
     together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # cells that move by themselves
     by_own, by_null, one_by_own, one_by_null = _beyond(together, (few - 1) * together)
