@@ -1000,6 +1000,28 @@ def frames_first(bits, frames, rows, columns):
 
 
 @_jit
+def stamps_first(bits, offsets, ticks, none):
+    """Turn stamps pixel by pixel, one for each bit set, into frames (8 * bytes, pixels) uint32, `none` elsewhere.
+
+    bits: (pixels, bytes), most significant first; offsets: (pixels + 1,) into ticks.
+    """
+    pixels, width = bits.shape
+    out = np.full((8 * width, pixels), np.uint32(none))
+    place = offsets[:-1].copy()
+    # some pixels at a time, which share their lines of the cache
+    for first in range(0, pixels, 16):
+        for byte in range(width):
+            for p in range(first, min(first + 16, pixels)):
+                if bits[p, byte] == 0:
+                    continue
+                for bit in range(8):
+                    if (bits[p, byte] >> (7 - bit)) & 1:
+                        out[8 * byte + bit, p] = ticks[place[p]]
+                        place[p] += 1
+    return out
+
+
+@_jit
 def first_of_frames(times, offsets, frames, frame_time, frame_period):
     """Which events (events,) bool are the first of their row in a frame; the others `frame_readout` leaves out."""
     kept = np.zeros(times.size, np.bool_)

@@ -161,6 +161,11 @@ class Recording:
         """The same data under another entry."""
         return replace(self, capture=capture)
 
+    def beside(self, dead_time: float) -> Recording:
+        """The same data, beside another sensor's dead time."""
+        totals = {name: x for name, x in self._kept.items() if name == "totals"}
+        return replace(self, dead_time=dead_time, _kept=totals)
+
     def watched(self, read: Callable[[float], None]) -> Recording:
         """The same data; `read` is told which share of the frames is read, each time."""
         return self if self.frames is None else replace(self, frames=_Watched(self.frames, read))
@@ -202,6 +207,6 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
     if first.tick is None or first.ticks is None:
         raise ValueError("STR without a converter cannot be a recording: stamps are whole ticks")
     none = no_detection(capture.conditions.frame_time, first.tick)
-    stamps = np.full((layout.pixels, one.frames.frames), none, np.uint32)
-    stamps[np.unpackbits(one.frames.bits, axis=1, count=one.frames.frames).view(bool)] = first.ticks
-    return Recording(capture, layout, None, stamps.T.reshape(-1, rows, columns), first.tick, dead_time)
+    stamps = kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, none)[: one.frames.frames]
+    totals: dict[str, object] = {"totals": np.diff(first.offsets)}
+    return Recording(capture, layout, None, stamps.reshape(-1, rows, columns), first.tick, dead_time, totals)

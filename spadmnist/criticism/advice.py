@@ -115,7 +115,7 @@ def _apart(bench: Bench, known: State, other: Sensors, capture: Capture, like: s
     sensor = recordings.InTheDark.of(sensor) if capture.light.dark else sensor
     number = np.array([10_000], np.uint64)
     made: Recording = next(recordings.simulated(sensor, capture, np.array([level]), number, bench.seed))
-    made = replace(made, dead_time=bench.dead, _kept={})
+    made = made.beside(bench.dead)
     counts = np.asarray(made.totals, float)
     summaries = {}
     for statistic in recordings.statistics_for(made.modality):

@@ -20,6 +20,7 @@ from .ladder import errors_of, row
 from .refining import EXCLUDED, shown
 from .search import Search
 from .settling import Settled
+from .showing import Shown
 from .swings import turned
 from .tried import Tried
 
@@ -153,12 +154,13 @@ def _followed(
 
     None where they cannot be followed.
     """
-    bench, slopes = course.bench, _slopes_known(course)
+    bench, slopes, only = course.bench, _slopes_known(course), _shown(course)
     settled: Settled | None = None
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = settling.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
+        model = state.sensors.changed
+        closer = settling.follow(bench, state, dials, here, model, 2 * fit.FEW, errors, slopes, near, only)
         if isinstance(closer, str):
             break
         settled = closer
@@ -177,11 +179,23 @@ def _followed(
     return settled, state, maps
 
 
+def _shown(course: Course) -> Shown | None:
+    """Where any of the steps is to be seen."""
+    out: dict[str, set[str]] = {}
+    for step in course.steps:
+        some = shown(step.template)
+        if some is None:
+            return None
+        for id, names in some.items():
+            out.setdefault(id, set()).update(names)
+    return out
+
+
 def _held(course: Course, settled: Settled) -> Settled:
     """The last step of all was not simulated: it is not taken where it loses a line or an edge, as no slope knows."""
     bench, state, dials = course.bench, course.state, settled.dials
     there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
-    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
+    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW, _shown(course))
     now = square(state.residuals)
     if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
         return replace(settled, point=settling.point_of(dials, course.values))

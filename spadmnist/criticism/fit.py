@@ -237,7 +237,7 @@ def _task(
     known = [s for s in recordings.statistics_for(capture.modality) if names is None or s.name in names]
 
     def take(recording: Recording) -> None:
-        recording = replace(recording, dead_time=dead, _kept={})
+        recording = recording.beside(dead)
         totals.append(int(recording.totals.sum()))
         for statistic in known:
             summary = recordings.reduced(statistic, recording)

@@ -80,7 +80,7 @@ def state_of(bench: Bench, one: Tried) -> State:
     return one.state
 
 
-def shown(trace: Mapping[Cell, np.ndarray]) -> Shown | None:
+def shown(trace: Mapping[Cell, np.ndarray]) -> dict[str, list[str]] | None:
     """Where numbers are settled: in all that shows what a model does, but for where hardly anything of it is.
 
     None where nothing but totals shows it.

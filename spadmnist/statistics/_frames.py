@@ -195,18 +195,22 @@ def frame_sums(recording: Recording) -> np.ndarray:
     """(frames,) int64 detections of the whole array in each frame."""
     if "frame_sums" not in recording._kept:
         out = np.empty(recording.n_frames, np.int64)
-        totals = np.zeros(recording.pixels, np.int64)
+        # totals are those of the recording: its frames are read once for both
+        totals = None if "totals" in recording._kept else np.zeros(recording.pixels, np.int64)
         if recording.modality == "counts":
             for first, part in recording.chunks():
                 flat = part.reshape(len(part), -1)
                 out[first : first + len(part)] = flat.sum(axis=1, dtype=np.int64)
-                totals += flat.sum(axis=0, dtype=np.int64)
+                if totals is not None:
+                    totals += flat.sum(axis=0, dtype=np.int64)
         else:
             for first, part in bits(recording):
                 _ones(as_words(part), out[first : first + len(part)])
-                add_pixels(part, recording.layout.columns, totals)
+                if totals is not None:
+                    add_pixels(part, recording.layout.columns, totals)
         recording._kept["frame_sums"] = out
-        recording._kept.setdefault("totals", totals)  # those of the recording: its frames are read once for both
+        if totals is not None:
+            recording._kept["totals"] = totals
     return recording._kept["frame_sums"]  # type: ignore[return-value]
 
 
@@ -214,14 +218,19 @@ def add_pixels(packed: np.ndarray, columns: int, out: np.ndarray) -> None:
     """Add to out (pixels,) int64 how often each pixel has a detection in packed frames (frames, rows, bytes)."""
     words = as_words(packed)
     sums = np.zeros((words.shape[1], 64), np.int64)
-    _pixel_sums(words, sums)
-    rows, width = packed.shape[1:]
-    by_byte = sums.reshape(-1, 8)[: rows * width, ::-1]  # the first pixel of a byte is its highest bit
-    out += by_byte.reshape(rows, 8 * width)[:, :columns].ravel()
+    pixel_sums(words, sums)
+    out += by_pixel(sums, packed.shape[1:], columns)
+
+
+def by_pixel(of_bits: np.ndarray, shape: tuple[int, ...], columns: int) -> np.ndarray:
+    """(pixels,) of what belongs to the bits of words (words, 64), see `as_words`; shape: rows, bytes of a frame."""
+    rows, width = shape
+    by_byte = of_bits.reshape(-1, 8)[: rows * width, ::-1]  # the first pixel of a byte is its highest bit
+    return by_byte.reshape(rows, 8 * width)[:, :columns].ravel()
 
 
 @jit
-def _pixel_sums(words, sums):
+def pixel_sums(words, sums):
     """Add to sums (words, 64) how often each bit is set, from the lowest to the highest."""
     frames, size = words.shape
     each = np.uint64(0x0101010101010101)

@@ -94,6 +94,8 @@ def _near_ends(stamps, none, counts):
     for stamp in stamps:
         at = np.int64(stamp)
         for end, away in enumerate((at, none - 1 - at)):
+            if away >> (octaves - 1) > 0:  # as most are
+                continue
             k = 0
             while away > 0 and k < octaves:
                 away >>= 1

@@ -5,15 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import per_cent, span
-from ._frames import add_pixels, bits, frame_sums
+from ._frames import as_words, bits, by_pixel, frame_sums, pixel_sums
 from ._scores import minority, number_at, pair_scores, pairs_law, poisson_score, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 from .maps import place_of
@@ -78,22 +76,57 @@ def _of_events(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return recording.kept("block counts", make)
 
 
-def _counts_by_block(recording: Recording, blocks: int) -> Iterator[np.ndarray]:
-    """(pixels,) int64 detections in each block of equally many frames; the frames left over are left out."""
-    size = recording.n_frames // blocks
-    counts, held, done = np.zeros(recording.pixels, np.int64), 0, 0
-    for _, part in recording.chunks() if recording.modality == "counts" else bits(recording):
+def _of_frames(recording: Recording, blocks: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """As `block_counts`, of frames: (pairs (levels, pixels), inside (pixels,)), int64.
+
+    blocks: how many there are, of equally many frames each; every number is a divisor of the first. The frames left
+    over are left out.
+    """
+    size = recording.n_frames // blocks[0]
+    each = blocks[0] // np.array(blocks)  # of the shortest
+    counting = recording.modality == "counts"
+    held = pairs = inside = np.zeros((0, 0, 0), np.int64)
+    shape: tuple[int, ...] = ()
+    for first, part in recording.chunks() if counting else bits(recording):
         part = np.ascontiguousarray(part)
-        while len(part) and done < blocks:
-            taken, part = part[: size - held], part[size - held :]
-            held += len(taken)
-            if recording.modality == "counts":
-                counts += taken.reshape(len(taken), -1).sum(axis=0, dtype=np.int64)
+        cells = part.reshape(len(part), -1, 1) if counting else as_words(part)
+        if not shape:
+            shape = part.shape[1:]
+            held = np.zeros((len(blocks), cells.shape[1], 1 if counting else 64), np.int64)
+            pairs, inside = np.zeros_like(held), np.zeros_like(held[0])
+        for start in range(-(first % size), len(cells), size):  # of a block of frames, all that is in this part
+            if first + start >= blocks[0] * size:
+                break
+            some = cells[max(start, 0) : start + size]
+            if counting:
+                held[0] += some.sum(axis=0, dtype=np.int64)
             else:
-                add_pixels(taken, recording.layout.columns, counts)
-            if held == size:
-                yield counts
-                counts, held, done = np.zeros_like(counts), 0, done + 1
+                pixel_sums(some, held[0])
+            if start + size <= len(cells):
+                _end_of_block((first + start) // size + 1, each, held, pairs, inside)
+    if counting:
+        return pairs[..., 0], inside[..., 0]
+    columns = recording.layout.columns
+    return np.stack([by_pixel(one, shape, columns) for one in pairs]), by_pixel(inside, shape, columns)
+
+
+@jit
+def _end_of_block(number, each, held, pairs, inside):
+    """One of the shortest blocks, the first of `held` (levels, ...), is full: on to the longer ones.
+
+    number: of blocks that there were; each: of them make one of each level. Adds to pairs (levels, ...), inside (...).
+    """
+    for i in range(inside.shape[0]):
+        for j in range(inside.shape[1]):
+            count = held[0, i, j]
+            inside[i, j] += count
+            for level in range(each.size):
+                if level > 0:
+                    held[level, i, j] += count
+                if number % each[level] == 0:
+                    whole = held[level, i, j]
+                    pairs[level, i, j] += whole * (whole - 1) // 2
+                    held[level, i, j] = 0
 
 
 def _block_time(recording: Recording, blocks: int) -> float:
@@ -180,10 +213,7 @@ class SlowSeries(Statistic):
             pairs = by_length[_LENGTHS.index(blocks)]
         else:
             slots = slots_of_frame(recording) * (recording.n_frames // blocks)
-            pairs, inside = np.zeros(recording.pixels, np.int64), np.zeros(recording.pixels, np.int64)
-            for counts in _counts_by_block(recording, blocks):
-                pairs += counts * (counts - 1) // 2
-                inside += counts
+            (pairs,), inside = _of_frames(recording, (blocks,))
         scores, _ = pair_scores(pairs, inside, blocks, slots, shares(inside, recording.pixels))
         few = minority(0, inside, blocks, slots)[1]
 
@@ -276,21 +306,6 @@ class HotSeries(Statistic):
             return f"the {part} of pixels with the most detections, in blocks of {show(times[level], 's')}"
 
         return Summary(np.array(scores), "normal", where, size_of)
-
-
-def _of_frames(recording: Recording, blocks: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """As `block_counts`, of frames: (pairs (levels, pixels), inside (pixels,)), int64. blocks: of `_LENGTHS`."""
-    pairs = np.zeros((len(blocks), recording.pixels), np.int64)
-    inside = np.zeros(recording.pixels, np.int64)
-    held = np.zeros_like(pairs)  # the block of each length that is being filled
-    for number, counts in enumerate(_counts_by_block(recording, blocks[0]), 1):
-        inside += counts
-        held += counts
-        for level, n in enumerate(blocks):
-            if number % (blocks[0] // n) == 0:
-                pairs[level] += held[level] * (held[level] - 1) // 2
-                held[level] = 0
-    return pairs, inside
 
 
 def steady(detections: np.ndarray | float, boxes: int, slots: float, excess: float) -> float:
