@@ -175,15 +175,16 @@ def _folds(recordings: int) -> list[slice]:
 
 def _weights(state: State, key: Cell) -> list[_Weigh]:
     """Trace -> weights of the cells of a statistic, by all of the model's recordings and by those outside each fold."""
-    if key not in state.weights:
-        own = state.own[key]
-        many, cells = own.shape
-        if key == RATES or not 1 < cells <= _SMALL:
-            state.weights[key] = [lambda t: t] * (_FOLDS + 1)
-        else:
-            rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
-            state.weights[key] = [_weighing(x, cells / many) for x in [own, *rests]]
-    return state.weights[key]
+    own = state.own[key]
+    many, cells = own.shape
+    if key == RATES or not 1 < cells <= _SMALL:
+        return [lambda t: t] * (_FOLDS + 1)
+
+    def made() -> list[_Weigh]:
+        rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
+        return [_weighing(x, cells / many) for x in [own, *rests]]
+
+    return state.once(("weights", key), made)
 
 
 def _weighing(own: np.ndarray, doubt: float) -> _Weigh:

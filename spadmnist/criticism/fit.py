@@ -83,7 +83,6 @@ class State:
     own: dict[Cell, np.ndarray]
     exact: list[Cell]
     space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `Bench.rate_space`
-    weights: dict[Cell, list[Callable[[np.ndarray], np.ndarray]]] = field(default_factory=dict)  # see `chance.along`
     _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict)  # what many candidates need
 
     def before(self, cell: Cell, few: int) -> tuple[np.ndarray, np.ndarray]:
@@ -94,17 +93,18 @@ class State:
             beyond = made.values[cell[1]][:few] - null.expected_all(made.totals[:few])[0]
             return beyond, _spread_of(null, made)
 
-        return self._once(("before", cell, few), make)
+        return self.once(("before", cell, few), make)
 
     def usual(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
         """What a statistic's null expects of so many detections, see `Null.expected`."""
-        return self._once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
+        return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
 
     def square(self, cell: Cell) -> float:
         """Sum of the squared residuals of the data in one statistic."""
-        return self._once(("square", cell), lambda: float(self.residuals[cell] @ self.residuals[cell]))
+        return self.once(("square", cell), lambda: float(self.residuals[cell] @ self.residuals[cell]))
 
-    def _once(self, name: tuple[Any, ...], make: Callable[[], T]) -> T:
+    def once(self, name: tuple[Any, ...], make: Callable[[], T]) -> T:
+        """What is made of the state by name: when it is first asked for, then it is kept."""
         if name not in self._kept:
             self._kept[name] = make()
         found: T = self._kept[name]

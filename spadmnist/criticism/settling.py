@@ -21,6 +21,7 @@ _CLOSE = 0.02  # and no nearer
 _TOLD_ASIDE = (0.1, 0.7)  # the same, of slopes that are known but for their size
 _TOLD_SIZE = 2.5  # times what they are thought to be, at most
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
+_VAIN = 2  # steps in a row, with slopes of their own, that gain nothing: what is left is chance
 _BLIND = 0.05  # squared slope of a number that nothing tells
 
 
@@ -87,7 +88,7 @@ def settle(
     own = np.concatenate([state.own[k] for k in keys], axis=1)  # (recordings, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    slopes, there, damping, promised = np.zeros((0, len(dials))), u, 0.0, 0.0
+    slopes, there, damping, promised, vain = np.zeros((0, len(dials))), u, 0.0, 0.0, 0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in dials])
     seen = np.ones(len(dials), bool)  # which of the dials anything follows
@@ -109,9 +110,11 @@ def settle(
             slopes[:, seen] = _slopes(found[1:], _aside(dials, u, steps, seen), len(z), np.flatnonzero(seen))
             seen = np.einsum("ij,ij->j", slopes, slopes) >= _BLIND
         if best is None or square < best[0]:
-            best, damping = (square, u, z), damping / 3
+            best, damping, vain = (square, u, z), damping / 3, 0
         else:
-            damping = max(3 * damping, 0.3)
+            damping, vain = max(3 * damping, 0.3), vain + 1
+            if vain == _VAIN:
+                break
         square, u0, z = best
         normal = slopes.T @ slopes
         step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (slopes.T @ z)
