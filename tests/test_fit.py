@@ -103,7 +103,7 @@ class _Law:
     def __init__(self, function):
         self.function = function
 
-    def moved(self, state, models, few):
+    def moved(self, state, models, few, only=None):
         return models
 
     def residuals(self, state, model):

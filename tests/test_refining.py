@@ -84,14 +84,22 @@ def test_probes_are_for_checks_that_the_candidate_moves(lab, monkeypatch, size: 
     assert refining._fails_its_own(bench, state, one, found) == asked
 
 
-def test_captures_that_show_hardly_anything_of_it_are_left_out(lab) -> None:
-    bench = bench_of(lab())
-    state = bench.state({})
-    trace = {c: np.zeros(len(z)) for c, z in state.residuals.items()}
-    trace["dark", "intervals"][0], trace["flat", "intervals"][0] = 10.0, 0.5
-    assert refining.showing(state, trace) == ["dark"]
-    trace["flat", "intervals"][0] = 2.0
-    assert refining.showing(state, trace) == ["dark", "flat"]
+def test_what_shows_hardly_anything_of_it_is_left_out() -> None:
+    """By its share of a faint trace, and by its size beside a strong one; totals are known anyway."""
+    trace = {
+        ("dark", "intervals"): np.array([10.0, 0.0]),
+        ("flat", "intervals"): np.array([0.5]),
+        RATES: np.full(2, 9.0),
+    }
+    trace["dark", "spread"] = np.array([0.0, 0.7])
+    assert refining.shown(trace) == {"dark": ["intervals"]}
+    trace["flat", "intervals"][0] = 1.1
+    assert refining.shown(trace) == {"dark": ["intervals"], "flat": ["intervals"]}
+    trace["flat", "intervals"][0], trace["dark", "intervals"][1] = 2.0, 1000.0
+    assert refining.shown(trace) == {"dark": ["intervals"], "flat": ["intervals"]}
+    trace["flat", "intervals"][0] = 1.5
+    assert refining.shown(trace) == {"dark": ["intervals"]}
+    assert refining.shown({RATES: np.full(2, 9.0), ("flat", "spread"): np.zeros(3)}) is None
 
 
 def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numbers(lab, monkeypatch) -> None:

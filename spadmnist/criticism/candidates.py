@@ -265,4 +265,6 @@ def first_strengths(dial: Dial) -> list[float]:
         edge = dial.unit == "s" and getattr(Effect.registry.find(dial.effect), "stage", "") == "dead_time"
         moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if edge else (0.1,)
         return [min(max(off * (1 + x), dial.low), dial.high) for x in moves]
-    return [math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * whole]
+    usual = math.sqrt(dial.low * dial.high) if dial.low > 0 else dial.low + 0.2 * whole
+    # a time, too, is an edge, and a short one looks otherwise than part of a long one
+    return [usual, math.sqrt(dial.low * usual)] if dial.unit == "s" and dial.low > 0 and dial.off == 0 else [usual]

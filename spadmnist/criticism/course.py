@@ -307,7 +307,8 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
     found = likelihood.settled(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
     if isinstance(found, str):
         return
-    moved = 0.0
+    moved, sound = 0.0, not course.failed
+    before = dict(course.values), course.state, [dict(step.values) for step in course.steps]
     for step in course.steps:
         for dial in step.dials:
             value, (low, high) = found.values[dial.key], found.intervals[dial.key]
@@ -316,6 +317,12 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             course.values[dial.key] = value
     if moved > _MOVED:
         course.state = bench.state(course.values, _model(course)[0])
+        rivals = any(other.get("confused") for step in course.steps for other in step.alternatives)
+        if sound and course.failed and rivals:
+            # of laws that are as good it knows only one: where that fails, it decides nothing
+            course.values, course.state, earlier = before
+            for step, usual in zip(course.steps, earlier, strict=True):
+                step.values = usual
 
 
 def _slopes_known(course: Course) -> dict[Key, dict[Cell, np.ndarray]]:

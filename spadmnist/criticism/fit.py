@@ -83,7 +83,7 @@ class State:
     own: dict[Cell, np.ndarray]
     exact: list[Cell]
     space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `Bench.rate_space`
-    _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict)  # what many candidates need
+    _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)  # see `once`
 
     def before(self, cell: Cell, few: int) -> tuple[np.ndarray, np.ndarray]:
         """((few, cells) what the model's first recordings have beyond its expectation, (cells,) its scatter)."""

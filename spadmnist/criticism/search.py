@@ -24,7 +24,7 @@ from .chance import LEAST_P, of_map
 from .fit import Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
-from .swings import NEAR, TIMES, turned
+from .swings import NEAR, TIMES, Swing, turned
 from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
@@ -53,6 +53,7 @@ class Search:
         self.accepted: list[Change] = []
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[State, list[Line]] | None = None
+        self._swings: dict[tuple[Any, ...], tuple[Sensors, Swing | str]] = {}
 
     # --- looking -------------------------------------------------------------------------------------------------
 
@@ -122,7 +123,7 @@ class Search:
         for change, tried in tries:
             if not change.phases:
                 continue
-            swing = turned(self.bench, state, change.phases, tried, fit.FEW)
+            swing = self._turned(state, change, tried)
             if isinstance(swing, str):
                 continue
             gain, times, found = swing.suited(self.bench, state)
@@ -137,6 +138,13 @@ class Search:
                 one.chance = line.p if line else None
             out.append(one)
         return out
+
+    def _turned(self, state: State, change: Change, tried: Mapping[Key, Any]) -> Swing | str:
+        """What swings, at any phase; a closer look at the same model looks at the same recordings of it."""
+        name = change.name, tuple(sorted(tried.items()))
+        if name not in self._swings or self._swings[name][0] is not state.sensors:
+            self._swings[name] = state.sensors, turned(self.bench, state, change.phases, tried, fit.FEW)
+        return self._swings[name][1]
 
     def _simulated(self, state: State, tried: Sequence[Tried], few: int, only: Sequence[str] = ()) -> list[Tried]:
         """Candidates with what they do, but for those that cannot be simulated.

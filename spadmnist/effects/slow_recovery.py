@@ -29,7 +29,7 @@ class SlowRecovery(Effect, stage="dead_time"):
         symbol="tau_r",
         bounds=(0, None),
         off=0.0,
-        search=(0.5e-9, 200e-9),
+        search=(0.1e-9, 200e-9),
     )
 
     def sensitivity(self, u: np.ndarray) -> np.ndarray:
