@@ -207,6 +207,8 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
     if first.tick is None or first.ticks is None:
         raise ValueError("STR without a converter cannot be a recording: stamps are whole ticks")
     none = no_detection(capture.conditions.frame_time, first.tick)
+    if none >= 1 << 32:
+        raise ValueError(f"STR of frames of {capture.conditions.frame_time:g} s needs stamps of more than 32 bits")
     stamps = kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, none)[: one.frames.frames]
     totals: dict[str, object] = {"totals": np.diff(first.offsets)}
     return Recording(capture, layout, None, stamps.reshape(-1, rows, columns), first.tick, dead_time, totals)

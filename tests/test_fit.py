@@ -249,3 +249,24 @@ def test_lazy_pixels_have_an_interval():
     assert told.value == pytest.approx(np.exp(logs[:16]).mean() / np.exp(np.median(logs)), rel=2e-3)
     logs[:16] = pulled[:16] = 0.0
     assert course._map_values(one)["low_ratio"].low is None
+
+
+def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after():
+    """Squares that every point raises, whatever its slopes promise: two steps in vain are enough."""
+    asked = []
+    rng = np.random.default_rng(3)
+    dial = candidates.Dial("any", "a", "", -20.0, 20.0, 0.0)
+    cell = ("one", "cells")
+
+    class Noise(_Law):
+        def moved(self, state, models, few, only=None):
+            asked.append(len(models))
+            return models
+
+        def residuals(self, state, model, times=1.0):
+            return super().residuals(state, model)
+
+    law = Noise(lambda a: 5 + a + rng.standard_normal(30) * (1 + 3 * len(asked)))
+    state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, [])
+    settling.settle(law, state, [dial], {dial.key: 0.0}, lambda v: v, rounds=8)
+    assert sum(n > 1 for n in asked) <= 4 < 16

@@ -681,3 +681,19 @@ def test_paper_line_with_too_little_room(expected: list[float], probability: flo
     assert np.array_equal(recorded.frames.first.offsets, stamped)
     stamps = [min(round(t / tick), 10**6 - 1) for t in out[: stamped[-1]].tolist()]
     assert recorded.frames.first.ticks.tolist() == stamps
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 50), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
+def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> None:
+    """Beside a literal one; with frames, and pixels, that fill no whole bytes."""
+    rng = np.random.default_rng(seed)
+    ones = rng.random((pixels, frames)) < share
+    offsets = np.concatenate([[0], np.cumsum(ones.sum(axis=1))])
+    for kind in (np.uint16, np.uint32):
+        ticks = rng.integers(0, 1000, int(offsets[-1])).astype(kind)
+        wanted = np.full((pixels, frames), 1000, np.uint32)
+        wanted[ones] = ticks
+        found = kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, 1000)
+        assert found.dtype == np.uint32 and np.array_equal(found[:frames], wanted.T)
+        assert np.all(found[frames:] == 1000)

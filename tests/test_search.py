@@ -13,7 +13,7 @@ from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet
 from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
-from spadmnist.criticism.candidates import Dial
+from spadmnist.criticism.candidates import Dial, first_strengths
 from spadmnist.criticism.fit import Bench, Moved
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.tried import Tried
@@ -305,3 +305,13 @@ def test_near_rivals_are_compared_by_what_each_leaves_of_the_cells_that_they_mov
     alone = tried("add crosstalk", 300.0, 0.5, 0.0)
     look.weigh(state, [alone, far])
     assert alone.gain == 300.0
+
+
+def test_a_time_is_tried_short_and_long(lab) -> None:
+    """Part of what a long one does is not what a short one does; of what is no time, one strength is enough."""
+    bench = bench_of(lab())
+    recovery = change_of(bench, "add slow_recovery").strengths[0]
+    usual, short = first_strengths(recovery)
+    assert usual == pytest.approx(math.sqrt(recovery.low * recovery.high)) and recovery.low < short < usual / 5
+    (crosstalk,) = first_strengths(change_of(bench, "add crosstalk").strengths[0])
+    assert 0 < crosstalk < 1

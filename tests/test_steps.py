@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, bench_of, change_of, quiet
+from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import answer, diagnose, findings, fit, settling
+from spadmnist.criticism import answer, diagnose, findings, fit, likelihood, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved, State
@@ -101,6 +102,27 @@ def test_an_edge_that_drowns_all_else_is_tried_weaker(lab):
     assert weaker(Tried(change, {service: least}, nothing, 0.0, 1.0)) is None
     assert weaker(Tried(change_of(bench, "add crosstalk"), {CROSSTALK: 0.1}, nothing, 0.0, 1.0)) is None
     assert weaker(Tried(change_of(bench, "set dead_time.duration"), {jitter: 1e-8}, nothing, 0.0, 1.0)) is None
+
+
+def test_expectations_of_many_captures_are_those_of_each(lab):
+    bench = bench_of(lab())
+    state = bench.state({})
+    for cell, null in state.nulls.items():
+        totals = state.made[cell[0]].totals[:3]
+        expected, leverage = null.expected_all(totals)
+        for k, total in enumerate(totals):
+            one, own = null.expected(float(total))
+            np.testing.assert_allclose(expected[k], one, rtol=1e-12)
+            assert leverage[k] == pytest.approx(own)
+
+
+def test_a_gain_is_what_the_squares_fall_by(lab):
+    bench = bench_of(lab())
+    state = bench.state({})
+    (moved,) = bench.moved(state, [state.sensors.changed({CROSSTALK: 0.05})])
+    for times in (0.1, 1.0):
+        fall = fit.square(state.residuals) - fit.square(bench.residuals(state, moved, times))
+        assert bench.gain(state, moved, times) == pytest.approx(fall, rel=1e-9, abs=1e-6)
 
 
 # --- what becomes of a closer look -------------------------------------------------------------------------------
@@ -241,3 +263,22 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         with pytest.raises(StopIteration):
             diagnose._added(course, diagnose._Beside([], False), failed)  # type: ignore[arg-type]
     assert taken == [map_, other]
+
+
+@pytest.mark.parametrize("rival", [False, True])
+def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, monkeypatch, rival: bool) -> None:
+    """It moves the dead time to where checks fail: without a rival that is said, with one what was settled stays."""
+    sensor, data = lab(dead=55)
+    course = course_of.begun(bench_of((sensor, data)))
+    taken(course, "set dead_time.duration", {DURATION: 55e-9})
+    (step,), state = course.steps, course.state
+    step.alternatives = [{"confused": rival}]
+    usual, settled = dict(step.values), course.values[DURATION]
+    check = SimpleNamespace(cell=("flat", "edge_intervals"))
+    monkeypatch.setattr(course_of.Course, "failed", property(lambda self: [] if self.state is state else [check]))
+    exact = likelihood.Exact({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, [1.0])
+    monkeypatch.setattr(likelihood, "settled", lambda *_, **__: exact)
+    course_of.settle_exactly(course, data)
+    assert bool(course.failed) != rival and (course.state is state) == rival
+    assert (step.values == usual) == rival
+    assert course.values[DURATION] == (settled if rival else 50e-9) and settled != 50e-9

@@ -17,10 +17,10 @@ from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
 from .ladder import errors_of, row
-from .refining import EXCLUDED, shown
+from .refining import EXCLUDED, UNSEEN
 from .search import Search
 from .settling import Settled
-from .showing import Shown
+from .showing import Shown, captures_showing, together
 from .swings import turned
 from .tried import Tried
 
@@ -109,7 +109,8 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
             material(best),
             dials=best.settled.dials if best.settled is not None else (),
             slopes=best.settled.slopes if best.settled is not None and best.faint else {},
-            template=bench.template(before, best.moved),
+            template=bench.template(before, best.there or best.moved),
+            shown=best.shown,
             before=dict(before.residuals),
             phased=bool(best.phases),
             chips=best.chips,
@@ -180,22 +181,16 @@ def _followed(
 
 
 def _shown(course: Course) -> Shown | None:
-    """Where any of the steps is to be seen."""
-    out: dict[str, set[str]] = {}
-    for step in course.steps:
-        some = shown(step.template)
-        if some is None:
-            return None
-        for id, names in some.items():
-            out.setdefault(id, set()).update(names)
-    return out
+    """Where any of the numbers is to be seen."""
+    some = [step.shown for step in course.steps if step.dials]
+    return None if None in some else together(one for one in some if one)
 
 
 def _held(course: Course, settled: Settled) -> Settled:
     """The last step of all was not simulated: it is not taken where it loses a line or an edge, as no slope knows."""
     bench, state, dials = course.bench, course.state, settled.dials
     there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
-    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW, _shown(course))
+    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
     now = square(state.residuals)
     if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
         return replace(settled, point=settling.point_of(dials, course.values))
@@ -273,7 +268,7 @@ def open_ends(course: Course) -> None:
                 tests += [(step, dial, end) for end in (dial.low, dial.high) if not v.low <= end <= v.high]
     state, bench = course.state, course.bench
     models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
-    some = [shown(step.template) for step, _, _ in tests]
+    some = [captures_showing(step.template, UNSEEN[0]) or None for step, _, _ in tests]
     now = square(state.residuals)
     for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW, only_of=some), strict=True):
         if not isinstance(moved, str) and square(bench.residuals(state, moved)) < now + EXCLUDED:
@@ -283,7 +278,10 @@ def open_ends(course: Course) -> None:
 
 
 def settle_exactly(course: Course, measurement: Measurement) -> None:
-    """All numbers by the likelihood of the data themselves, where all that the model has is in it."""
+    """All numbers by the likelihood of the data themselves, where all that the model has is in it.
+
+    Not where checks fail at its numbers and another step would do as well.
+    """
     bench = course.bench
     wanted = [step.change for step in course.steps if step.dials]
     dials = [d for step in course.steps for d in step.dials]
@@ -307,7 +305,7 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
     found = likelihood.settled(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
     if isinstance(found, str):
         return
-    moved, sound = 0.0, not course.failed
+    moved, failed = 0.0, {block.cell for block in course.failed}
     before = dict(course.values), course.state, [dict(step.values) for step in course.steps]
     for step in course.steps:
         for dial in step.dials:
@@ -318,7 +316,7 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
     if moved > _MOVED:
         course.state = bench.state(course.values, _model(course)[0])
         rivals = any(other.get("confused") for step in course.steps for other in step.alternatives)
-        if sound and course.failed and rivals:
+        if rivals and {block.cell for block in course.failed} - failed:
             # of laws that are as good it knows only one: where that fails, it decides nothing
             course.values, course.state, earlier = before
             for step, usual in zip(course.steps, earlier, strict=True):

@@ -578,6 +578,7 @@ class Bench:
             logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
             base, some = state.made[id], other.numbers.astype(int)
+            assert some[-1] == len(some) - 1  # the model's first ones, beside its own first ones
             apart = np.log(np.maximum(other.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
             # the closed form has no scatter: where the recordings do not contradict it, it serves
             usual = state.rates[id]

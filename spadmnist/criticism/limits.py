@@ -11,8 +11,8 @@ from .answer import plain
 from .chance import along
 from .fit import State
 from .search import Search
-from .showing import Shown, showing
-from .tried import Tried
+from .showing import Shown, captures_showing
+from .tried import Tried, shape_of
 
 _ONE_SIDED = 1.645  # 95 %
 _CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a trace that chance does not hide, and of one that it does
@@ -30,26 +30,28 @@ def upper_limits(
     more would have been seen. How the trace of each grows with its strength is simulated once more.
     """
     bench = search.bench
-    shapes: dict[str, list[_Shape]] = {}
+    shapes: dict[str, dict[tuple[Any, ...], _Shape]] = {}
     for one in tried:
         change = one.change
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
         trace = along(bench, state, one.moved)
         times = (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
-        shapes.setdefault(change.effect, []).append((times, trace.size, one))
+        known = shapes.setdefault(change.effect, {})
+        if shape_of(one) not in known or known[shape_of(one)][1] < trace.size:  # of several strengths the clearest
+            known[shape_of(one)] = times, trace.size, one
     # a template that saturates does not tell which shape is the weakest
     asked = {
         (name, n): shape
         for name, all_ in shapes.items()
-        for n, shape in enumerate(all_)
-        if shape is max(all_, key=lambda s: s[0]) or min(s[1] for s in all_) > _SATURATED
+        for n, shape in enumerate(all_.values())
+        if shape is max(all_.values(), key=lambda s: s[0]) or min(s[1] for s in all_.values()) > _SATURATED
     }
     times_of = _at_limit(search, state, asked)
     excluded, hidden = [], []
     for name in shapes:
         limits = [_strength(shape[2], times_of[key]) for key, shape in asked.items() if key[0] == name]
-        dial = shapes[name][0][2].change.strengths[0]
+        dial = next(iter(shapes[name].values()))[2].change.strengths[0]
         if None in limits:
             hidden.append(name)
         else:
@@ -75,7 +77,7 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
     for name, (times, size, one) in weakest.items():
         out[name] = times
         if size > 2 * _CLEARLY:
-            where[name] = showing(bench.template(state, one.moved), _UNSEEN)
+            where[name] = captures_showing(bench.template(state, one.moved), _UNSEEN)
             seen = along(bench, state, one.moved.only(where[name])).size
             needed[name] = times * seen
             open_[name] = 1.0, seen, _CLEARLY / seen

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from . import checks, fit, settling
-from .candidates import Dial, Key
-from .fit import RATES, Bench, Cell, State, square, stacked
+from .candidates import Dial, Key, first_strengths
+from .fit import RATES, Bench, Moved, State, square, stacked
 from .settling import Settled
-from .showing import Shown, showing
+from .showing import Shown, showing, together
 from .swings import NEAR, turned
 from .tried import Tried, is_edge, room_of
 
 _ASIDE = 0.1  # of a logarithm, for the slope of what swings
-_UNSEEN = 0.01, 4.0  # of the square of a trace, by its share and by its size: where so little is, nobody looks
+UNSEEN = 0.01, 4.0  # of the square of a trace, by its share and by its size: where so little is, nobody looks
 STRONG = 60.0  # standard deviations of a trace that chance hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
@@ -41,7 +41,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     given = one.scaled()
     dials = [d for d in one.change.dials if d.key in given and not d.whole]
     boost, power = _boost(bench, state, one, given)
-    some = shown(bench.template(state, one.moved))
+    one.shown = some = _shown(bench, state, one, given)
 
     def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
         return settling.settle(
@@ -64,8 +64,13 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     if boost == 1 and _fails_its_own(bench, state, one, found):
         found = _probed(bench, state, one, found, some)
     one.faint = boost > 1
-    one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
+    if not one.faint:  # there it may do what it did not do where it was tried first
+        (there,) = bench.moved(state, [one.sensors])
+        if not isinstance(there, str):
+            one.there, residuals = there, bench.residuals(state, there)
+            found = replace(found, residuals=residuals, square=square(residuals))
+    one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.gain = square(state.residuals) - found.square
     if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
         one.gain = max(one.gain, square(state.residuals) - square(state_of(bench, one).residuals))
@@ -80,12 +85,17 @@ def state_of(bench: Bench, one: Tried) -> State:
     return one.state
 
 
-def shown(trace: Mapping[Cell, np.ndarray]) -> dict[str, list[str]] | None:
-    """Where numbers are settled: in all that shows what a model does, but for where hardly anything of it is.
+def _shown(bench: Bench, state: State, one: Tried, given: Mapping[Key, Any]) -> Mapping[str, Collection[str]] | None:
+    """Where its numbers are settled: in all that shows what it does, but for where hardly anything of it is.
 
-    None where nothing but totals shows it.
+    Of directions side by side, where any of them does something. None where nothing but totals shows it.
     """
-    return showing(trace, *_UNSEEN) or None
+    moved: list[Moved | str] = [one.moved.at(one.times)]
+    if len(one.change.strengths) > 1:
+        ways = [{**given, d.key: first_strengths(d)[0]} for d in one.change.strengths]
+        models = [state.sensors.changed(way, one.phases, one.chips) for way in ways]
+        moved += bench.moved(state, models, kept="sure")
+    return together(showing(bench.template(state, m), *UNSEEN) for m in moved if not isinstance(m, str)) or None
 
 
 def _fails_its_own(bench: Bench, state: State, one: Tried, found: Settled) -> bool:
@@ -177,6 +187,7 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     """
     dials = tuple(d for d in one.change.strengths if d.key in one.values)
     size, given = bench.size(state, one.moved.at(one.times)), one.scaled()
+    one.shown = _shown(bench, state, one, given)
     room = min(room_of(d, float(given[d.key])) for d in dials)
     stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
     strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}

@@ -24,7 +24,7 @@ from .chance import LEAST_P, of_map
 from .fit import Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
-from .swings import NEAR, TIMES, Swing, turned
+from .swings import NEAR, TIMES, turned
 from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
@@ -53,7 +53,6 @@ class Search:
         self.accepted: list[Change] = []
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[State, list[Line]] | None = None
-        self._swings: dict[tuple[Any, ...], tuple[Sensors, Swing | str]] = {}
 
     # --- looking -------------------------------------------------------------------------------------------------
 
@@ -123,7 +122,7 @@ class Search:
         for change, tried in tries:
             if not change.phases:
                 continue
-            swing = self._turned(state, change, tried)
+            swing = turned(self.bench, state, change.phases, tried, fit.FEW)
             if isinstance(swing, str):
                 continue
             gain, times, found = swing.suited(self.bench, state)
@@ -138,13 +137,6 @@ class Search:
                 one.chance = line.p if line else None
             out.append(one)
         return out
-
-    def _turned(self, state: State, change: Change, tried: Mapping[Key, Any]) -> Swing | str:
-        """What swings, at any phase; a closer look at the same model looks at the same recordings of it."""
-        name = change.name, tuple(sorted(tried.items()))
-        if name not in self._swings or self._swings[name][0] is not state.sensors:
-            self._swings[name] = state.sensors, turned(self.bench, state, change.phases, tried, fit.FEW)
-        return self._swings[name][1]
 
     def _simulated(self, state: State, tried: Sequence[Tried], few: int, only: Sequence[str] = ()) -> list[Tried]:
         """Candidates with what they do, but for those that cannot be simulated.
@@ -211,7 +203,7 @@ class Search:
         out: list[Tried] = []
         loud = [t for t in tried if self.bench.size(state, t.moved) > _LOUD]
         for _ in range(_WEAKER):
-            lower = [(t.change, down) for t in loud if (down := weaker(t))]
+            lower = [(t.change, down) for t in loud if (down := weaker(t)) and not _among(tried, t.change, down)]
             loud = [t for t in self._looked_at(state, lower, some) if self.bench.size(state, t.moved) > _SILENT]
             out += loud
             loud = [t for t in loud if self.bench.size(state, t.moved) > _LOUD]
@@ -491,6 +483,11 @@ def _scattered(sensors: Sensors, change: Change, sigma: float) -> Sensors:
         return with_values(sensor, {(effect, parameter): usual * draws})
 
     return Sensors(of, sensors.one, alike=False, typical=sensors.usual)
+
+
+def _among(tried: Sequence[Tried], change: Change, values: Mapping[Key, Any]) -> bool:
+    """Has a change been tried at these values?"""
+    return any(t.change.name == change.name and t.values == values for t in tried)
 
 
 def _opposite(state: State, one: Tried) -> Sensors | None:

@@ -21,7 +21,7 @@ _CLOSE = 0.02  # and no nearer
 _TOLD_ASIDE = (0.1, 0.7)  # the same, of slopes that are known but for their size
 _TOLD_SIZE = 2.5  # times what they are thought to be, at most
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
-_VAIN = 2  # steps in a row, with slopes of their own, that gain nothing: what is left is chance
+_VAIN = 2  # steps in a row, the second one shorter, that gain nothing: what is left is chance
 _BLIND = 0.05  # squared slope of a number that nothing tells
 
 
@@ -112,7 +112,7 @@ def settle(
         if best is None or square < best[0]:
             best, damping, vain = (square, u, z), damping / 3, 0
         else:
-            damping, vain = max(3 * damping, 0.3), vain + 1
+            damping, vain = max(3 * damping, 1.0), vain + 1
             if vain == _VAIN:
                 break
         square, u0, z = best
