@@ -270,3 +270,14 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after():
     state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, [])
     settling.settle(law, state, [dial], {dial.key: 0.0}, lambda v: v, rounds=8)
     assert sum(n > 1 for n in asked) <= 4 < 16
+
+
+def test_what_cannot_be_settled_is_told_with_what_can(made):
+    sensor, *_ = made
+    every = list(candidates.changes(sensor.settled()))
+    with pytest.raises(
+        InputError, match=r"dead_time\.durations cannot be settled here; .*Did you mean dead_time\.duration\?"
+    ):
+        fitted._named(every, "set", "dead_time", "durations")
+    with pytest.raises(InputError, match=r"crosstalks cannot be settled here; .*Did you mean crosstalk\?"):
+        fitted._named(every, "add", "crosstalks", None)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from joblib import Parallel
 from scipy import stats
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import checks, fit, likelihood, mapping, recordings, settling
@@ -168,4 +168,4 @@ def _named(every: Sequence[Change], kind: str, effect: str, parameter: str | Non
             return change
     name = effect + (f".{parameter}" if parameter else "")
     able = sorted({c.effect + (f".{c.parameter}" if c.parameter else "") for c in every if c.kind == kind})
-    raise InputError(f"{name} cannot be settled here; those that can: {', '.join(able)}")
+    raise InputError(f"{name} cannot be settled here; those that can: {', '.join(able)}.{did_you_mean(name, able)}")

@@ -129,12 +129,8 @@ def _folds(recording: Recording) -> dict[int, np.ndarray]:
                 _remainders(found.stamps, density)
         folded = {_COMMON: density}
         for whole, part in _STEPS:
-            small = part <= 1000
-            folded[part] = np.zeros(part, np.int64 if small else density.dtype)
-            if small and folded[whole].dtype == np.int64:
-                np.add.reduce(folded[whole].reshape(-1, part), axis=0, out=folded[part])
-            else:
-                _fold(folded[whole], folded[part])
+            folded[part] = np.zeros(part, density.dtype if part > 1000 else np.int64)
+            _fold(folded[whole], folded[part])
         known = recording._kept["code folds"] = {period: folded[period] for period in _FOLDS}
     return known  # type: ignore[return-value]
 
