@@ -13,8 +13,10 @@ import numpy as np
 
 from . import kernels
 from .effects import Conditions
+from .errors import InputError
 from .events import Events, Layout
 from .readout import Recorded, no_detection
+from .units import show
 
 T = TypeVar("T")
 
@@ -208,7 +210,8 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
         raise ValueError("STR without a converter cannot be a recording: stamps are whole ticks")
     none = no_detection(capture.conditions.frame_time, first.tick)
     if none >= 1 << 32:
-        raise ValueError(f"STR of frames of {capture.conditions.frame_time:g} s needs stamps of more than 32 bits")
+        frame, tick = (show(x, "s") for x in (capture.conditions.frame_time, first.tick))
+        raise InputError(f"{capture.id}: STR stamps of {tick} in frames of {frame} need more than 32 bits")
     stamps = kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, none)[: one.frames.frames]
     totals: dict[str, object] = {"totals": np.diff(first.offsets)}
     return Recording(capture, layout, None, stamps.reshape(-1, rows, columns), first.tick, dead_time, totals)

@@ -284,3 +284,19 @@ def test_no_chance_is_none_at_all(lab):
     one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
     significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e18))
     assert 0 < p < 1e-100 and math.isfinite(significance)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_several_strengths_the_clearest_tells_the_limit(lab, monkeypatch, order: int) -> None:
+    """One that is so weak that it does nothing says nothing of what can be seen."""
+    bench = bench_of(lab())
+    state, change = bench.state({}), change_of(bench, "add slow_recovery")
+    key, loud, silent = change.strengths[0].key, Moved({}, {}, {"flat": 1.0}), Moved({}, {}, {}, True)
+    tried = [Tried(change, {key: 5e-9}, loud, 0.0, 1.0), Tried(change, {key: 5e-10}, silent, 0.0, 1.0)]
+
+    def along(bench: Bench, state: fit.State, moved: Moved) -> chance.Likeness:
+        return chance.Likeness(20.0 if moved is loud else 0.0, 0.0, np.zeros(16), 1.0, 15.0)
+
+    monkeypatch.setattr(limits, "along", along)
+    (excluded,), hidden = limits.upper_limits(quiet(bench), state, tried[::order])
+    assert not hidden and excluded["upper_limit_95"] == pytest.approx(1.645 / 20 * 5e-9, rel=1e-6)

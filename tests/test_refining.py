@@ -12,7 +12,7 @@ import pytest
 from tinylab import CROSSTALK, DURATION, bench_of, change_of, given, quiet
 
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import refining, search, settling
+from spadmnist.criticism import fit, refining, search, settling
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved
 from spadmnist.criticism.search import Search
@@ -247,3 +247,17 @@ def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow
     assert found == pytest.approx(np.full(2, 0.02 / math.sqrt(float(span @ span))), rel=0.1)
     other = Step(change_of(course.bench, "add crosstalk"), {}, 1.0, 9.0, "", dials=dials)
     assert not course_of._of_pixels(course, other, maps).any()
+
+
+def test_what_is_settled_is_looked_at_everywhere(lab) -> None:
+    """Also where its first values did nothing, so that nobody looked there while it was settled."""
+    course = course_of.begun(bench_of(lab(dead=55)))
+    bench, state = course.bench, course.state
+    one = given(course, "set dead_time.duration", {DURATION: 55e-9}, True)
+    assert one.there is not None and one.settled is not None and one.residuals is not None
+    assert {cell[0] for cell in one.there.shifts} <= set(state.made)
+    again = bench.residuals(state, one.there)
+    for cell, z in again.items():
+        np.testing.assert_array_equal(one.residuals[cell], z)
+    assert one.settled.square == pytest.approx(fit.square(again))
+    assert one.gain == pytest.approx(fit.square(state.residuals) - fit.square(again))

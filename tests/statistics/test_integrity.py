@@ -33,6 +33,7 @@ from spadmnist.effects.dark_counts import DarkCounts
 from spadmnist.effects.dead_time import DeadTime
 from spadmnist.effects.detection import Detection
 from spadmnist.effects.tdc import Tdc
+from spadmnist.errors import InputError
 from spadmnist.recording import Recording, of_image
 from spadmnist.sensor import Sensor
 from spadmnist.statistics.fano import ArrayFano, PixelFano
@@ -312,6 +313,22 @@ def test_empty_and_full_data_have_the_same_cells(statistic: type) -> None:
         if "counts" in statistic.modalities:
             cells.add(len(reduced(statistic, counts_of(np.full((50, 3, 4), value), 4)).values))
     assert len(cells) == 1
+
+
+def test_stamps_that_need_more_than_32_bits_are_refused() -> None:
+    effects = [Detection(pdp=0.4), DeadTime(duration=50e-9), Tdc(resolution=1e-12)]
+    sensor = Sensor(grid(2, 2), effects, "device").settled()
+    for frame, fits in ((4.29e-3, True), (4.3e-3, False)):
+        conditions = Conditions(3 * frame, 3, frame, frame, 500e-9)
+        streams = Streams(1, "level", "train", np.arange(1, dtype=np.uint64))
+        recorded = sensor.expose(np.full((1, 4), 1e4), conditions, streams, ["str"])
+        if fits:
+            found = of_image(recorded, 0, capture("str", conditions), sensor.layout, 0.0)
+            frames = np.asarray(found.frames[:])  # type: ignore[index]
+            assert found.totals.tolist() == (frames < found.none).reshape(3, -1).sum(axis=0).tolist()
+            continue
+        with pytest.raises(InputError, match="flat: STR stamps of 1 ps in frames of 4.3 ms need more than 32 bits"):
+            of_image(recorded, 0, capture("str", conditions), sensor.layout, 0.0)
 
 
 @pytest.mark.parametrize("modality", ["tr", "qis", "str", "counts"])
