@@ -327,7 +327,7 @@ def test_stamps_that_need_more_than_32_bits_are_refused() -> None:
             frames = np.asarray(found.frames[:])  # type: ignore[index]
             assert found.totals.tolist() == (frames < found.none).reshape(3, -1).sum(axis=0).tolist()
             continue
-        with pytest.raises(InputError, match="flat: STR stamps of 1 ps in frames of 4.3 ms need more than 32 bits"):
+        with pytest.raises(InputError, match=r"flat: STR stamps of 1 ps in frames of 4\.3 ms need"):
             of_image(recorded, 0, capture("str", conditions), sensor.layout, 0.0)
 
 
