@@ -28,7 +28,7 @@ def model(rng: np.random.Generator, cells: int, common: float, recordings: int =
     return SimpleNamespace(
         residuals={CELL: draw(1)[0], RATES: np.zeros(0)},
         own={CELL: own, RATES: np.zeros((recordings, 0))},
-        weights={},
+        once=lambda name, make: make(),
         nulls={},
     )
 

@@ -502,6 +502,7 @@ def test_a_place_that_cannot_be_written(made: tuple[Path, Path], tmp_path: Path)
     assert_sentence(run("generate", made[0], "-o", tmp_path / "closed" / "out"), "closed", "-o")
 
 
+@pytest.mark.slow
 def test_a_read_only_disk(made: tuple[Path, Path], disk: Path) -> None:
     shutil.copytree(made[1], disk / "out")
     shutil.copy(made[0], disk / "c.yaml")
@@ -525,7 +526,7 @@ def test_a_read_only_disk(made: tuple[Path, Path], disk: Path) -> None:
     assert_same(disk, before)
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_full_disk(jobs: int, made: tuple[Path, Path], disk: Path) -> None:
     need = sum(-(-p.stat().st_size // 4096) * 4096 for p in made[1].rglob("*") if p.is_file())
     remount(disk, f"size={int(need * 0.7)}")
@@ -544,6 +545,7 @@ def test_a_full_disk(jobs: int, made: tuple[Path, Path], disk: Path) -> None:
     assert_same(disk / "out", complete)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_during_reconstruct(made: tuple[Path, Path], disk: Path) -> None:
     few = write_config(disk / "few.yaml", levels=("5 mlux", "2560 mlux"), methods=("counts",), train=20, test=6)
     make(few, disk / "out")
@@ -561,6 +563,7 @@ def test_a_disk_that_fills_during_reconstruct(made: tuple[Path, Path], disk: Pat
 # --- names --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_names_with_blanks_and_of_any_alphabet(made: tuple[Path, Path], tmp_path: Path) -> None:
     """Relative, with a plug-in, for every verb."""
     home = tmp_path / "Größe mit Leer 数"

@@ -631,7 +631,7 @@ def test_a_killed_worker_is_replaced(many: tuple[Path, Path], tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("whom", ["driver", "tree"])
+@pytest.mark.parametrize("whom", [pytest.param("driver", marks=pytest.mark.slow), "tree"])
 def test_interrupted_by_a_signal(number: int, status: int, whom: str, many: tuple[Path, Path], tmp_path: Path) -> None:
     """Ctrl-C goes to the whole group, a batch system's signal to the driver."""
     root = tmp_path / "out"

@@ -260,6 +260,7 @@ def test_names_in_a_manifest_lead_nowhere_else(root: Path, tmp_path: Path) -> No
 # --- what was lost ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_lost_manifest(root: Path, made: Path) -> None:
     (root / "manifest.json").unlink()
     result = run("verify", root)
@@ -305,6 +306,7 @@ def test_a_lost_manifest_and_a_lost_config(manifest: str, root: Path) -> None:
     assert_same(root, before)
 
 
+@pytest.mark.slow
 def test_a_folder_that_never_was_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "foreign").mkdir()
@@ -437,6 +439,7 @@ def test_reconstruct_makes_what_generate_makes(
     assert_same(tmp_path / "out", tree(made))
 
 
+@pytest.mark.slow
 def test_reconstruct_by_command_one_after_the_other(few: dict[int, Path], made: Path, tmp_path: Path) -> None:
     shutil.copytree(few[2], tmp_path / "out")
     for chosen in (METHODS[2:4], METHODS[4:]):
