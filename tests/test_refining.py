@@ -249,10 +249,11 @@ def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow
     assert not course_of._of_pixels(course, other, maps).any()
 
 
-def test_what_is_settled_is_looked_at_everywhere(lab) -> None:
+def test_what_is_settled_is_looked_at_everywhere(lab, monkeypatch) -> None:
     """Also where its first values did nothing, so that nobody looked there while it was settled."""
     course = course_of.begun(bench_of(lab(dead=55)))
     bench, state = course.bench, course.state
+    monkeypatch.setattr(refining, "_shown", lambda *_: {"flat": ["edge_intervals"]})
     one = given(course, "set dead_time.duration", {DURATION: 55e-9}, True)
     assert one.there is not None and one.settled is not None and one.residuals is not None
     assert {cell[0] for cell in one.there.shifts} <= set(state.made)
