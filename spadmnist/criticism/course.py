@@ -20,7 +20,7 @@ from .ladder import errors_of, row
 from .refining import EXCLUDED, UNSEEN
 from .search import Search
 from .settling import Settled
-from .showing import Shown, captures_showing, together
+from .showing import captures_showing
 from .swings import turned
 from .tried import Tried
 
@@ -155,13 +155,13 @@ def _followed(
 
     None where they cannot be followed.
     """
-    bench, slopes, only = course.bench, _slopes_known(course), _shown(course)
+    bench, slopes = course.bench, _slopes_known(course)
     settled: Settled | None = None
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
         model = state.sensors.changed
-        closer = settling.follow(bench, state, dials, here, model, 2 * fit.FEW, errors, slopes, near, only)
+        closer = settling.follow(bench, state, dials, here, model, 2 * fit.FEW, errors, slopes, near)
         if isinstance(closer, str):
             break
         settled = closer
@@ -178,12 +178,6 @@ def _followed(
             settled = replace(settled, point=settling.point_of(dials, here))
             break
     return settled, state, maps
-
-
-def _shown(course: Course) -> Shown | None:
-    """Where any of the numbers is to be seen."""
-    some = [step.shown for step in course.steps if step.dials]
-    return None if None in some else together(one for one in some if one)
 
 
 def _held(course: Course, settled: Settled) -> Settled:
