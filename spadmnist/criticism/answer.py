@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,7 +65,6 @@ class Step:
     template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     slopes: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)  # (cells, dials), where faint
-    shown: Mapping[str, Collection[str]] | None = field(default=None, repr=False)  # where its numbers are settled
 
     def as_data(self) -> dict[str, Any]:
         kind = "per_pixel" if self.change.kind == "per_pixel" else self.change.kind

@@ -110,7 +110,6 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
             dials=best.settled.dials if best.settled is not None else (),
             slopes=best.settled.slopes if best.settled is not None and best.faint else {},
             template=bench.template(before, best.there or best.moved),
-            shown=best.shown,
             before=dict(before.residuals),
             phased=bool(best.phases),
             chips=best.chips,
@@ -160,8 +159,7 @@ def _followed(
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
-        model = state.sensors.changed
-        closer = settling.follow(bench, state, dials, here, model, 2 * fit.FEW, errors, slopes, near)
+        closer = settling.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
         if isinstance(closer, str):
             break
         settled = closer

@@ -41,7 +41,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     given = one.scaled()
     dials = [d for d in one.change.dials if d.key in given and not d.whole]
     boost, power = _boost(bench, state, one, given)
-    one.shown = some = _shown(bench, state, one, given)
+    some = _shown(bench, state, one, given)
 
     def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
         return settling.settle(
@@ -187,7 +187,6 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     """
     dials = tuple(d for d in one.change.strengths if d.key in one.values)
     size, given = bench.size(state, one.moved.at(one.times)), one.scaled()
-    one.shown = _shown(bench, state, one, given)
     room = min(room_of(d, float(given[d.key])) for d in dials)
     stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
     strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .candidates import Dial, Key
-from .fit import FEW, Bench, Cell, Kept, Sensors, State, stacked
+from .fit import FEW, Bench, Cell, Sensors, State, stacked
 from .showing import Shown
 
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
@@ -179,14 +179,13 @@ def follow(
     errors: Mapping[Key, float] | None = None,
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
     before: Settled | None = None,
-    only: Shown | None = None,
 ) -> Settled | str:
     """One step of Gauss and Newton from a state that has these values: as many recordings tell it as the state has.
 
     Only how the cells follow the numbers is found from a few recordings more. errors: standard deviations of
     coordinates, as far as they are known: about an edge a slope holds no further than it is known. known: slopes of
     which only the size is not known for certain: what chance leaves in the cells of a faint effect hides the rest.
-    before: what was settled from a state near by, whose slopes still hold. only: as of `settle`.
+    before: what was settled from a state near by, whose slopes still hold.
     """
     dials = tuple(dials)
     keys = list(state.residuals)
@@ -196,7 +195,7 @@ def follow(
     if before is not None and before.dials == dials:
         slopes = np.stack([_stacked_slope(state, _of_dial(before, i), keys) for i in range(len(dials))], axis=1)
     else:
-        slopes = _slopes_about(bench, state, dials, u, values, sensors_of, few, errors or {}, known or {}, only)
+        slopes = _slopes_about(bench, state, dials, u, values, sensors_of, few, errors or {}, known or {})
     if isinstance(slopes, str):
         return slopes
     covariance = covariance_of(slopes, own)
@@ -221,7 +220,6 @@ def _slopes_about(
     few: int,
     errors: Mapping[Key, float],
     known: Mapping[Key, Mapping[Cell, np.ndarray]],
-    only: Shown | None,
 ) -> np.ndarray | str:
     """(cells, dials) how the residuals of a state follow its numbers; arguments as of `follow`."""
     keys = list(state.residuals)
@@ -237,8 +235,7 @@ def _slopes_about(
     ends: list[np.ndarray | str] = [np.zeros(0)] * len(points)
     for bare in (False, True):
         some = [k for k in range(len(points)) if (k // 2 in told) == bare]
-        kept: Kept = "all" if bare else "likely"
-        made = bench.moved(state, [sensors_of(values_there[k]) for k in some], few, only, kept=kept)
+        made = bench.moved(state, [sensors_of(values_there[k]) for k in some], few, kept="all" if bare else "likely")
         for k, m in zip(some, made, strict=True):
             if isinstance(m, str):
                 return m

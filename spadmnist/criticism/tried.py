@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,7 +47,6 @@ class Tried:
     more: tuple[Change, ...] = ()  # maps that only make sense together
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     seen: set[str] = field(default_factory=set)  # captures in which it was simulated
-    shown: Mapping[str, Collection[str]] | None = None  # where its numbers are settled, see `showing`
     there: Moved | None = None  # what it does where they are settled
 
     @property
