@@ -16,7 +16,7 @@ from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step, canonical
 from spadmnist.criticism.candidates import Key
 from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.showing import showing
+from spadmnist.criticism.showing import captures_showing
 from spadmnist.criticism.tried import Tried
 
 # --- which capture would tell ------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def test_means_alone_have_limits_too(lab) -> None:
     """Nothing was simulated, so no capture shows a trace."""
     bench = bench_of(lab())
     state = replace(bench.state({}), made={})
-    assert showing(bench.template(state, Moved({}, {}, {})), 0.1) == {}
+    assert captures_showing(bench.template(state, Moved({}, {}, {})), 0.1) == []
 
 
 def test_a_light_that_is_not_stated_is_the_one_that_fits(lab) -> None:

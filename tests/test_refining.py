@@ -16,7 +16,7 @@ from spadmnist.criticism import fit, refining, search, settling
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved
 from spadmnist.criticism.search import Search
-from spadmnist.criticism.showing import captures_showing, showing, together
+from spadmnist.criticism.showing import captures_showing
 from spadmnist.criticism.tried import Tried
 
 NOTHING = Moved({}, {}, {})
@@ -85,35 +85,18 @@ def test_probes_are_for_checks_that_the_candidate_moves(lab, monkeypatch, size: 
     assert refining._fails_its_own(bench, state, one, found) == asked
 
 
-def test_what_shows_hardly_anything_of_it_is_left_out() -> None:
-    """By its share of a faint trace, and by its size beside a strong one; totals are known anyway."""
+def test_captures_that_show_hardly_anything_of_it_are_left_out() -> None:
+    """By their share of a faint trace, and by their size beside a strong one; totals are known anyway."""
     trace = {("dark", "intervals"): np.array([10.0, 0.0]), ("flat", "intervals"): np.array([0.5])}
-    trace |= {("dark", "spread"): np.array([0.0, 0.7]), RATES: np.full(2, 9.0)}
+    trace[RATES] = np.full(2, 9.0)
     few = refining.UNSEEN
-    assert showing(trace, *few) == {"dark": ["intervals"]}
+    assert captures_showing(trace, *few) == ["dark"]
     trace["flat", "intervals"][0] = 1.1
-    assert showing(trace, *few) == {"dark": ["intervals"], "flat": ["intervals"]}
-    trace["flat", "intervals"][0], trace["dark", "intervals"][1] = 2.0, 1000.0
-    assert showing(trace, *few) == {"dark": ["intervals"], "flat": ["intervals"]}
-    trace["flat", "intervals"][0] = 1.5
-    assert showing(trace, *few) == {"dark": ["intervals"]}
-    assert list(captures_showing(trace, 1e-6)) == ["flat", "dark"] and list(captures_showing(trace, 0.1)) == ["dark"]
-    assert together([{"dark": ["a"]}, {"dark": ["b"], "flat": ["a"]}]) == {"dark": {"a", "b"}, "flat": {"a"}}
-
-
-def test_directions_side_by_side_are_settled_where_any_of_them_shows(lab) -> None:
-    """What is faint along the rows is looked for there, though it is the slope along the columns that was seen."""
-    bench = bench_of(lab(side=6, light=400))
-    state, change = bench.state({}), change_of(bench, "add illumination_gradient")
-    x = "illumination_gradient", "x"
-    (moved,) = bench.moved(state, [state.sensors.changed({x: 0.3})], kept="sure")
-    assert isinstance(moved, Moved) and ("flat", "columns") in moved.shifts
-    one = Tried(change, {**dict(change.fixed), x: 0.3}, moved, 0.0, 1.0)
-    shown = refining._shown(bench, state, one, one.scaled())
-    assert shown is not None and "rows" in shown["flat"]
-    along_x = replace(change, strengths=tuple(d for d in change.strengths if d.key == x))
-    shown = refining._shown(bench, state, replace(one, change=along_x), one.scaled())
-    assert shown is not None and "rows" not in shown["flat"]
+    assert captures_showing(trace, *few) == ["flat", "dark"]
+    trace["flat", "intervals"][0], trace["dark", "intervals"][1] = 2.1, 1000.0
+    assert captures_showing(trace, *few) == ["flat", "dark"]
+    trace["flat", "intervals"][0] = 1.9
+    assert captures_showing(trace, *few) == ["dark"]
 
 
 def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numbers(lab, monkeypatch) -> None:
@@ -253,7 +236,7 @@ def test_what_is_settled_is_looked_at_everywhere(lab, monkeypatch) -> None:
     """Also where its first values did nothing, so that nobody looked there while it was settled."""
     course = course_of.begun(bench_of(lab(dead=55)))
     bench, state = course.bench, course.state
-    monkeypatch.setattr(refining, "_shown", lambda *_: {"dark": ["spread"]})
+    monkeypatch.setattr(refining, "captures_showing", lambda *_: ["dark"])
     one = given(course, "set dead_time.duration", {DURATION: 55e-9}, True)
     assert one.there is not None and one.settled is not None and one.residuals is not None
     assert ("flat", "edge_intervals") in one.there.shifts

@@ -49,29 +49,15 @@ def test_models_may_be_looked_at_in_captures_of_their_own(lab):
     bench = bench_of(lab())
     state = bench.state({})
     models = [state.sensors.changed({CROSSTALK: x}) for x in (0.05, 0.1)]
-    mixed = bench.moved(state, models, only_of=[{"flat": None}, {"dark": None}])
+    mixed = bench.moved(state, models, only_of=[["flat"], ["dark"]])
     for moved, model, id in zip(mixed, models, ("flat", "dark"), strict=True):
-        (alone,) = bench.moved(state, [model], only={id: None})
+        (alone,) = bench.moved(state, [model], only=[id])
         assert not isinstance(moved, str) and not isinstance(alone, str)
         assert moved.shifts.keys() == alone.shifts.keys() and {cell[0] for cell in moved.shifts} == {id}
         for cell, shift in alone.shifts.items():
             np.testing.assert_array_equal(moved.shifts[cell], shift)
         assert moved.logs == alone.logs
-        assert moved.only({id: None}).shifts.keys() == moved.shifts.keys() and not moved.only({}).shifts
-
-
-def test_models_may_be_looked_at_in_some_statistics_alone(lab):
-    """These have what they have where all are looked at, and nobody has reduced the others."""
-    bench = bench_of(lab())
-    state = bench.state({})
-    model = state.sensors.changed({CROSSTALK: 0.1})
-    (whole,) = bench.moved(state, [model], only={"flat": None})
-    (some,) = bench.moved(state, [model], only={"flat": ["neighbours", "spread"]})
-    assert not isinstance(whole, str) and not isinstance(some, str)
-    assert some.logs == whole.logs and ("flat", "neighbours") in some.shifts
-    assert some.shifts.keys() == whole.only({"flat": ["neighbours", "spread"]}).shifts.keys() < whole.shifts.keys()
-    for cell, shift in some.shifts.items():
-        np.testing.assert_array_equal(shift, whole.shifts[cell])
+        assert moved.only([id]).shifts.keys() == moved.shifts.keys() and not moved.only([]).shifts
 
 
 def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monkeypatch):

@@ -260,7 +260,7 @@ def open_ends(course: Course) -> None:
                 tests += [(step, dial, end) for end in (dial.low, dial.high) if not v.low <= end <= v.high]
     state, bench = course.state, course.bench
     models = [state.sensors.changed({dial.key: end}) for _, dial, end in tests]
-    some = [captures_showing(step.template, UNSEEN[0]) or None for step, _, _ in tests]
+    some = [captures_showing(step.template, UNSEEN[0]) for step, _, _ in tests]
     now = square(state.residuals)
     for (step, dial, end), moved in zip(tests, bench.moved(state, models, 2 * fit.FEW, only_of=some), strict=True):
         if not isinstance(moved, str) and square(bench.residuals(state, moved)) < now + EXCLUDED:

@@ -27,7 +27,6 @@ from . import recordings
 from .candidates import Key, Values, on_chip, with_values
 from .nulls import Null, _standardized, learn, poisson_scores
 from .shifts import beyond_noise, difference
-from .showing import Shown
 
 T = TypeVar("T")
 Cell = tuple[str, str]  # capture, statistic
@@ -125,21 +124,16 @@ class Moved:
     nothing: bool = False
     even: Moved | None = None
 
-    def only(self, shown: Shown) -> Moved:
-        """The same, seen in these cells alone; of captures, the totals."""
-
-        def inside(cell: Cell) -> bool:
-            names = shown.get(cell[0], ())
-            return names is None or cell[1] in names
-
-        shifts = {cell: x for cell, x in self.shifts.items() if inside(cell)}
-        noise = {cell: x for cell, x in self.noise.items() if inside(cell)}
-        even = None if self.even is None else self.even.only(shown)
+    def only(self, ids: Collection[str]) -> Moved:
+        """The same, seen in some captures alone; of the others, the totals."""
+        shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
+        noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
+        even = None if self.even is None else self.even.only(ids)
         return Moved(shifts, noise, self.logs, self.nothing, even)
 
     def beside(self, other: Moved, ids: Collection[str]) -> Moved:
         """The same, and what `other` does in some captures of which this says the totals alone."""
-        there = other.only(dict.fromkeys(ids))
+        there = other.only(ids)
         logs = {**self.logs, **{id: log for id, log in other.logs.items() if id in ids}}
         even = self.even
         if even is not None or there.even is not None:
@@ -225,16 +219,16 @@ def _task(
     numbers: np.ndarray,
     seed: int,
     dead: float,
-    names: Collection[str] | None = None,
+    hasty: bool = False,
 ) -> Made | str:
     """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each.
 
-    names: of these statistics; None: all.
+    hasty: without statistics that cost much.
     """
     keep_freed_memory()
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = [s for s in recordings.statistics_for(capture.modality) if names is None or s.name in names]
+    known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
 
     def take(recording: Recording) -> None:
         recording = recording.beside(dead)
@@ -316,18 +310,18 @@ class Bench:
         self,
         wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]],
         pieces: int = 1,
-        names: Sequence[Collection[str] | None] | None = None,
+        hasty: bool = False,
     ) -> list[Made | str]:
-        """Recordings for each of (sensors, capture, photons, numbers), in their order. names: of its statistics."""
+        """Recordings for each of (sensors, capture, photons, numbers), in their order."""
         tasks = []
-        for (sensors, id, photons, numbers), some in zip(wanted, names or [None] * len(wanted), strict=True):
+        for sensors, id, photons, numbers in wanted:
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             for part in parts:
                 if sensors.alike:
                     models = [recordings.Packed.of(sensors.of(id, 0))]
                 else:
                     models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
-                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, some))
+                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, hasty))
         self.simulations += sum(len(n) for _, _, _, n in wanted)
         results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
         out: list[Made | str] = []
@@ -540,28 +534,25 @@ class Bench:
         state: State,
         models: Sequence[Sensors],
         few: int = FEW,
-        only: Shown | None = None,
+        only: Collection[str] = (),
         hasty: bool = True,
         kept: Kept = "likely",
-        only_of: Sequence[Shown | None] | None = None,
+        only_of: Sequence[Collection[str]] | None = None,
     ) -> list[Moved | str]:
         """What each of these models would change.
 
-        few: recordings of each capture; only: of these captures, and of what they show; hasty: without statistics that
+        few: recordings of each capture; only: of these captures, where there are any; hasty: without statistics that
         cost much; kept: of what the recordings show, what is hardly ever chance (a trace), what is hardly all chance
         (a slope, which would be too small without it), or all. only_of: as `only`, of each model by itself.
         """
         numbers = np.arange(few, dtype=np.uint64)
-        everything: Shown = dict.fromkeys(state.made)
-        shown_of = [everything if some is None else some for some in only_of or [only] * len(models)]
-        ids_of = [[id for id in state.made if id in shown] for shown in shown_of]
-        wanted, names = [], []
-        for sensors, ids, shown in zip(models, ids_of, shown_of, strict=True):
+        ids_of = [[id for id in state.made if not some or id in some] for some in only_of or [only] * len(models)]
+        wanted = []
+        for sensors, ids in zip(models, ids_of, strict=True):
             for id in ids:
-                names.append(_names(self.seen[id].capture, shown[id], hasty))
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = iter(self.simulate(wanted, names=names))
+        results = iter(self.simulate(wanted, hasty=hasty))
         out: list[Moved | str] = []
         for sensors, ids in zip(models, ids_of, strict=True):
             made = {id: next(results) for id in ids}
@@ -666,12 +657,6 @@ class Bench:
             else:
                 out[cell] = shift / np.maximum(scale, 0.5 if null.law == "poisson" else 1e-30)
         return out
-
-
-def _names(capture: Capture, shown: Collection[str] | None, hasty: bool) -> list[str]:
-    """The statistics that are looked at: all, or those that show something; hasty: without those that cost much."""
-    known = recordings.statistics_for(capture.modality)
-    return [s.name for s in known if (shown is None or s.name in shown) and not (hasty and s.costly)]
 
 
 def _joined(parts: Sequence[Made]) -> Made:

@@ -11,7 +11,7 @@ from .answer import plain
 from .chance import along
 from .fit import State
 from .search import Search
-from .showing import Shown, captures_showing
+from .showing import captures_showing
 from .tried import Tried, shape_of
 
 _ONE_SIDED = 1.645  # 95 %
@@ -73,7 +73,7 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
     out: dict[tuple[str, int], float] = {}
     open_: dict[tuple[str, int], tuple[float, float, float]] = {}  # strength and size that are known, strength to try
     needed: dict[tuple[str, int], float] = {}
-    where: dict[tuple[str, int], Shown] = {}
+    where: dict[tuple[str, int], list[str]] = {}
     for name, (times, size, one) in weakest.items():
         out[name] = times
         if size > 2 * _CLEARLY:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from . import checks, fit, settling
-from .candidates import Dial, Key, first_strengths
-from .fit import RATES, Bench, Moved, State, square, stacked
+from .candidates import Dial, Key
+from .fit import RATES, Bench, State, square, stacked
 from .settling import Settled
-from .showing import Shown, showing, together
+from .showing import captures_showing
 from .swings import NEAR, turned
 from .tried import Tried, is_edge, room_of
 
@@ -41,7 +41,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     given = one.scaled()
     dials = [d for d in one.change.dials if d.key in given and not d.whole]
     boost, power = _boost(bench, state, one, given)
-    some = _shown(bench, state, one, given)
+    some = captures_showing(bench.template(state, one.moved.at(one.times)), *UNSEEN)
 
     def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
         return settling.settle(
@@ -85,19 +85,6 @@ def state_of(bench: Bench, one: Tried) -> State:
     return one.state
 
 
-def _shown(bench: Bench, state: State, one: Tried, given: Mapping[Key, Any]) -> Mapping[str, Collection[str]] | None:
-    """Where its numbers are settled: in all that shows what it does, but for where hardly anything of it is.
-
-    Of directions side by side, where any of them does something. None where nothing but totals shows it.
-    """
-    moved: list[Moved | str] = [one.moved.at(one.times)]
-    if len(one.change.strengths) > 1:
-        ways = [{**given, d.key: first_strengths(d)[0]} for d in one.change.strengths]
-        models = [state.sensors.changed(way, one.phases, one.chips) for way in ways]
-        moved += bench.moved(state, models, kept="sure")
-    return together(showing(bench.template(state, m), *UNSEEN) for m in moved if not isinstance(m, str)) or None
-
-
 def _fails_its_own(bench: Bench, state: State, one: Tried, found: Settled) -> bool:
     """Does a check fail, the numbers being settled, of those that the candidate moves at all?"""
     trace = bench.template(state, one.moved.at(one.times))
@@ -136,10 +123,10 @@ def _boost(bench: Bench, state: State, one: Tried, given: Mapping[Key, Any]) -> 
     return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
 
 
-def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Shown | None) -> Settled:
+def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Collection[str]) -> Settled:
     """Settled numbers, better ones near by being taken where slopes do not lead to them: a line, an edge.
 
-    only: what is looked at for it.
+    only: captures that are simulated for it.
     """
     for dial in one.change.dials:
         if dial not in found.dials or not dial.log:
@@ -157,7 +144,7 @@ def _probed(bench: Bench, state: State, one: Tried, found: Settled, only: Shown 
 
 
 def _nearest(
-    bench: Bench, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float], only: Shown | None
+    bench: Bench, state: State, one: Tried, found: Settled, dial: Dial, probes: Sequence[float], only: Collection[str]
 ) -> tuple[Settled, bool]:
     """(the best of the probes to both sides of a number, or what was settled; is it one of the probes?)."""
     at, before = float(found.values[dial.key]), found

@@ -145,7 +145,7 @@ class Search:
         """
         down = {i: opposite for i, one in enumerate(tried) if (opposite := _opposite(state, one))}
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = self.bench.moved(state, [*models, *down.values()], few, dict.fromkeys(only or state.made), kept="sure")
+        made = self.bench.moved(state, [*models, *down.values()], few, only, kept="sure")
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):

@@ -6,7 +6,7 @@ By Gauss's and Newton's method on the residuals of all cells, every point being 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,6 @@ import numpy as np
 
 from .candidates import Dial, Key
 from .fit import FEW, Bench, Cell, Sensors, State, stacked
-from .showing import Shown
 
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _CLOSE = 0.02  # and no nearer
@@ -59,11 +58,11 @@ def settle(
     rounds: int = 3,
     few: int = FEW,
     stronger: tuple[float, float] = (1.0, 1.0),
-    only: Shown | None = None,
+    only: Collection[str] = (),
 ) -> Settled | str:
     """Gauss-Newton on the residuals of all cells, from `values` on; every point is simulated.
 
-    only: of what these captures show; all other cells are taken not to follow. stronger: (factor, power). Of what is
+    only: of these captures; the others' cells are taken not to follow. stronger: (factor, power). Of what is
     faint, what one `factor` times as strong does is simulated, and taken for factor^power times what it does itself.
     """
     dials = tuple(dials)

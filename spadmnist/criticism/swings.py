@@ -74,7 +74,7 @@ def turned(bench: Bench, state: State, keys: Sequence[Key], values: Mapping[Key,
     pairs = [(id, key) for id in bench.seen for key in keys]
     models = [state.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
     lit = [id for id, seen in bench.seen.items() if not seen.capture.light.dark]
-    found = bench.moved(state, models, few, dict.fromkeys(lit))
+    found = bench.moved(state, models, few, lit)
     made = [m for m in found if not isinstance(m, str)]
     if len(made) < len(found):
         return next(m for m in found if isinstance(m, str))
