@@ -948,6 +948,21 @@ def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
 
 
 @_jit
+def add_waits(frames, none, of_pixels, of_frames):
+    """Add to of_pixels (pixels,) and of_frames (frames,) how long first detections were waited for, in frames.
+
+    frames: (frames, pixels) ticks, `none` and above where there is no detection; a stamp is the middle of its tick.
+    """
+    for f in range(frames.shape[0]):
+        total = 0.0
+        for p in range(frames.shape[1]):
+            waited = min((frames[f, p] + 0.5) / none, 1.0)
+            of_pixels[p] += waited
+            total += waited
+        of_frames[f] += total
+
+
+@_jit
 def column_sums(packed, columns, out):
     """Add to out (rows * columns,) how often each pixel has a detection.
 

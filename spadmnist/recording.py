@@ -141,6 +141,23 @@ class Recording:
         """(pixels,) detections of each pixel (counts of all frames for `counts`)."""
         return self.kept("totals", self._totals)
 
+    @property
+    def waited(self) -> tuple[np.ndarray, np.ndarray]:
+        """STR: how long (each pixel, (pixels,); the array in each frame, (frames,)) waited for first detections.
+
+        In frames; one without a detection is waited through to its end. Of steady light, the detections and this time
+        tell all that the stamps do: their ratio is the rate, with the relative variance of so many detections, and
+        where nearly every frame has one, frames without are few and tell less.
+        """
+        return self.kept("waited", self._waited)
+
+    def _waited(self) -> tuple[np.ndarray, np.ndarray]:
+        of_pixels, of_frames = np.zeros(self.pixels), np.zeros(self.n_frames)
+        for start, part in self.chunks():
+            flat = np.ascontiguousarray(part).reshape(len(part), -1)
+            kernels.add_waits(flat, self.none, of_pixels, of_frames[start : start + len(part)])
+        return of_pixels, of_frames
+
     def kept(self, name: str, make: Callable[[], T]) -> T:
         """What is computed of the data by name: made when it is first asked for, then kept with them."""
         if name not in self._kept:

@@ -81,6 +81,34 @@ def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     assert float(map_.values()[hot].mean()) > 900 and float(map_.values()[~hot].mean()) < 260
 
 
+def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> None:
+    """4 photons a frame: 1500 frames tell a pixel to 1 / sqrt(448) by those without a detection, with stamps to 1 /
+    sqrt(1473)."""
+    (tmp_path / "sensor.yaml").write_text(
+        SENSOR.replace("dark_counts: {rate: 200 Hz}", "tdc: {resolution: 1 ns}\n    dead_time: {duration: 20 ns}")
+    )
+    plan = CAPTURES.replace("id: dark, file: dark.h5, modality: qis", "id: flat, file: flat.h5, modality: str")
+    plan = plan.replace("1 us", "10 us").replace(str(FRAMES), "1500")
+    light = "kind: flat, wavelength: 500 nm, irradiance: 378 nW/cm^2, relative_uncertainty: 0.05"
+    (tmp_path / "plan.yaml").write_text(plan.replace("kind: dark", light))
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    relative = 1 + 0.1 * np.random.default_rng(3).standard_normal(SIDE * SIDE)
+    truth = with_values(sensor, {("detection", "relative"): relative / relative.mean()})
+    wanted = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, wanted, tmp_path / "lab", 5))
+    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
+    share = bench.seen["flat"].total / SIDE**2 / 1500
+    assert 0.97 < share < 0.99
+    change = next(c for c in changes(sensor) if c.name == "per_pixel detection.pdp")
+    levels = mapping.levels_of(bench, bench.state({}))
+    map_ = mapping.settle_maps(bench, {}, [change], levels)[change.carrier]  # type: ignore[index]
+    assert np.median(map_.raw_error) == pytest.approx(1 / math.sqrt(1500 * share), rel=0.05)
+    apart = map_.raw - np.log(relative / relative.mean())
+    pull = (apart - np.median(apart)) / map_.raw_error
+    assert abs(np.mean(pull**2) - 1) < 5 * math.sqrt(2 / SIDE**2)
+    assert map_.sigma == pytest.approx(0.1, rel=5 / math.sqrt(2 * SIDE**2) + 0.05)
+
+
 @pytest.mark.parametrize("fraction", [1.0, 0.6])
 def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_path: Path) -> None:
     (tmp_path / "sensor.yaml").write_text(SENSOR.replace("200 Hz", "100 kHz"))

@@ -14,6 +14,7 @@ from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.candidates import Dial, first_strengths
+from spadmnist.criticism.chance import along
 from spadmnist.criticism.fit import Bench, Moved
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.tried import Tried
@@ -36,6 +37,32 @@ def test_what_both_signs_do_is_told_apart() -> None:
             assert there.shifts[cell] == pytest.approx(one.shifts.get(cell, np.zeros(1)))
     # half as strong: half of the odd part, a quarter of the even one
     assert both.at(0.5).shifts[CELL] == pytest.approx([0.5 * 4 + 0.25 * 1, 0.25 * 1])
+
+
+def test_what_chance_does_to_a_power_is_no_sign() -> None:
+    """(n + 10)^2 and (n - 10)^2 differ by 40 n: chance, if n is. A line that was there, (10 + 1)^2, has a sign."""
+    chance, line = ("flat", "spectrum"), ("bright", "spectrum")
+    up = Moved({chance: np.array([114.0, 0.0]), line: np.array([21.0]), CELL: np.array([5.0])}, {}, {})
+    down = Moved({chance: np.array([86.0, 0.0]), line: np.array([-19.0]), CELL: np.array([-3.0])}, {}, {})
+    both = Moved.both(up, down, [chance, line], 2)
+    assert both.shifts[chance].tolist() == [0.0, 0.0] and both.shifts[line].tolist() == [20.0]
+    assert both.at(0.1).shifts[chance] == pytest.approx([1.0, 0.0])
+    assert both.shifts[CELL].tolist() == [4.0]
+    assert Moved.both(up, down).shifts[chance].tolist() == [14.0, 0.0]
+
+
+def test_a_faint_drift_resembles_the_trend_and_not_what_chance_makes_of_spectra(lab) -> None:
+    """The trace of 1 % is not much more than its trend: in a spectrum it is the square that is there."""
+    bench = bench_of(lab("    source_drift: {slope: 0}\n", light=900, side=8))
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add source_drift")
+    (one,) = look.looked_at(state, change, look.begun(state, change))
+    faint = one.moved.at(0.1)
+    trend = float(np.linalg.norm(bench.template(state, faint)["flat", "trend"]))
+    whole = along(bench, state, faint)
+    assert trend > 2 and whole.size * whole.spread < 1.25 * trend
+    spectrum = one.moved.shifts["flat", "spectrum"]
+    assert not spectrum.any() and one.moved.even is not None and one.moved.even.shifts["flat", "spectrum"].any()
 
 
 @pytest.mark.slow

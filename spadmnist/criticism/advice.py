@@ -116,13 +116,7 @@ def _apart(bench: Bench, known: State, other: Sensors, capture: Capture, like: s
     number = np.array([10_000], np.uint64)
     made: Recording = next(recordings.simulated(sensor, capture, np.array([level]), number, bench.seed))
     made = made.beside(bench.dead)
-    counts = np.asarray(made.totals, float)
-    summaries = {}
-    for statistic in recordings.statistics_for(made.modality):
-        summary = recordings.reduced(statistic, made)
-        if summary is not None:
-            summaries[statistic.name] = summary
-    new.seen = {capture.id: Seen(made.capture, float(counts.sum()), counts, summaries)}
+    new.seen = {capture.id: Seen.of(made)}
     state = new.state({}, first, _RECORDINGS)
     (moved,) = new.moved(state, [second], fit.FEW, hasty=False, kept="sure")
     if isinstance(moved, str):

@@ -15,6 +15,7 @@ from . import mapping
 from .candidates import Change, Key, changes
 from .fit import RATES, Bench, Cell, Moved, State
 from .lines import Line
+from .nulls import scores_of_powers
 from .tried import Tried, shape_of
 
 LEAST_P = 1e-300
@@ -139,7 +140,10 @@ def along(bench: Bench, state: State, moved: Moved) -> Likeness:
     size = data = norm = fourth = wild = 0.0
     for key in keys:
         whole, *parts = _weights(state, key)
-        t, w = template[key], whole(template[key])
+        t, null = template[key], state.nulls.get(key)
+        if null is not None and null.law == "exponential":
+            t = scores_of_powers(t)
+        w = whole(t)
         for part, weigh in zip(_folds(many), parts, strict=True):
             own[part] += state.own[key][part] @ weigh(t)
         size, data = size + float(t @ w), data + float(state.residuals[key] @ w)

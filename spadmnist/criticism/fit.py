@@ -25,7 +25,7 @@ from ..sensor import Sensor
 from ..statistics import Summary
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
-from .nulls import Null, _standardized, learn, poisson_scores
+from .nulls import LEAST_POWER, Null, _standardized, learn, poisson_scores
 from .shifts import beyond_noise, difference
 
 T = TypeVar("T")
@@ -33,10 +33,10 @@ Cell = tuple[str, str]  # capture, statistic
 RATES = ("", "rates")  # the block of all captures' totals
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm: how far a level is changed to have as many detections
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point falls into the widest gap
-_LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than these are none
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
+_SURE_SQUARE = 30.0  # in variances, of what is never chance
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
@@ -45,7 +45,8 @@ Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 class Seen:
     """A capture as it was measured: its detections, of each pixel, and its summaries.
 
-    counts: None where the mean alone is known. last: s, of the last detection that has a stamp of its own.
+    counts: None where the mean alone is known. last: s, of the last detection that has a stamp of its own. waited:
+    (pixels,) of first stamps, frames' worth of time before them.
     """
 
     capture: Capture
@@ -53,6 +54,22 @@ class Seen:
     counts: np.ndarray | None
     summaries: Mapping[str, Summary]
     last: float | None = None
+    waited: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, recording: Recording) -> Seen:
+        """What is looked at of a recording."""
+        summaries = {}
+        for statistic in recordings.statistics_for(recording.modality):
+            summary = recordings.reduced(statistic, recording)
+            if summary is not None:
+                summaries[statistic.name] = summary
+        counts = np.asarray(recording.totals, float)
+        last = None
+        if recording.events is not None and len(recording.events.times):
+            last = float(recording.events.times.max())
+        waited = recording.waited[0] if recording.modality == "str" else None
+        return cls(recording.capture, float(counts.sum()), counts, summaries, last, waited)
 
 
 @dataclass
@@ -159,16 +176,24 @@ class Moved:
         return out
 
     @staticmethod
-    def both(up: Moved, down: Moved) -> Moved:
-        """Of what a strength does and what its opposite does: the odd part and the even one."""
+    def both(up: Moved, down: Moved, powers: Collection[Cell] = (), few: int = FEW) -> Moved:
+        """Of what a strength does and what its opposite does: the odd part and the even one.
+
+        powers: cells that are squares of amplitudes. What is added to an amplitude moves them in proportion to its
+        strength by what chance had in them already, another chance in each recording; so that is none of what it does
+        if so `few` recordings may have made it.
+        """
 
         def half(a: Mapping[Any, Any], b: Mapping[Any, Any], sign: float) -> dict[Any, Any]:
             return {k: 0.5 * (a.get(k, 0.0) + sign * b.get(k, 0.0)) for k in a.keys() | b.keys()}
 
         noise = half(up.noise, down.noise, 1.0)
         even = Moved(half(up.shifts, down.shifts, 1.0), {}, half(up.logs, down.logs, 1.0))
-        nothing = up.nothing and down.nothing
-        return Moved(half(up.shifts, down.shifts, -1.0), noise, half(up.logs, down.logs, -1.0), nothing, even)
+        odd = half(up.shifts, down.shifts, -1.0)
+        for cell in odd.keys() & set(powers):
+            chance = 2 * np.maximum(even.shifts[cell], 0.0) / few  # variance of what grows in proportion
+            odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
+        return Moved(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even)
 
 
 @dataclass(frozen=True)
@@ -288,16 +313,7 @@ class Bench:
             if exposures and capture.id in exposures:
                 conditions = replace(recording.conditions, exposure=exposures[capture.id])
                 recording = replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
-            summaries = {}
-            for statistic in recordings.statistics_for(recording.modality):
-                summary = recordings.reduced(statistic, recording)
-                if summary is not None:
-                    summaries[statistic.name] = summary
-            counts = np.asarray(recording.totals, float)
-            last = None
-            if recording.events is not None and len(recording.events.times):
-                last = float(recording.events.times.max())
-            self.seen[capture.id] = Seen(recording.capture, float(counts.sum()), counts, summaries, last)
+            self.seen[capture.id] = Seen.of(recording)
 
     @property
     def dark(self) -> list[str]:
@@ -602,6 +618,10 @@ class Bench:
                     shifts[cell], noise[cell] = shift, left
         return Moved(shifts, noise, logs, nothing)
 
+    def both(self, state: State, up: Moved, down: Moved, few: int) -> Moved:
+        """`Moved.both` of what so many recordings of a strength and of its opposite show at this state."""
+        return Moved.both(up, down, [cell for cell, null in state.nulls.items() if null.law == "exponential"], few)
+
     def residuals(self, state: State, moved: Moved, times: float = 1.0, noisy: bool = False) -> dict[Cell, np.ndarray]:
         """The data's residuals if the shifts were `times` as large. noisy: their scatter adds to that of the cells."""
         out: dict[Cell, np.ndarray] = {}
@@ -689,7 +709,7 @@ def _judged(
     if null.law in ("poisson", "exponential"):
         expected = np.maximum(expected, 0.5 / null.recordings)
     if null.law == "exponential":  # detections by chance alone have their power, whatever else there is
-        expected = np.maximum(expected, _LEAST_POWER * usual[0])
+        expected = np.maximum(expected, LEAST_POWER * usual[0])
     z = _standardized(null.law, values, expected, null.spread, leverage + noise, null.recordings, null.scaled)
     return np.asarray(z / null.factor)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from . import fit
 from .answer import plain
-from .chance import along
-from .fit import State
+from .chance import Likeness, along
+from .fit import Bench, Moved, State
 from .search import Search
 from .showing import captures_showing
 from .tried import Tried, shape_of
@@ -36,7 +36,9 @@ def upper_limits(
         if change.kind != "add" or len(change.strengths) != 1 or change.phases:
             continue
         trace = along(bench, state, one.moved)
-        times = (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
+        times = _seen_at(trace)
+        for _ in range(_LOOKS if one.moved.even is not None and math.isfinite(times) else 0):
+            times *= _seen_at(along(bench, state, one.moved.at(times)))  # where the square of it is no matter
         known = shapes.setdefault(change.effect, {})
         if shape_of(one) not in known or known[shape_of(one)][1] < trace.size:  # of several strengths the clearest
             known[shape_of(one)] = times, trace.size, one
@@ -58,6 +60,11 @@ def upper_limits(
             far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
             excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
     return excluded, [{"effect": name} for name in sorted(hidden)]
+
+
+def _seen_at(trace: Likeness) -> float:
+    """Times the strength of a trace at which it would be seen if it grew in proportion."""
+    return (max(trace.data, 0.0) + _ONE_SIDED) / trace.size if trace.size > 0 else math.inf
 
 
 # times the strength at which it would be seen if it grew in proportion, the size of its trace, what it is
@@ -85,17 +92,10 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
         known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
         if not known:
             break
-        models = []
-        for name, (_, _, try_) in known.items():
-            one = weakest[name][2]
-            dial = one.change.strengths[0]
-            models.append(state.sensors.changed({**one.values, dial.key: _strength(one, try_)}))
+        asked = [(weakest[name][2], try_, where[name]) for name, (_, _, try_) in known.items()]
         open_ = {}
-        only = [where[name] for name in known]
-        for (name, (strong, size, try_)), moved in zip(
-            known.items(), bench.moved(state, models, fit.FEW, kept="sure", only_of=only), strict=True
-        ):
-            there = 0.0 if isinstance(moved, str) else along(bench, state, moved.only(where[name])).size
+        for (name, (strong, size, try_)), moved in zip(known.items(), _as_strong(bench, state, asked), strict=True):
+            there = 0.0 if moved is None else along(bench, state, moved).size
             power = math.log(max(there, _HARDLY) / size) / math.log(try_ / strong)
             out[name] = try_ * (needed[name] / max(there, _HARDLY)) ** (1 / min(max(power, 0.5), 10.0))
             if there < _CLEARLY / 3:  # it grows faster: a trace that chance hides tells no power
@@ -103,6 +103,30 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
             elif there > 6 * _CLEARLY:
                 open_[name] = try_, there, try_ * _CLEARLY / there
     return out
+
+
+def _as_strong(bench: Bench, state: State, asked: Sequence[tuple[Tried, float, Sequence[str]]]) -> list[Moved | None]:
+    """What each does at so many times its strength, in some captures: with both signs, if it may have either."""
+    models, only = [], []
+    for one, times, ids in asked:
+        dial = one.change.strengths[0]
+        for sign in _signs(one):
+            models.append(state.sensors.changed({**one.values, dial.key: _strength(one, sign * times)}))
+            only.append(ids)
+    made = iter(bench.moved(state, models, fit.FEW, kept="sure", only_of=only))
+    out: list[Moved | None] = []
+    for one, _, ids in asked:
+        found = [next(made) for _ in _signs(one)]
+        whole = [m.only(ids) for m in found if not isinstance(m, str)]
+        if len(whole) < len(found):
+            out.append(None)
+        else:
+            out.append(whole[0] if len(whole) == 1 else bench.both(state, whole[0], whole[1], fit.FEW))
+    return out
+
+
+def _signs(one: Tried) -> tuple[float, ...]:
+    return (1.0,) if one.moved.even is None else (1.0, -1.0)
 
 
 def _strength(one: Tried, times: float) -> float | None:

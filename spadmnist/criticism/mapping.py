@@ -104,20 +104,24 @@ def groups_of(sensor: Sensor, per: str) -> np.ndarray:
 
 
 class _Line:
-    """Expected detections of each pixel in one capture, for maps."""
+    """Expected detections of each pixel in one capture, for maps: of first stamps in the time that it waited."""
 
     def __init__(self, bench: Bench, id: str, level: float):
         self.seen, self.id, self.level = bench.seen[id], id, level
         self.conditions = self.seen.capture.conditions
-        self.frames = not self.seen.capture.counts_events
+        self.waited = self.seen.waited
+        self.frames = not self.seen.capture.counts_events and self.waited is None
 
     def expected(self, sensor: Sensor) -> np.ndarray:
         if self.seen.capture.light.dark:
             sensor = InTheDark.of(sensor)
         light = np.full((1, sensor.layout.pixels), self.level)
-        if not self.frames:
+        if self.seen.capture.counts_events:
             return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
-        return np.maximum(self.conditions.frames * in_frames(sensor, light, self.conditions)[0], 1e-9)
+        share = in_frames(sensor, light, self.conditions)[0]
+        if self.waited is None:
+            return np.maximum(self.conditions.frames * share, 1e-9)
+        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-9)), 1e-9))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
         """(pixels,) of the counts that were measured."""

@@ -19,6 +19,7 @@ from ..statistics import Summary
 
 _LEAST = 1e-300
 _FEW = 20.0  # expected counts below which a cell does not tell by itself how it follows the light
+LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 _MANY = 200.0  # expected counts beyond which a root of them is normal enough
 
 
@@ -241,6 +242,14 @@ def poisson_scores(n: np.ndarray, mean: np.ndarray) -> np.ndarray:
         tail = np.clip(np.where(k > m, above, below), _LEAST, 1.0)
         out[few] = np.where(k > m, -1.0, 1.0) * special.ndtri(tail)
     return out
+
+
+def scores_of_powers(more: np.ndarray) -> np.ndarray:
+    """By how much the normal scores of powers rise that are larger by so many of their means: by little for the large.
+
+    The score of a power p is about the root of 2 p.
+    """
+    return np.asarray(_score_of_tail(-np.maximum(1.0 + more, LEAST_POWER)) - _score_of_tail(np.array(-1.0)))
 
 
 def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:

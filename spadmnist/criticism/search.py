@@ -152,7 +152,7 @@ class Search:
             other = downs.get(i)
             if isinstance(up, str) or isinstance(other, str):
                 continue
-            one.moved = up if other is None else Moved.both(up, other)
+            one.moved = up if other is None else self.bench.both(state, up, other, few)
             out.append(one)
         return out
 

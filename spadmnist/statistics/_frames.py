@@ -16,6 +16,7 @@ import numpy as np
 from ..kernels import inline, jit
 from ..recording import Recording
 
+_MANY = 100.0  # counts for which whole numbers are no matter
 _SMALL = 2**23  # pixels times frames up to which a form of the frames is kept with the recording
 
 
@@ -73,6 +74,18 @@ def first_stamps(recording: Recording) -> Iterator[tuple[int, FirstStamps]]:
             yield first, FirstStamps(offsets, stamps[:-1], pixels[:-1])
 
     return _kept(recording, "first stamps", make)
+
+
+def in_equal_times(counts: np.ndarray, waited: np.ndarray) -> np.ndarray:
+    """Detections if all had waited as long as they do in the mean; few of them are whole numbers.
+
+    They scatter like Poisson counts of their size. As if each had three detections' time more than it has: a handful in
+    saturation is no normal variable, and so it weighs less.
+    """
+    usual, mean = float(waited.mean()), float(counts.mean())
+    more = 3.0 * usual / max(mean, 1e-9)
+    found = np.asarray(counts * ((usual + more) / (waited + more)))
+    return found if mean >= _MANY else np.rint(found)
 
 
 @jit

@@ -10,6 +10,7 @@ import numpy as np
 from ..events import Layout
 from . import Recording, Statistic, Summary
 from ._counting import per_cent
+from ._frames import in_equal_times
 from ._scores import Pairs, number_at, pooled_score, shares
 from ._series import has_data, slots_of_frame
 
@@ -22,14 +23,23 @@ _TAIL = 16  # pixels in a tail, at least
 class _Counting:
     """The law of a pixel's number of detections in a capture, as far as the conditions fix it.
 
-    slots: that a pixel can fill at most (binomial); blind: share of the exposure that one detection takes from it.
+    counts: (pixels,) float, its detections; of first stamps those that it would have had if it had waited for them as
+    long as all do (see `Recording.waited`). slots: that a pixel can fill at most (binomial); blind: share of the
+    exposure that one detection takes from it.
     """
 
     def __init__(self, recording: Recording):
         conditions = recording.conditions
-        self.slots = recording.n_frames * slots_of_frame(recording) if recording.events is None else np.inf
-        live = conditions.exposure if recording.events is not None else recording.n_frames * conditions.frame_time
-        self.blind = 0.0 if np.isfinite(self.slots) else recording.dead_time / live
+        self.counts = recording.totals.astype(np.float64)
+        self.slots, self.blind = np.inf, 0.0
+        if recording.modality == "str":
+            self.counts = in_equal_times(self.counts, recording.waited[0])
+            return
+        if recording.events is None:
+            self.slots = recording.n_frames * slots_of_frame(recording)
+        if not np.isfinite(self.slots):
+            live = conditions.exposure if recording.events is not None else recording.n_frames * conditions.frame_time
+            self.blind = recording.dead_time / live
 
     def as_poisson(self, counts: np.ndarray) -> np.ndarray:
         """Numbers that scatter like Poisson counts of their size; a few detections stay as they are.
@@ -86,7 +96,9 @@ class PixelMap(Statistic):
     """Detections of each pixel.
 
     Law: Poisson. Frames fill slots (binomial) and a dead time takes part of the exposure, so the counts are first
-    brought to numbers with the scatter of Poisson counts; small counts stay what they are.
+    brought to numbers with the scatter of Poisson counts; small counts stay what they are. A pixel whose first stamps
+    come early has waited less: its detections are brought to an equal time of waiting, and so the stamps tell its rate
+    where frames without a detection are few.
     Shows: pixels with another PDP, hot and dead pixels, gradients and patterns, crosstalk around hot pixels.
     Source: photon response and dark signal non-uniformity, EMVA standard 1288.
     """
@@ -104,7 +116,7 @@ class PixelMap(Statistic):
             return f"{found:.6g} detections, {wanted:.6g} expected", float((found - wanted) / max(wanted, 1.0))
 
         return Summary(
-            np.rint(law.as_poisson(recording.totals)),
+            np.rint(law.as_poisson(law.counts)),
             "poisson",
             lambda cell: place_of(layout, cell),
             size,
@@ -128,7 +140,7 @@ def _lines(recording: Recording, axis: int) -> Summary | None:
         share = float((found - wanted) / max(wanted, 1.0))
         return f"{found:.7g} detections, {wanted:.7g} expected ({per_cent(share)})", share
 
-    values = law.as_poisson(recording.totals).reshape(layout.shape).sum(axis=1 - axis)
+    values = law.as_poisson(law.counts).reshape(layout.shape).sum(axis=1 - axis)
     cells = np.arange(layout.shape[axis], dtype=np.float64)
     return Summary(np.rint(values), "poisson", lambda cell: f"{name} {cell}", size, axis=cells, label=name)
 
@@ -220,7 +232,8 @@ class Surface(Statistic):
         names = basis.names
         if not has_data(recording) or not names:
             return None
-        rates = _Counting(recording).rates(recording.totals.astype(np.float64))
+        law = _Counting(recording)
+        rates = law.rates(law.counts)
         mean = rates.mean()
         fitted = basis.fit(rates / mean if mean > 0 else np.ones_like(rates))
 
@@ -236,11 +249,10 @@ def _dithered(recording: Recording) -> tuple[np.ndarray, float]:
 
     Every count is spread over (-1/2, 1/2) about itself: whole numbers would jump over a threshold all at once.
     """
-    counts = recording.totals
-    share = shares(counts, counts.size)
-    rates = np.sort(_Counting(recording).rates(counts + share - 0.5))
-    tenth = -(-counts.size // 10)
-    return rates, max(2.0, float(rates[tenth : counts.size - tenth].mean()))
+    law = _Counting(recording)
+    rates = np.sort(law.rates(law.counts + shares(recording.totals, recording.pixels) - 0.5))
+    tenth = -(-rates.size // 10)
+    return rates, max(2.0, float(rates[tenth : rates.size - tenth].mean()))
 
 
 class Outliers(Statistic):
@@ -326,7 +338,7 @@ class Spread(Statistic):
         if not has_data(recording) or free[1] < 8:
             return None
         counting = _Counting(recording)
-        counts = recording.totals.astype(np.float64)
+        counts = counting.counts
         mean = float(counts.mean())
         smooth = basis.fit(counts - mean) @ basis.functions
         squares = np.array([((counts - mean) ** 2).sum(), ((counts - mean - smooth) ** 2).sum()])

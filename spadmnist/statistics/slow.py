@@ -11,7 +11,7 @@ from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import per_cent, span
-from ._frames import as_words, bits, by_pixel, frame_sums, pixel_sums
+from ._frames import as_words, bits, by_pixel, frame_sums, in_equal_times, pixel_sums
 from ._scores import minority, number_at, pair_scores, pairs_law, poisson_score, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 from .maps import place_of
@@ -138,9 +138,16 @@ def _block_time(recording: Recording, blocks: int) -> float:
     return conditions.frame_period * merged * (recording.n_frames // blocks)
 
 
+def _of_blocks(series: np.ndarray, blocks: int) -> np.ndarray:
+    """(blocks,) sums of a series over frames (frames,); those left over are left out."""
+    size = len(series) // blocks
+    return np.asarray(series[: blocks * size].reshape(blocks, size).sum(axis=1))
+
+
 class Trend(Statistic):
     """The array's detections in 32 blocks of the capture (16 where there are few frames), relative to their mean.
 
+    Of first stamps those of equal times of waiting (see `pixel_map`).
     Law: normal, as scores of Poisson counts among those of the whole capture; all blocks with the same spread.
     Shows: a light source that drifts, slow flicker, warming up, readout that stops for a while.
     """
@@ -159,9 +166,12 @@ class Trend(Statistic):
             sums = _of_events(recording)[2].reshape(blocks, -1).sum(axis=1)
         else:
             size = recording.n_frames // blocks
-            sums = frame_sums(recording)[: blocks * size].reshape(blocks, size).sum(axis=1)
-            slots = slots_of_frame(recording) * size * recording.pixels
-        total = int(sums.sum())
+            sums = _of_blocks(frame_sums(recording), blocks)
+            if recording.modality == "str":
+                sums = in_equal_times(sums, _of_blocks(recording.waited[1], blocks))
+            else:
+                slots = slots_of_frame(recording) * size * recording.pixels
+        total = float(sums.sum())
         # slots that are free scatter like those that are taken; where they are fewer, they are the ones to count
         free = total > blocks * slots / 2
         mean = slots - total / blocks if free else total / blocks

@@ -65,10 +65,13 @@ class Spectrum(Statistic):
 
 
 def _series(recording: Recording) -> tuple[np.ndarray, float]:
-    """((bins,) detections of the array, s from one bin to the next)."""
+    """((bins,) detections of the array, s from one bin to the next); of first stamps in equal times of waiting."""
     conditions = recording.conditions
     if recording.events is None:
         sums = frame_sums(recording)
+        if recording.modality == "str":  # what stamps tell, too: the score of the rate, to first order
+            waited = recording.waited[1]
+            sums = sums - sums.sum() / waited.sum() * (waited - waited.mean())
         together = conditions.largest_count if recording.modality == "counts" and conditions.counting == "frames" else 1
         step = conditions.frame_period * together
         some = -(-len(sums) // _MOST)

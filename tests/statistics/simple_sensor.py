@@ -90,10 +90,30 @@ def str_of(stamps: np.ndarray, tick: float = 1e-8) -> Recording:
     return Recording(capture("str", conditions), grid(rows, columns), None, stamps.astype(np.uint32), tick)
 
 
-def stamped(seed: int, shape: tuple[int, int, int], share: float, tick: float = 1e-8) -> Recording:
-    """Frames with the first stamp of steady light; one has a detection with a probability `share`."""
-    first = np.random.default_rng(seed).exponential(FRAME / -np.log1p(-share), shape)
+def stamped(seed: int, shape: tuple[int, int, int], share: Any, tick: float = 1e-8) -> Recording:
+    """Frames with the first stamp of light that is steady in each; one has a detection with a probability `share`.
+
+    share: scalar, map, or for every frame.
+    """
+    first = np.random.default_rng(seed).exponential(FRAME / -np.log1p(-np.asarray(share)), shape)
     return str_of(np.minimum(np.floor(first / tick), round(FRAME / tick)), tick)
+
+
+def in_equal_times(recording: Recording, axes: tuple[int, ...], blocks: int = 0) -> np.ndarray:
+    """Literally: first stamps that there would be if all had waited as long for them. axes: that are summed over.
+
+    blocks: of as many frames each, whose sums are meant.
+    """
+    frames = np.asarray(recording.frames[:])  # type: ignore[index]
+    hit = frames < recording.none
+    waited = np.where(hit, (frames + 0.5) / recording.none, 1.0)
+    if blocks:
+        size = len(frames) // blocks
+        hit, waited = (x[: blocks * size].reshape(blocks, -1) for x in (hit, waited))
+    n, time = hit.sum(axis=axes).ravel(), waited.sum(axis=axes).ravel()
+    more = 3 * time.mean() / n.mean()
+    found = n * (time.mean() + more) / (time + more)
+    return np.rint(found) if n.mean() < 100 else found
 
 
 def counts_of(values: np.ndarray, bits: int, counting: str = "frames") -> Recording:

@@ -27,9 +27,11 @@ def series_of(recording: Recording) -> tuple[np.ndarray, float]:
     if recording.modality == "qis":
         frames = np.unpackbits(frames, axis=2, count=recording.layout.columns)
     elif recording.modality == "str":
-        frames = frames < recording.none
+        hit = frames < recording.none
+        waited = np.where(hit, (frames + 0.5) / recording.none, 1.0)
+        frames = hit - hit.sum() / waited.sum() * (waited - waited.mean())
     together = 15 if recording.modality == "counts" and recording.conditions.counting == "frames" else 1
-    return frames.reshape(len(frames), -1).sum(axis=1, dtype=int), together * FRAME
+    return frames.reshape(len(frames), -1).sum(axis=1, dtype=frames.dtype), together * FRAME
 
 
 @pytest.mark.parametrize("kind", ["tr", "tr without ticks", "qis", "str", "counts", "counter"])
