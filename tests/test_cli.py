@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from test_factory import COMMAND, assert_same, assert_sentence, make, run, tree, write_config
+from commands import COMMAND, run, run_anew
+from test_factory import assert_same, assert_sentence, make, tree, write_config
 
 from spadmnist.cli import cli
 
@@ -72,7 +73,7 @@ def test_help_is_there_at_once() -> None:
     best = 9.0
     for _ in range(5):
         started = time.perf_counter()
-        assert run("--help").returncode == 0
+        assert run_anew("--help").returncode == 0
         best = min(best, time.perf_counter() - started)
     assert best < 0.3
 
@@ -196,7 +197,7 @@ for command in json.loads(sys.argv[1]):
     quiet(result)
     assert result.returncode == 0, result
     assert result.stdout.count("Usage:") >= 1 and len(commands) > 20
-    result = run("verify", tmp_path / "nö", env=env)
+    result = run_anew("verify", tmp_path / "nö", env=env)
     assert_sentence(result)
 
 

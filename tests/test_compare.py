@@ -205,6 +205,7 @@ def summaries_of(law: str, values: np.ndarray, scale: np.ndarray | None = None) 
     return [Summary(row, law, str, lambda c, m, e: ("", 0.0), scale) for row in values]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "draw", "scaled"),
     [

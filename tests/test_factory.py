@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from commands import COMMAND, run, run_anew
 
 import spadmnist
 from spadmnist import config, dataset, factory, plugins, verify
@@ -29,7 +30,6 @@ from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 
 METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
-COMMAND = str(Path(sys.executable).with_name("spadmnist"))
 LEVELS = ("5 mlux", "40 mlux", "160 mlux", "640 mlux", "2560 mlux")
 
 TEXT = """\
@@ -88,12 +88,6 @@ def make(
     """`spadmnist generate`, in this process."""
     experiment = config.read(file, **changes)
     return factory.generate(experiment, experiment.load_images(), root, jobs, progress)
-
-
-def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """`spadmnist ARGUMENTS`."""
-    options = {"timeout": 120, **options}
-    return subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True, **options)
 
 
 def tree(root: Path) -> dict[str, bytes | str]:
@@ -175,7 +169,7 @@ def test_the_surroundings_do_not_show(made: tuple[Path, Path], tmp_path: Path) -
     copy = tmp_path / "copy of small.yaml"
     shutil.copy(made[0], copy)
     surroundings = {"TZ": "Asia/Kathmandu", "LC_ALL": "C", "LANG": "C", "PYTHONHASHSEED": "12345"}
-    result = run(
+    result = run_anew(
         "generate",
         os.path.relpath(copy, tmp_path / "elsewhere"),
         "--output",
@@ -613,6 +607,7 @@ def kill_and_resume(file: Path, root: Path, expected: dict[str, bytes | str], ki
     assert_same(root, expected)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(many: tuple[Path, Path], tmp_path: Path) -> None:
     kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 2, random.Random(1))
 
@@ -671,6 +666,7 @@ class Poison(Effect, stage="light"):
 '''
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_worker_is_named_and_the_others_finish(tmp_path: Path) -> None:
     (tmp_path / "poison.py").write_text(POISON)
     file = write_config(tmp_path / "c.yaml", more="    poison: {}\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 from collections.abc import Iterator
@@ -45,9 +46,19 @@ def layer_of(file: str) -> str:
     return Path(file).parts[0].removesuffix(".py")
 
 
-def imports(file: str, with_types: bool = False) -> Iterator[tuple[int, str]]:
+@functools.cache
+def parsed(file: str) -> ast.Module:
+    return ast.parse(MODULES[file].read_text())
+
+
+@functools.cache
+def imports(file: str, with_types: bool = False) -> list[tuple[int, str]]:
     """(line, dotted name) of all imports of a module, those within functions too, relative ones made absolute."""
-    tree = ast.parse(MODULES[file].read_text())
+    return list(_imports(file, with_types))
+
+
+def _imports(file: str, with_types: bool) -> Iterator[tuple[int, str]]:
+    tree = parsed(file)
     skipped = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and not with_types:
@@ -128,7 +139,7 @@ def test_a_library_has_its_place(package: str, owners: set[str]) -> None:
 
 
 def calls(file: str) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(ast.parse(MODULES[file].read_text())):
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.Call):
             yield node.lineno, ast.unparse(node.func)
         elif isinstance(node, ast.Raise) and node.exc is not None:
@@ -161,7 +172,7 @@ def test_there_is_no_list_of_effects(file: str) -> None:
     """No module but its own names an effect, as text or as a class. A stage may have the name of an effect."""
     exempt = {Path(file).stem} | (FUSED if file == "sensor.py" else set())
     words = own_effects() - set(STAGES) - exempt
-    tree = ast.parse(MODULES[file].read_text())
+    tree = parsed(file)
     # what it comes after is the one thing that an effect may say of another
     places = [n.value for n in ast.walk(tree) if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "after"]
     for node in ast.walk(tree):
@@ -175,7 +186,7 @@ def test_there_is_no_list_of_effects(file: str) -> None:
 @pytest.mark.parametrize("file", list(MODULES))
 def test_no_collection_holds_several_effects(file: str) -> None:
     """Also where they have the names of stages."""
-    for node in ast.walk(ast.parse(MODULES[file].read_text())):
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
             items = node.keys if isinstance(node, ast.Dict) else node.elts
             named = {i.value for i in items if isinstance(i, ast.Constant)} & own_effects()
@@ -196,14 +207,14 @@ def test_a_name_that_is_not_there() -> None:
 
 
 def public(file: str) -> Iterator[ast.FunctionDef | ast.ClassDef]:
-    for node in ast.parse(MODULES[file].read_text()).body:
+    for node in parsed(file).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
             yield node
 
 
 @pytest.mark.parametrize("file", list(MODULES))
 def test_what_is_public_is_explained(file: str) -> None:
-    tree = ast.parse(MODULES[file].read_text())
+    tree = parsed(file)
     assert ast.get_docstring(tree), f"{file} has no docstring"
     for node in public(file):
         assert ast.get_docstring(node), f"{file}:{node.lineno} {node.name} has no docstring"

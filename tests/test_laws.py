@@ -72,6 +72,7 @@ CONSERVATIVE: dict[str, Draw] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*UNIFORM, *CONSERVATIVE])
 def test_p_values_where_nothing_is_wrong(name: str) -> None:
     """The shares of p-values below 1, 10 and 50 % are within binomial bounds, or below if conservative."""

@@ -92,6 +92,7 @@ def check(answers: Sequence[likelihood.Exact], key: candidates.Key, truth: float
     assert missed <= MOST, f"{missed} of {len(values)} intervals miss the {key}"
 
 
+@pytest.mark.slow
 def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
     hidden = candidates.with_values(sensor, TRUTH)
     # no two pixels need be alike: each has a rate of its own

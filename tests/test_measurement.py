@@ -816,6 +816,7 @@ except SpadError as error:
         subprocess.run(["umount", disk], check=True)
 
 
+@pytest.mark.slow
 def test_who_is_killed_leaves_no_half_file_and_can_go_on(tmp_path: Path) -> None:
     done = alone(f"""
 write({str(tmp_path / "out")!r}, at=lambda start: start > 2000 and os.kill(os.getpid(), signal.SIGKILL))
@@ -846,6 +847,7 @@ except KeyboardInterrupt:
     assert tree(tmp_path / "out") == {}
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_hdf5_writes_what_it_kept(tmp_path: Path) -> None:
     """Were it raised in what HDF5 calls, the process would crash."""
     done = alone(f"""

@@ -378,6 +378,7 @@ def test_every_kind_of_summary_has_a_picture_of_two_models(kind: str) -> None:
         assert "before" in words and "after" in words and "simulated" not in words
 
 
+@pytest.mark.slow
 def test_numbers_beyond_all_bounds_are_drawn() -> None:
     odd = np.array([np.nan, np.inf, -np.inf, 1e200, 0.0])
     for kind in ("poisson", "exponential", "normal"):

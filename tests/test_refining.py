@@ -140,6 +140,7 @@ def test_a_map_goes_unless_a_check_fails_without_it(lab, monkeypatch, without: i
     assert (course.ladder[-1]["model"] == "start") == kept
 
 
+@pytest.mark.slow
 def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) -> None:
     """The same answer, by fewer recordings."""
     made = lab("    crosstalk: {probability: 3 %}\n")

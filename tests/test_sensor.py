@@ -267,6 +267,7 @@ def test_any_cut_of_a_batch_is_the_batch(cuts: list[int], rules: str) -> None:
         assert_same(whole.images(a, b), part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rules", ["paper", "device"])
 def test_images_alone_and_in_reverse(rules: str) -> None:
     chip = sensor(30, *paper_effects(), rules=rules)

@@ -43,6 +43,7 @@ def shift_of(null: Null, values: np.ndarray, base: np.ndarray, few: int) -> np.n
     return shifts.beyond_noise(shift, spread, chance, null, expected, few, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("few", [2, 4])
 @pytest.mark.parametrize("name", list(LAWS))
 def test_what_chance_makes_of_a_few_recordings_is_no_shift(name: str, few: int) -> None:

@@ -208,6 +208,7 @@ def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
     assert dials[0].value(float(course_of._held(course, settled).point[0])) == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fails", [True, False])
 def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, monkeypatch, fails):
     """A candidate that could be chance by few recordings is looked at by many before the answer is that none fits."""

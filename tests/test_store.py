@@ -327,6 +327,7 @@ def test_names_that_cannot_be_stored(tmp_path: Path) -> None:
 
 
 # --- damage ------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS)
 def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: str) -> None:
     """Flipped bits, cut files and missing files: reading refuses, or gives exactly what was written; the hash

@@ -36,6 +36,7 @@ def score_of(bench: fit.Bench, state: fit.State, id: str, total: float) -> float
     return float(z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", [5.6, 8.0, 15.0, 31.0, 100.0, 1000.0])
 def test_few_dark_counts_alarm_as_often_as_they_should(lab, mean: float) -> None:
     """All totals that Poisson's law has, each with its probability: twice the level is allowed, for it is discrete."""

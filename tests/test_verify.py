@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import run
 from test_factory import (
     METHODS,
     Stop,
     assert_same,
     assert_sentence,
     make,
-    run,
     tree,
     write_config,
 )
