@@ -948,15 +948,28 @@ def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
 
 
 @_jit
-def add_waits(frames, none, of_pixels, of_frames):
-    """Add to of_pixels (pixels,) and of_frames (frames,) how long first detections were waited for, in frames.
+def span_of_stamps(stamps, none, first, last):
+    """(the smallest of `first` and all stamps below `none`, the largest of them and `last`)."""
+    for stamp in stamps:
+        if stamp < none:
+            first = min(first, np.int64(stamp))
+            last = max(last, np.int64(stamp))
+    return first, last
 
-    frames: (frames, pixels) ticks, `none` and above where there is no detection; a stamp is the middle of its tick.
+
+@_jit
+def add_waits(frames, none, first, last, of_pixels, of_frames):
+    """Add to of_pixels (pixels,) and of_frames (frames,) how long first detections were waited for.
+
+    frames: (frames, pixels) ticks, `none` and above where there is no detection. In the time from the tick `first` to
+    the end of `last`; a stamp is the middle of its tick.
     """
+    unit = 1.0 / (last - first + 1)
     for f in range(frames.shape[0]):
         total = 0.0
         for p in range(frames.shape[1]):
-            waited = min((frames[f, p] + 0.5) / none, 1.0)
+            stamp = frames[f, p]
+            waited = (np.int64(stamp) - first + 0.5) * unit if stamp < none else 1.0
             of_pixels[p] += waited
             total += waited
         of_frames[f] += total

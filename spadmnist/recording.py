@@ -21,6 +21,7 @@ from .units import show
 T = TypeVar("T")
 
 MODALITIES = ("tr", "str", "qis", "counts")
+_FEW_TICKS = 64  # between the first stamp and the last: a rate changes within one
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
 
 
@@ -142,20 +143,26 @@ class Recording:
         return self.kept("totals", self._totals)
 
     @property
-    def waited(self) -> tuple[np.ndarray, np.ndarray]:
+    def waited(self) -> tuple[np.ndarray, np.ndarray] | None:
         """STR: how long (each pixel, (pixels,); the array in each frame, (frames,)) waited for first detections.
 
-        In frames; one without a detection is waited through to its end. Of steady light, the detections and this time
-        tell all that the stamps do: their ratio is the rate, with the relative variance of so many detections, and
-        where nearly every frame has one, frames without are few and tell less.
+        In frames, of which counts what lies between the first and the last of all stamps: a gate may leave no more. A
+        frame without a detection is waited through to its end. Of steady light, the detections and this time tell all
+        that the stamps do: their ratio is the rate, with the relative variance of so many detections, where frames
+        without are few and tell less. None where ticks are too long to tell it, and of other data.
         """
-        return self.kept("waited", self._waited)
+        return self.kept("waited", self._waited) if self.modality == "str" else None
 
-    def _waited(self) -> tuple[np.ndarray, np.ndarray]:
+    def _waited(self) -> tuple[np.ndarray, np.ndarray] | None:
+        first, last = self.none, -1
+        for _, part in self.chunks():
+            first, last = kernels.span_of_stamps(np.ascontiguousarray(part).ravel(), self.none, first, last)
+        if last - first < _FEW_TICKS:
+            return None
         of_pixels, of_frames = np.zeros(self.pixels), np.zeros(self.n_frames)
         for start, part in self.chunks():
             flat = np.ascontiguousarray(part).reshape(len(part), -1)
-            kernels.add_waits(flat, self.none, of_pixels, of_frames[start : start + len(part)])
+            kernels.add_waits(flat, self.none, first, last, of_pixels, of_frames[start : start + len(part)])
         return of_pixels, of_frames
 
     def kept(self, name: str, make: Callable[[], T]) -> T:
@@ -182,8 +189,8 @@ class Recording:
 
     def beside(self, dead_time: float) -> Recording:
         """The same data, beside another sensor's dead time."""
-        totals = {name: x for name, x in self._kept.items() if name == "totals"}
-        return replace(self, dead_time=dead_time, _kept=totals)
+        still = {name: x for name, x in self._kept.items() if name in ("totals", "waited")}
+        return replace(self, dead_time=dead_time, _kept=still)
 
     def watched(self, read: Callable[[float], None]) -> Recording:
         """The same data; `read` is told which share of the frames is read, each time."""

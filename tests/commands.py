@@ -66,11 +66,12 @@ def run(*arguments: object, cwd: Path | None = None, timeout: float = _SECONDS) 
         assert server.stdin is not None and server.stdout is not None
         server.stdin.write(json.dumps(asked).encode() + b"\n")
         child = int(_line(server.stdout, _SECONDS) or 0)
-        assert child, "the process that divides has ended"
-        status = _line(server.stdout, timeout)
-        if status is None:
+        status = _line(server.stdout, timeout) if child else None
+        if not status:  # what it says later would be taken for the next command's
+            server.kill()
+            _server.cache_clear()
+            assert child, "the process that divides has ended"
             os.killpg(child, signal.SIGKILL)
-            _line(server.stdout, _SECONDS)
             raise subprocess.TimeoutExpired(command, timeout)
         return subprocess.CompletedProcess(command, int(status), _text(out), _text(err))
 

@@ -85,7 +85,7 @@ def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> N
     """4 photons a frame: 1500 frames tell a pixel to 1 / sqrt(448) by those without a detection, with stamps to 1 /
     sqrt(1473)."""
     (tmp_path / "sensor.yaml").write_text(
-        SENSOR.replace("dark_counts: {rate: 200 Hz}", "tdc: {resolution: 1 ns}\n    dead_time: {duration: 20 ns}")
+        SENSOR.replace("dark_counts: {rate: 200 Hz}", "tdc: {resolution: 1 ns}\n    dead_time: {duration: 4 us}")
     )
     plan = CAPTURES.replace("id: dark, file: dark.h5, modality: qis", "id: flat, file: flat.h5, modality: str")
     plan = plan.replace("1 us", "10 us").replace(str(FRAMES), "1500")

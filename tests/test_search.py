@@ -42,10 +42,14 @@ def test_what_both_signs_do_is_told_apart() -> None:
 def test_what_chance_does_to_a_power_is_no_sign() -> None:
     """(n + 10)^2 and (n - 10)^2 differ by 40 n: chance, if n is. A line that was there, (10 + 1)^2, has a sign."""
     chance, line = ("flat", "spectrum"), ("bright", "spectrum")
-    up = Moved({chance: np.array([114.0, 0.0]), line: np.array([21.0]), CELL: np.array([5.0])}, {}, {})
-    down = Moved({chance: np.array([86.0, 0.0]), line: np.array([-19.0]), CELL: np.array([-3.0])}, {}, {})
-    both = Moved.both(up, down, [chance, line], 2)
-    assert both.shifts[chance].tolist() == [0.0, 0.0] and both.shifts[line].tolist() == [20.0]
+    there = np.arange(9) == 4
+    up = Moved({chance: np.array([114.0, 0.0]), line: 21.0 * there, CELL: np.array([5.0])}, {}, {})
+    down = Moved({chance: np.array([86.0, 0.0]), line: -19.0 * there, CELL: np.array([-3.0])}, {}, {})
+    both = Moved.both(up, down, {chance: np.ones(2), line: 1.0 + 100.0 * there}, 2)
+    assert both.shifts[chance].tolist() == [0.0, 0.0] and both.shifts[line].tolist() == (20.0 * there).tolist()
+    # where there is fifty times the power, chance does more, and takes away as well
+    noisy = Moved.both(up, down, {line: np.full(9, 50.0)}, 2)
+    assert not noisy.shifts[line].any()
     assert both.at(0.1).shifts[chance] == pytest.approx([1.0, 0.0])
     assert both.shifts[CELL].tolist() == [4.0]
     assert Moved.both(up, down).shifts[chance].tolist() == [14.0, 0.0]

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 from joblib import Parallel, delayed
+from scipy import ndimage
 
 from .. import twin
 from ..errors import SpadError
@@ -37,6 +38,7 @@ _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than the
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
 _SURE_SQUARE = 30.0  # in variances, of what is never chance
+_BESIDE = 9  # powers beside one, of which most are no line
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
@@ -68,7 +70,7 @@ class Seen:
         last = None
         if recording.events is not None and len(recording.events.times):
             last = float(recording.events.times.max())
-        waited = recording.waited[0] if recording.modality == "str" else None
+        waited = None if recording.waited is None else recording.waited[0]
         return cls(recording.capture, float(counts.sum()), counts, summaries, last, waited)
 
 
@@ -176,12 +178,12 @@ class Moved:
         return out
 
     @staticmethod
-    def both(up: Moved, down: Moved, powers: Collection[Cell] = (), few: int = FEW) -> Moved:
+    def both(up: Moved, down: Moved, powers: Mapping[Cell, np.ndarray] | None = None, few: int = FEW) -> Moved:
         """Of what a strength does and what its opposite does: the odd part and the even one.
 
-        powers: cells that are squares of amplitudes. What is added to an amplitude moves them in proportion to its
-        strength by what chance had in them already, another chance in each recording; so that is none of what it does
-        if so `few` recordings may have made it.
+        powers: what cells usually have that are squares of amplitudes. What is added to an amplitude moves them in
+        proportion to its strength by what chance had in them already, another chance in each recording; so that is
+        none of what it does if so `few` recordings may have made it.
         """
 
         def half(a: Mapping[Any, Any], b: Mapping[Any, Any], sign: float) -> dict[Any, Any]:
@@ -190,8 +192,9 @@ class Moved:
         noise = half(up.noise, down.noise, 1.0)
         even = Moved(half(up.shifts, down.shifts, 1.0), {}, half(up.logs, down.logs, 1.0))
         odd = half(up.shifts, down.shifts, -1.0)
-        for cell in odd.keys() & set(powers):
-            chance = 2 * np.maximum(even.shifts[cell], 0.0) / few  # variance of what grows in proportion
+        for cell in odd.keys() & (powers or {}).keys():
+            usual = ndimage.median_filter(powers[cell], _BESIDE)  # type: ignore[index]  # a line's own has a sign
+            chance = 2 * usual * np.abs(even.shifts[cell]) / few  # variance of what grows in proportion
             odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
         return Moved(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even)
 
@@ -620,7 +623,12 @@ class Bench:
 
     def both(self, state: State, up: Moved, down: Moved, few: int) -> Moved:
         """`Moved.both` of what so many recordings of a strength and of its opposite show at this state."""
-        return Moved.both(up, down, [cell for cell, null in state.nulls.items() if null.law == "exponential"], few)
+        powers = {
+            cell: state.usual(cell, self.seen[cell[0]].total)[0]
+            for cell, null in state.nulls.items()
+            if null.law == "exponential"
+        }
+        return Moved.both(up, down, powers, few)
 
     def residuals(self, state: State, moved: Moved, times: float = 1.0, noisy: bool = False) -> dict[Cell, np.ndarray]:
         """The data's residuals if the shifts were `times` as large. noisy: their scatter adds to that of the cells."""

@@ -38,7 +38,8 @@ def upper_limits(
         trace = along(bench, state, one.moved)
         times = _seen_at(trace)
         for _ in range(_LOOKS if one.moved.even is not None and math.isfinite(times) else 0):
-            times *= _seen_at(along(bench, state, one.moved.at(times)))  # where the square of it is no matter
+            # where its square is as small as it is; by the root, for with the square alone it would go to and fro
+            times *= math.sqrt(_seen_at(along(bench, state, one.moved.at(times))))
         known = shapes.setdefault(change.effect, {})
         if shape_of(one) not in known or known[shape_of(one)][1] < trace.size:  # of several strengths the clearest
             known[shape_of(one)] = times, trace.size, one
@@ -86,7 +87,8 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
         if size > 2 * _CLEARLY:
             where[name] = captures_showing(bench.template(state, one.moved), _UNSEEN)
             seen = along(bench, state, one.moved.only(where[name])).size
-            needed[name] = times * seen
+            here = one.moved if one.moved.even is None else one.moved.at(times)
+            needed[name] = along(bench, state, here.only(where[name])).size * (times if one.moved.even is None else 1.0)
             open_[name] = 1.0, seen, _CLEARLY / seen
     for _ in range(_LOOKS):
         known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
@@ -107,26 +109,27 @@ def _at_limit(search: Search, state: State, weakest: Mapping[tuple[str, int], _S
 
 def _as_strong(bench: Bench, state: State, asked: Sequence[tuple[Tried, float, Sequence[str]]]) -> list[Moved | None]:
     """What each does at so many times its strength, in some captures: with both signs, if it may have either."""
-    models, only = [], []
+    models, only, signs = [], [], []
     for one, times, ids in asked:
         dial = one.change.strengths[0]
-        for sign in _signs(one):
-            models.append(state.sensors.changed({**one.values, dial.key: _strength(one, sign * times)}))
+        strong = _strength(one, times)
+        assert strong is not None  # as it is asked for
+        strengths = [strong]
+        if one.moved.even is not None and -strong >= dial.low:  # what has either sign vanishes at 0
+            strengths.append(-strong)
+        signs.append(len(strengths))
+        for value in strengths:
+            models.append(state.sensors.changed({**one.values, dial.key: value}))
             only.append(ids)
     made = iter(bench.moved(state, models, fit.FEW, kept="sure", only_of=only))
     out: list[Moved | None] = []
-    for one, _, ids in asked:
-        found = [next(made) for _ in _signs(one)]
-        whole = [m.only(ids) for m in found if not isinstance(m, str)]
-        if len(whole) < len(found):
+    for (_, _, ids), number in zip(asked, signs, strict=True):
+        up, down = next(made), next(made) if number == 2 else None
+        if isinstance(up, str) or isinstance(down, str):
             out.append(None)
         else:
-            out.append(whole[0] if len(whole) == 1 else bench.both(state, whole[0], whole[1], fit.FEW))
+            out.append((up if down is None else bench.both(state, up, down, fit.FEW)).only(ids))
     return out
-
-
-def _signs(one: Tried) -> tuple[float, ...]:
-    return (1.0,) if one.moved.even is None else (1.0, -1.0)
 
 
 def _strength(one: Tried, times: float) -> float | None:

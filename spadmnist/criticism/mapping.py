@@ -121,7 +121,7 @@ class _Line:
         share = in_frames(sensor, light, self.conditions)[0]
         if self.waited is None:
             return np.maximum(self.conditions.frames * share, 1e-9)
-        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-9)), 1e-9))
+        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-15)), 1e-9))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
         """(pixels,) of the counts that were measured."""
@@ -137,6 +137,8 @@ class _Line:
         return self.frames and float(np.median(counts)) > 0.9 * self.conditions.frames
 
     def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
+        if self.waited is not None:
+            return np.maximum(n, 0.25)
         if self.frames:
             return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), 0.25)
         return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)

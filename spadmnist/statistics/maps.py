@@ -25,15 +25,16 @@ class _Counting:
 
     counts: (pixels,) float, its detections; of first stamps those that it would have had if it had waited for them as
     long as all do (see `Recording.waited`). slots: that a pixel can fill at most (binomial); blind: share of the
-    exposure that one detection takes from it.
+    exposure that one detection takes from it; waited: frames that pixels waited in the mean, 0 where that is unknown.
     """
 
     def __init__(self, recording: Recording):
         conditions = recording.conditions
         self.counts = recording.totals.astype(np.float64)
-        self.slots, self.blind = np.inf, 0.0
-        if recording.modality == "str":
+        self.slots, self.blind, self.waited, self.frames = np.inf, 0.0, 0.0, recording.n_frames
+        if recording.waited is not None:
             self.counts = in_equal_times(self.counts, recording.waited[0])
+            self.waited = float(recording.waited[0].mean())
             return
         if recording.events is None:
             self.slots = recording.n_frames * slots_of_frame(recording)
@@ -46,9 +47,11 @@ class _Counting:
 
         Twice the root of it has the spread 1: that of a binomial number is an arcsine (Anscombe, Biometrika 35, 1948),
         that of one with a dead time, variance n (1 - n blind)^2 (Mueller, NIM 112, 1973), an inverse hyperbolic
-        tangent. Three slots more than there are: the few that are left free in saturation are no normal variable, and
-        so they weigh less.
+        tangent, that of a rate by first stamps see `_steadied`. Three slots more than there are: the few that are left
+        free in saturation are no normal variable, and so they weigh less.
         """
+        if self.waited:
+            return np.asarray(self.frames * np.interp(counts / self.waited, *_steadied()) ** 2)
         if np.isfinite(self.slots):
             return np.asarray((self.slots + 3.0) * np.arcsin(np.sqrt(counts / (self.slots + 3.0))) ** 2)
         if self.blind <= 0:
@@ -61,6 +64,9 @@ class _Counting:
     def detections(self, value: float) -> float:
         """The inverse of `as_poisson`."""
         value = max(0.0, value)
+        if self.waited:
+            photons, roots = _steadied()
+            return float(self.waited * np.interp(np.sqrt(value / self.frames), roots, photons))
         if np.isfinite(self.slots):
             return float((self.slots + 3.0) * np.sin(min(np.sqrt(value / (self.slots + 3.0)), np.pi / 2)) ** 2)
         if self.blind <= 0:
@@ -70,6 +76,9 @@ class _Counting:
 
     def variance(self, counts: np.ndarray) -> np.ndarray:
         """What counting alone scatters."""
+        if self.waited:  # as much as the detections that there were, of the frames
+            told = -self.frames * np.expm1(-counts / self.waited)
+            return np.asarray(counts**2 / np.maximum(told, 1e-9))
         if np.isfinite(self.slots):
             return np.asarray(counts * (1.0 - counts / self.slots))
         return np.asarray(counts * (1.0 - np.minimum(counts * self.blind, _BLIND)) ** 2)
@@ -82,6 +91,20 @@ class _Counting:
         if np.isfinite(self.slots):
             return -self.slots * np.log((self.slots - counts + 1.5) / (self.slots + 1.5))
         return np.asarray(counts / (1.0 - np.minimum(counts * self.blind, 0.95)))
+
+
+@lru_cache(maxsize=1)
+def _steadied() -> tuple[np.ndarray, np.ndarray]:
+    """(photons in a frame, the root of what scatters like Poisson counts, per frame): of rates by first stamps.
+
+    Of F frames F (1 - exp(-x)) have a detection, and so the relative variance of x is one over it. A number F s^2 has
+    as much variance as it has size where s' = sqrt(1 - exp(-x)) / (2 x).
+    """
+    x = np.geomspace(1e-8, 1e6, 20_000)
+    slope = np.sqrt(-np.expm1(-x)) / 2.0  # per logarithm of x
+    between = (slope[1:] + slope[:-1]) / 2.0 * np.diff(np.log(x))
+    roots = np.sqrt(x[0]) + np.concatenate([[0.0], np.cumsum(between)])
+    return np.concatenate([[0.0], x]), np.concatenate([[0.0], roots])
 
 
 def place_of(layout: Layout, pixel: int) -> str:

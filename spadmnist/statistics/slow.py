@@ -167,7 +167,7 @@ class Trend(Statistic):
         else:
             size = recording.n_frames // blocks
             sums = _of_blocks(frame_sums(recording), blocks)
-            if recording.modality == "str":
+            if recording.waited is not None:
                 sums = in_equal_times(sums, _of_blocks(recording.waited[1], blocks))
             else:
                 slots = slots_of_frame(recording) * size * recording.pixels

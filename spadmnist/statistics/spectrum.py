@@ -69,7 +69,7 @@ def _series(recording: Recording) -> tuple[np.ndarray, float]:
     conditions = recording.conditions
     if recording.events is None:
         sums = frame_sums(recording)
-        if recording.modality == "str":  # what stamps tell, too: the score of the rate, to first order
+        if recording.waited is not None:  # what stamps tell, too: the score of the rate, to first order
             waited = recording.waited[1]
             sums = sums - sums.sum() / waited.sum() * (waited - waited.mean())
         together = conditions.largest_count if recording.modality == "counts" and conditions.counting == "frames" else 1

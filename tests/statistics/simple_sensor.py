@@ -99,6 +99,12 @@ def stamped(seed: int, shape: tuple[int, int, int], share: Any, tick: float = 1e
     return str_of(np.minimum(np.floor(first / tick), round(FRAME / tick)), tick)
 
 
+def waits(frames: np.ndarray, none: int) -> np.ndarray:
+    """How long each of the frames waited, of the time between the first stamp of all and the last."""
+    first, last = frames[frames < none].min(), frames[frames < none].max()
+    return np.where(frames < none, (frames.astype(float) - first + 0.5) / (last - first + 1), 1.0)
+
+
 def in_equal_times(recording: Recording, axes: tuple[int, ...], blocks: int = 0) -> np.ndarray:
     """Literally: first stamps that there would be if all had waited as long for them. axes: that are summed over.
 
@@ -106,7 +112,7 @@ def in_equal_times(recording: Recording, axes: tuple[int, ...], blocks: int = 0)
     """
     frames = np.asarray(recording.frames[:])  # type: ignore[index]
     hit = frames < recording.none
-    waited = np.where(hit, (frames + 0.5) / recording.none, 1.0)
+    waited = waits(frames, recording.none)
     if blocks:
         size = len(frames) // blocks
         hit, waited = (x[: blocks * size].reshape(blocks, -1) for x in (hit, waited))

@@ -148,9 +148,9 @@ def test_a_drift_is_seen_by_stamps_where_nearly_every_frame_has_one() -> None:
         return many(Trend, make, number) @ times
 
     shape, share = (1280, 8, 8), -np.expm1(-photons)
-    usual = drift(partial(stamped, shape=shape, share=-math.expm1(-3.5)), 60)
-    found = (drift(partial(stamped, shape=shape, share=share), 60).mean() - usual.mean()) / usual.std()
-    assert abs(found - 3.26) < 5 * math.sqrt(2 / 60 + 3.26**2 / 120)
+    usual = drift(partial(stamped, shape=shape, share=-math.expm1(-3.5)), 200)
+    found = (drift(partial(stamped, shape=shape, share=share), 200).mean() - usual.mean()) / usual.std()
+    assert abs(found - 3.26) < 5 * math.sqrt(2 / 200 + 3.26**2 / 400)
 
 
 def test_a_gap_in_the_readout_is_seen() -> None:

@@ -8,7 +8,7 @@ from functools import partial
 import laws
 import numpy as np
 import pytest
-from simple_sensor import FRAME, counted, grid, many, one_of_each, qis, reduced, tr
+from simple_sensor import FRAME, counted, grid, many, one_of_each, qis, reduced, tr, waits
 
 from spadmnist import recording as recordings
 from spadmnist.recording import Recording
@@ -28,7 +28,7 @@ def series_of(recording: Recording) -> tuple[np.ndarray, float]:
         frames = np.unpackbits(frames, axis=2, count=recording.layout.columns)
     elif recording.modality == "str":
         hit = frames < recording.none
-        waited = np.where(hit, (frames + 0.5) / recording.none, 1.0)
+        waited = waits(frames, recording.none)
         frames = hit - hit.sum() / waited.sum() * (waited - waited.mean())
     together = 15 if recording.modality == "counts" and recording.conditions.counting == "frames" else 1
     return frames.reshape(len(frames), -1).sum(axis=1, dtype=frames.dtype), together * FRAME
