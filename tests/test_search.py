@@ -69,6 +69,20 @@ def test_a_faint_drift_resembles_the_trend_and_not_what_chance_makes_of_spectra(
     assert not spectrum.any() and one.moved.even is not None and one.moved.even.shifts["flat", "spectrum"].any()
 
 
+def test_a_gate_that_takes_most_of_the_light_is_tried_where_it_does(lab) -> None:
+    """It lacks 0.6; in proportion to what 0.18 take, or 0.0018, it would lack more than all."""
+    bench = bench_of(lab("    short_gate: {fraction: 0.4}\n", light=20, side=8))
+    state, look = bench.state({}), quiet(bench)
+    change = change_of(bench, "add short_gate")
+    tried = look._by_totals(state, [(change, values) for values in look.begun(state, change)])
+    best = max(tried, key=lambda one: one.gain)
+    # the next strengths that are tried are a sixth away
+    assert best.times == 1 and best.values["short_gate", "fraction"] == pytest.approx(0.4, abs=0.1)
+    linear = bench.told(state, state.sensors.changed({("short_gate", "fraction"): 0.82}))
+    times = look.line_search(state, linear, False)[1]
+    assert change.strengths[0].scaled(0.82, times) < best.values["short_gate", "fraction"] - 0.05
+
+
 @pytest.mark.slow
 def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
     """Its trend has a sign, the variance of the counts has none."""

@@ -185,8 +185,25 @@ class Search:
             with contextlib.suppress(SpadError):
                 one = Tried(change, tried, self.bench.told(state, state.sensors.changed(tried)), 0.0, 1.0)
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
-                out.append(one)
+                out.append(self._by_exact_totals(state, one) if one.gain > _PROMISING else one)
         return out
+
+    def _by_exact_totals(self, state: State, one: Tried) -> Tried:
+        """A candidate at the strength whose totals are nearest: only small ones change them in proportion.
+
+        A gate of half the frame halves them, one of nothing leaves nothing.
+        """
+        best = replace(one, gain=0.0, times=1.0)
+        for factors in ([*TIMES, *([-t for t in TIMES] if one.signed else [])], NEAR):
+            start = best
+            for factor in factors:
+                values = replace(start, times=factor).scaled()
+                with contextlib.suppress(SpadError):
+                    moved = self.bench.told(state, state.sensors.changed(values))
+                    gain = self.bench.gain(state, moved)
+                    if gain > best.gain:
+                        best = replace(start, values=values, moved=moved, gain=gain)
+        return best
 
     def _raised(self, state: State, tried: list[Tried], some: Sequence[str]) -> list[Tried]:
         """These, and stronger ones for those that leave no trace: these may do so."""
