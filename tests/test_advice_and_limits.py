@@ -121,7 +121,7 @@ STEADY = (
 )
 
 
-@pytest.mark.parametrize(("extra", "stays"), [("", False), (STEADY, True)])
+@pytest.mark.parametrize(("extra", "stays"), [("", False), pytest.param(STEADY, True, marks=pytest.mark.slow)])
 def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, stays: bool):
     course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n" + extra, side=4)))
     change = change_of(course.bench, "per_pixel dark_counts.rate")

@@ -89,7 +89,9 @@ def compared(model: Sensor, data: Measurement, **more: Any) -> criticism.Compari
 # --- a right model is left alone ---
 
 
-@pytest.mark.parametrize("modality", [pytest.param("tr", marks=pytest.mark.slow), "qis", "str"])
+@pytest.mark.parametrize(
+    "modality", [pytest.param("tr", marks=pytest.mark.slow), pytest.param("qis", marks=pytest.mark.slow), "str"]
+)
 def test_a_right_model_is_adequate_whatever_the_power_meter_says(modality: str) -> None:
     for number, light in enumerate((1.0, 0.98)):
         found = compared(sensor(), measured(sensor(), modality, number, light))

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import commands
 import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-BIN = Path(sys.executable).parent
 
 
 def blocks(language: str) -> list[str]:
@@ -32,17 +30,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(command: str, folder: Path) -> str:
-    done = subprocess.run([str(BIN / "spadmnist"), *command.split()[1:]], cwd=folder, capture_output=True, text=True)
+    done = commands.run(*command.split()[1:], cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_every_verb_and_option_of_the_readme_is_there() -> None:
-    commands = re.findall(r"^(?:\.venv/bin/)?(spadmnist [a-z].*?)(?:\s+#.*)?$", "\n".join(blocks("")), re.M)
-    assert len(commands) >= 5
-    for command in commands:
+    lines = re.findall(r"^(?:\.venv/bin/)?(spadmnist [a-z].*?)(?:\s+#.*)?$", "\n".join(blocks("")), re.M)
+    assert len(lines) >= 5
+    for command in lines:
         words = command.split()
-        known = subprocess.run([str(BIN / "spadmnist"), words[1], "--help"], capture_output=True, text=True)
+        known = commands.run(words[1], "--help")
         assert known.returncode == 0, command
         for option in (w for w in words[2:] if w.startswith("-")):
             assert option in known.stdout, command

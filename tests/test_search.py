@@ -119,7 +119,7 @@ def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
     ("name", "values", "power"),
     [
         ("afterpulsing", {PROBABILITY: 1e-3, LIFETIME: 40e-9}, 1.0),
-        ("crosstalk", {CROSSTALK: 2e-4}, 1.0),
+        pytest.param("crosstalk", {CROSSTALK: 2e-4}, 1.0, marks=pytest.mark.slow),
         ("source_noise", {("source_noise", "contrast"): 0.03, ("source_noise", "coherence_time"): 1e-4}, 2.0),
     ],
 )

@@ -254,7 +254,7 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
     assert taken == [map_, other]
 
 
-@pytest.mark.parametrize("rival", [False, True])
+@pytest.mark.parametrize("rival", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, monkeypatch, rival: bool) -> None:
     """It moves the dead time to where checks fail: without a rival that is said, with one what was settled stays."""
     sensor, data = lab(dead=55)
