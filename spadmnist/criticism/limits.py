@@ -115,7 +115,7 @@ def _as_strong(bench: Bench, state: State, asked: Sequence[tuple[Tried, float, S
         strong = _strength(one, times)
         assert strong is not None  # as it is asked for
         strengths = [strong]
-        if one.moved.even is not None and -strong >= dial.low:  # what has either sign vanishes at 0
+        if one.moved.even is not None and dial.low <= -strong <= dial.high:  # what has either sign vanishes at 0
             strengths.append(-strong)
         signs.append(len(strengths))
         for value in strengths:

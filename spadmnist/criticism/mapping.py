@@ -370,7 +370,10 @@ def bench_light_only(sensor: Sensor, change: Change) -> bool:
 
 
 def expected(bench: Bench, id: str, state: Any, values: Mapping[Key, Any]) -> np.ndarray:
-    """(pixels,) detections that a model with these values changed expects in a capture."""
+    """(pixels,) detections that a model with these values changed expects in a capture.
+
+    Of first stamps in the time that each pixel waited, so that there, too, the light is what they are in proportion to.
+    """
     return _Line(bench, id, state.rates[id].level).expected(with_values(state.sensors.usual(id), values))
 
 

@@ -42,6 +42,11 @@ class _Counting:
             live = conditions.exposure if recording.events is not None else recording.n_frames * conditions.frame_time
             self.blind = recording.dead_time / live
 
+    @property
+    def what(self) -> str:
+        """The words for `counts`: brought to an equal time they may be more than there are frames."""
+        return "detections in an equal time of waiting" if self.waited else "detections"
+
     def as_poisson(self, counts: np.ndarray) -> np.ndarray:
         """Numbers that scatter like Poisson counts of their size; a few detections stay as they are.
 
@@ -136,7 +141,7 @@ class PixelMap(Statistic):
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             found, wanted = law.detections(measured), law.detections(expected)
-            return f"{found:.6g} detections, {wanted:.6g} expected", float((found - wanted) / max(wanted, 1.0))
+            return f"{found:.6g} {law.what}, {wanted:.6g} expected", float((found - wanted) / max(wanted, 1.0))
 
         return Summary(
             np.rint(law.as_poisson(law.counts)),
@@ -161,7 +166,7 @@ def _lines(recording: Recording, axis: int) -> Summary | None:
     def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
         found, wanted = (per_line * law.detections(value / per_line) for value in (measured, expected))
         share = float((found - wanted) / max(wanted, 1.0))
-        return f"{found:.7g} detections, {wanted:.7g} expected ({per_cent(share)})", share
+        return f"{found:.7g} {law.what}, {wanted:.7g} expected ({per_cent(share)})", share
 
     values = law.as_poisson(law.counts).reshape(layout.shape).sum(axis=1 - axis)
     cells = np.arange(layout.shape[axis], dtype=np.float64)

@@ -75,7 +75,8 @@ def test_a_number_says_how_many_detections_it_stands_for(kind: str) -> None:
     for pixel in (0, 17, 65):
         found = int(recording.totals[pixel])
         text, share = summary.size(pixel, literal_number(recording, found), literal_number(recording, 2))
-        assert text == f"{found} detections, 2 expected"
+        what = "detections in an equal time of waiting" if kind == "str" else "detections"
+        assert text == f"{found} {what}, 2 expected"
         assert math.isclose(share, (found - 2) / 2, rel_tol=1e-6 if kind == "str" else 1e-9)  # by a table
         assert summary.where(pixel) == f"row {pixel // 11}, column {pixel % 11}"
 
