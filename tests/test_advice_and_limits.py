@@ -34,6 +34,7 @@ def advised(bench: Bench, found: str, values: dict[Key, Any]) -> tuple[dict[str,
     return told, fit.square(residuals) - fit.square(state.residuals)
 
 
+@pytest.mark.slow
 def test_dark_rates_are_told_by_a_long_dark_capture(lab):
     """130 Hz for 100 Hz in 4 pixels and 100 s: log 1.3 beside 1 / root of 40,000 detections."""
     told, now = advised(bench_of(lab()), "set dark_counts.rate", {("dark_counts", "rate"): 130.0})

@@ -119,7 +119,7 @@ def assert_sentence(result: subprocess.CompletedProcess[str], *words: str) -> No
         assert word in result.stderr, result.stderr
 
 
-@pytest.fixture(scope="session", params=["zarr", "hdf5"])
+@pytest.fixture(scope="session", params=["zarr", pytest.param("hdf5", marks=pytest.mark.slow)])
 def format(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -617,6 +617,7 @@ def test_killed_and_resumed_many_times(many: tuple[Path, Path], tmp_path: Path) 
     kill_and_resume(many[0], tmp_path / "out", tree(many[1]), 42, random.Random(2))
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced(many: tuple[Path, Path], tmp_path: Path) -> None:
     with running("generate", many[0], "-o", tmp_path / "out", "--jobs", 2) as process:
         assert wait_for(lambda: records(tmp_path / "out") >= 3, 60)

@@ -55,6 +55,7 @@ def test_what_chance_does_to_a_power_is_no_sign() -> None:
     assert Moved.both(up, down).shifts[chance].tolist() == [14.0, 0.0]
 
 
+@pytest.mark.slow
 def test_a_faint_drift_resembles_the_trend_and_not_what_chance_makes_of_spectra(lab) -> None:
     """The trace of 1 % is not much more than its trend: in a spectrum it is the square that is there."""
     bench = bench_of(lab("    source_drift: {slope: 0}\n", light=900, side=8))

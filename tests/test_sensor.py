@@ -153,6 +153,7 @@ def paper_sensors(draw: st.DrawFn) -> tuple[Sensor, Conditions, np.ndarray, tupl
     return sensor(pixels, *effects), conditions, photons, readouts
 
 
+@pytest.mark.slow  # every stage of every readout is compiled for it
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(paper_sensors(), st.integers(0, 2**40), st.integers(0, 2**62))
 def test_fused_and_staged_lines_agree(case: Any, image: int, seed: int) -> None:

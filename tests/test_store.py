@@ -560,7 +560,7 @@ def test_a_file_is_committed_whole(tmp_path: Path) -> None:
     assert disk.sweep(tmp_path / "nowhere") == 0
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", ["zarr", pytest.param("hdf5", marks=pytest.mark.slow)])
 def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
     program = textwrap.dedent(
         """

@@ -29,7 +29,7 @@ from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 
 
-@pytest.fixture(scope="module", params=["zarr", "hdf5"])
+@pytest.fixture(scope="module", params=["zarr", pytest.param("hdf5", marks=pytest.mark.slow)])
 def format(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

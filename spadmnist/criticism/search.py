@@ -32,7 +32,7 @@ _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
 _REFINED = 3  # of these, that are settled
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
-_LEAST_CHANCE = 1e-3  # of a map that is tried
+_LEAST_CHANCE, _CHANCE_BESIDE = 1e-3, 0.05  # of a map that is tried, and beside what chance makes of pixels
 _SILENT = 6.0  # standard deviations of a trace that is none
 _LOUD, _WEAKER = 300.0, 3  # the same of one that says little of a smaller one; times that one is looked for
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
@@ -301,7 +301,9 @@ class Search:
             out.append(
                 replace(one, values=given, gain=size, sensors=state.sensors.changed(given, one.phases, one.chips))
             )
-        for one in self._simulated(state, [*out, *self.maps(state, values)], fit.FEW):
+        # pixels that chance has made odd are a map, too, even where the map alone would be no news
+        least = _CHANCE_BESIDE if any(one.chips for one in best) else _LEAST_CHANCE
+        for one in self._simulated(state, [*out, *self.maps(state, values, least)], fit.FEW):
             if one.maps is None:
                 before, x, size = one.gain, abs(one.times), self.bench.size(state, one.moved)
                 if min(size, before) > 5 and not 0.7 < x < 1.4 and one.change.kind == "add" and not one.moved.even:
@@ -317,8 +319,11 @@ class Search:
             kept.append(one)
         return sorted(kept, key=lambda t: -t.gain)
 
-    def maps(self, state: State, values: dict[Key, Any]) -> list[Tried]:
-        """Every map whose values differ beyond their noise, and all that are needed side by side."""
+    def maps(self, state: State, values: dict[Key, Any], least: float = _LEAST_CHANCE) -> list[Tried]:
+        """Every map whose values differ beyond their noise, and all that are needed side by side.
+
+        least: the largest p-value of one that is tried.
+        """
         if self.only_rates(state):
             return []
         levels = mapping.levels_of(self.bench, state)
@@ -343,7 +348,7 @@ class Search:
                 continue
             sensors = sensors.changed({}, self.phases)
             chance = min(of_map(self.bench, state, c, values, levels) for c in group)
-            if chance > _LEAST_CHANCE:
+            if chance > least:
                 continue
             nothing = Moved({}, {}, {})
             out.append(

@@ -169,6 +169,11 @@ def per_cent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
+def root_of(variance: float) -> float:
+    """The square root with the sign of the variance: what is beyond noise may be less than nothing."""
+    return float(np.copysign(np.sqrt(abs(variance)), variance))
+
+
 def of_detections(total: float) -> Callable[[int, float, float], tuple[str, float]]:
     """The `size` of cells that count detections, of which there are `total`."""
 

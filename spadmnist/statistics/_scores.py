@@ -20,6 +20,7 @@ import numpy as np
 
 _FEW = 128  # up to so many detections the law of their pairs is worked out exactly
 _THIN = 0.1  # and if they fill less than this share of the slots, so that slots hardly matter
+_FEWEST_BOXES = 6.0  # in which pairs fall, for their law to be known
 _SPARSE = 30.0  # expectations below it are no normal variable
 _GOLDEN = 0x9E3779B97F4A7C15
 
@@ -112,6 +113,24 @@ def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pair
     thirds = np.maximum(n - 2.0, 0.0) * np.maximum(places - n - 2.0, 0.0) / places**2  # p (1 - p), of what is left
     shape = (1.0 - 2.0 * p) ** 2 + 2.0 * (slots - 2.0) * thirds
     return Pairs(all_pairs * (slots - 1.0) / max(1.0, places - 1.0), variance, variance * np.maximum(shape, 1e-3))
+
+
+def unequal_pairs_law(expected: np.ndarray) -> Pairs:
+    """Law of the pairs within boxes that are not equal, given the number of detections. expected: of each box.
+
+    That of Poisson numbers n of mean m, of n (n - 1) / 2 - c n, whose slope c on the number of all is taken out: the
+    joint cumulants of pairs and numbers are derivatives of m^2 / 2. To the first order in one over the number of all.
+    Nothing is known, and all is 0, where a few boxes have nearly all pairs.
+    """
+    m = np.asarray(expected, np.float64)
+    total = m.sum()
+    if total < 2.0 or (m**2).sum() ** 2 < _FEWEST_BOXES * (m**4).sum():
+        return Pairs(*(np.zeros(()) for _ in range(3)))
+    c = (m**2).sum() / total
+    mean = (m**2).sum() / 2.0
+    variance = (m**2 / 2.0 + m**3).sum() - c**2 * total
+    third = (m**2 / 2 + 4 * m**3 + 4 * m**4 - 3 * c * (m**2 + 3 * m**3) + 6 * c**2 * m**2 - c**3 * m).sum()
+    return Pairs(*(np.asarray(part * (1.0 - 1.0 / total)) for part in (mean, variance, max(third, 1e-3 * variance))))
 
 
 def gamma_score(number: np.ndarray | float, law: Pairs) -> np.ndarray:

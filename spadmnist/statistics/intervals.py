@@ -16,20 +16,27 @@ from ._counting import (
     guide,
     logarithmic,
     of_detections,
+    per_cent,
     place,
+    root_of,
     span,
     tick_of,
     whole_ticks,
 )
+from ._scores import number_at, pooled_score, shares, unequal_pairs_law
+from ._series import has_data
 
 _BEFORE, _BEHIND = 10e-9, 20e-9  # s: what belongs to the edge, before and behind the dead time
 _FINEST = 0.5e-9  # s
 _LONGEST = 100e-3  # s
+# s: what is counted as early, against the dead time; the last are what a pixel's own afterpulses fill
+_EARLY = (-5e-9, -2e-9, -0.5e-9, 0.0, 1e-9, 5e-9, 20e-9, 100e-9)
 _FINE, _REACH = 1e-9, 1e-6  # s: steps in which intervals are looked at closely, and how far behind the dead time
 _PER_DECADE = 10
 _KNOWN = 16  # intervals from which on a pixel's own rate is known well enough
 _LEVELS = 20
 _LAGS = (1, 2, 3, 5, 10, 20)
+_FEWEST_PIXELS = 8  # that can differ
 _FEWEST = 300  # products from which on a correlation is a normal variable
 
 
@@ -147,6 +154,70 @@ class FineIntervals(Statistic):
         return Summary(counts[1:].astype(np.float64), "poisson", where, size, axis=middles, label="interval (s)")
 
 
+class EarlyIntervals(Statistic):
+    """How unlike the pixels are in their shortest intervals: the variance of their numbers beyond counting noise.
+
+    Intervals up to 5, 2 and 0.5 ns below the dead time, up to it, and up to 1, 5, 20 and 100 ns behind it. How
+    many a pixel has, if all have one dead time, follows from its rate. Law: normal, as the score of the pairs of short
+    intervals in the same pixel, given the number of all.
+    Shows: a dead time that differs from pixel to pixel (jitter blurs the edge in all pixels alike, and is not seen),
+    afterpulsing that some pixels have and others not.
+    Source: index of dispersion (Fisher, Biometrics 6, 1950).
+    """
+
+    modalities = ("tr",)
+    among = "pixel"
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        if not has_data(recording) or recording.pixels < _FEWEST_PIXELS:
+            return None
+        assert recording.events is not None
+        stamps, tick = whole_ticks(recording)
+        bounds = np.unique(np.rint((recording.dead_time + np.array(_EARLY)) / tick).astype(np.int64))
+        bounds = bounds[bounds > 0]
+        numbers = np.zeros((bounds.size, recording.pixels), np.int64)
+        _up_to(stamps, recording.events.offsets, bounds, numbers)
+        numbers = numbers.cumsum(axis=0)
+
+        detections = recording.totals.astype(np.float64)
+        live = np.maximum(recording.conditions.exposure - detections * recording.dead_time, detections * tick)
+        # up to a tick behind the dead time in proportion to the time, then ever fewer of what is left
+        behind = np.maximum(bounds * tick - recording.dead_time, tick)
+        rates = np.divide(detections, live, out=np.zeros_like(live), where=detections > 0)
+        share = shares(recording.totals, bounds.size)
+        laws, scores = [], []
+        for number, time, one in zip(numbers, behind, share, strict=True):
+            chance = -detections * np.expm1(-rates * time)
+            law = unequal_pairs_law(number.sum() * chance / max(float(chance.sum()), 1e-300))
+            laws.append(law)
+            pairs = float((number * (number - 1)).sum()) / 2.0
+            # where nothing is known it is a normal variable all the same, as in other recordings
+            scores.append(pooled_score(pairs if law.mean > 0 else 0.0, law, one))
+
+        def relative(cell: int, score: float) -> float:
+            """Relative variance between pixels beyond noise."""
+            law = laws[cell]
+            pairs = number_at(score, lambda number, part: pooled_score(number, law, part), float(law.mean))
+            return pairs / float(law.mean) - 1.0 if law.mean > 0 else 0.0
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, wanted = (root_of(relative(cell, score)) for score in (measured, expected))
+            text = f"differ by {per_cent(found)} from pixel to pixel beyond counting noise, {per_cent(wanted)} expected"
+            few = float(numbers[cell].sum()) / max(1.0, float(detections.sum()))
+            return text, few * root_of(relative(cell, measured) - relative(cell, expected))
+
+        seconds = bounds * tick
+        return Summary(
+            np.array(scores),
+            "normal",
+            lambda cell: f"numbers of intervals below {units.show(seconds[cell], 's')}",
+            size,
+            axis=seconds,
+            label="interval (s)",
+        )
+
+
 class Rescaled(Statistic):
     """Intervals measured by the pixel's own rate: u = 1 - exp(-rate (interval - dead time)), which should be even.
 
@@ -205,6 +276,24 @@ class RescaledLag(Statistic):
 
         lags = np.array(_LAGS, np.float64)
         return Summary(values, "normal", where, size, np.ones(len(_LAGS)), lags, "intervals apart")
+
+
+@jit
+def _up_to(stamps, offsets, bounds, out):
+    """Add to `out` (bounds, rows) the intervals below each bound and not below the one before."""
+    for row in range(offsets.size - 1):
+        if offsets[row] == offsets[row + 1]:
+            continue
+        before = np.int64(stamps[offsets[row]])
+        for i in range(offsets[row] + 1, offsets[row + 1]):
+            now = np.int64(stamps[i])
+            gap = now - before
+            before = now
+            if gap < bounds[-1]:
+                k = 0
+                while gap >= bounds[k]:
+                    k += 1
+                out[k, row] += 1
 
 
 def _within(seconds: np.ndarray, k: int) -> str:

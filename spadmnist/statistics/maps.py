@@ -9,7 +9,7 @@ import numpy as np
 
 from ..events import Layout
 from . import Recording, Statistic, Summary
-from ._counting import per_cent
+from ._counting import per_cent, root_of
 from ._frames import in_equal_times
 from ._scores import Pairs, number_at, pooled_score, shares
 from ._series import has_data, slots_of_frame
@@ -392,15 +392,8 @@ class Spread(Statistic):
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             found, wanted = relative(cell, measured), relative(cell, expected)
-            text = (
-                f"pixels differ by {per_cent(_root(found))} beyond counting noise, {per_cent(_root(wanted))} expected"
-            )
-            return text, _root(found - wanted)
+            shown = [per_cent(root_of(variance)) for variance in (found, wanted)]
+            return "pixels differ by {} beyond counting noise, {} expected".format(*shown), root_of(found - wanted)
 
         names = ("differences between pixels", "differences between pixels, smooth part removed")
         return Summary(np.array(scores), "normal", lambda cell: names[cell], size)
-
-
-def _root(value: float) -> float:
-    """The square root with the sign of the value."""
-    return float(np.copysign(np.sqrt(abs(value)), value))

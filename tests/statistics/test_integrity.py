@@ -331,7 +331,7 @@ def test_stamps_that_need_more_than_32_bits_are_refused() -> None:
             of_image(recorded, 0, capture("str", conditions), sensor.layout, 0.0)
 
 
-@pytest.mark.parametrize("modality", ["tr", "qis", "str", "counts"])
+@pytest.mark.parametrize("modality", [pytest.param("tr", marks=pytest.mark.slow), "qis", "str", "counts"])
 def test_what_the_sensor_makes_is_whole(modality: str) -> None:
     """The package's own sensor, with all of its classes for data: nothing is out of order, repeated or silent."""
     effects = [Detection(pdp=0.4), DarkCounts(rate=100.0), DeadTime(duration=50e-9), Tdc(resolution=1e-10)]

@@ -5,13 +5,22 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import laws
 import null_laws
 import numpy as np
 import pytest
+from scipy import stats
 from simple_sensor import grid, live, many, one_of_each, reduced, sigmas, tr, tr_of
 
 from spadmnist.recording import Recording
-from spadmnist.statistics.intervals import EdgeIntervals, FineIntervals, Intervals, Rescaled, RescaledLag
+from spadmnist.statistics.intervals import (
+    EarlyIntervals,
+    EdgeIntervals,
+    FineIntervals,
+    Intervals,
+    Rescaled,
+    RescaledLag,
+)
 
 ALL = (EdgeIntervals, Intervals, FineIntervals, Rescaled, RescaledLag)
 
@@ -65,6 +74,58 @@ def test_intervals_of_a_small_recording(kind: str) -> None:
     assert math.isclose(difference, 12 * sums[0] / products[0]) and text.startswith("correlation ")
 
 
+def test_early_intervals_of_pixels() -> None:
+    """Literally: the pairs in one pixel among as many short intervals that fall on the pixels by lot."""
+    recording = BRIGHT(7)
+    rows, tick = ticks_of(recording)
+    detections = np.array([len(row) for row in rows])
+    rng = np.random.default_rng(1)
+    bounds = (45, 48, 49.5, 50, 51, 55, 70, 150)
+    summary = reduced(EarlyIntervals, recording)
+    for cell, bound in enumerate(bounds):
+        assert summary.where(cell) == f"numbers of intervals below {bound:g} ns"
+        number = np.array([(np.diff(row) * tick < (bound - 0.01) * 1e-9).sum() for row in rows])
+        pairs = (number * (number - 1)).sum() / 2
+        text, share = summary.size(cell, float(summary.values[cell]), 0.0)
+        if bound <= 50:
+            assert number.sum() == 0 and share == 0
+        elif bound >= 55:  # as of as many that fall on the pixels by lot, each with its chance
+            n, rate = detections, detections / (1e-3 - 50e-9 * detections)
+            chance = -n * np.expm1(-rate * (bound - 50) * 1e-9)
+            drawn = rng.multinomial(number.sum(), chance / chance.sum(), 100_000)
+            usual = (drawn * (drawn - 1)).sum(axis=1) / 2
+            score = stats.norm.ppf(((usual < pairs).sum() + (usual <= pairs).sum()) / 2 / len(usual))
+            assert abs(summary.values[cell] - score) < 0.05 + 0.6 / usual.std()
+            relative = pairs / usual.mean() - 1
+            wanted = 100 * math.copysign(math.sqrt(abs(relative)), relative)
+            assert "from pixel to pixel" in text and abs(float(text.split()[2]) - wanted) < 0.02 * abs(wanted) + 1.0
+
+
+def test_pixels_whose_dead_times_differ_are_seen_and_jitter_is_not() -> None:
+    usual = many(EarlyIntervals, BRIGHT, 60)
+
+    def found(recording: Recording) -> np.ndarray:
+        return (reduced(EarlyIntervals, recording).values - usual.mean(axis=0)) / usual.std(axis=0, ddof=1).clip(1.0)
+
+    rng = np.random.default_rng(3)
+    rows = []
+    for tau in 50e-9 + 4e-9 * rng.standard_normal(24):
+        rows.append(live(np.sort(rng.random(rng.poisson(2000)) * 1e-3), float(tau)))
+    assert found(tr_of(rows, grid(4, 6), 1e-3, 1e-10, 50e-9))[[0, 1, 2, 3, 4, 5]].min() > laws.z_bound()
+    blurred = [BRIGHT(8).events.row(p) for p in range(24)]  # type: ignore[union-attr]
+    blurred = [np.sort(np.clip(row + 4e-9 * rng.standard_normal(len(row)), 0, 0.999e-3)) for row in blurred]
+    jittered = tr_of(blurred, grid(4, 6), 1e-3, 1e-10, 50e-9)
+    assert np.abs(found(jittered)).max() < laws.z_bound(laws.FALSE_ALARM / 8)
+    assert reduced(EdgeIntervals, jittered).values[:20].sum() > 100
+
+    # and afterpulses that only some pixels have
+    some = [with_afterpulses(1, 0.1), DIM(2)]
+    mixed = [some[p % 2].events.row(p) for p in range(24)]  # type: ignore[union-attr]
+    assert sigmas(EarlyIntervals, tr_of(mixed, grid(4, 6), 2e-2, 1e-10, 50e-9), DIM)[6:].min() > laws.z_bound()
+    everywhere = np.abs(sigmas(EarlyIntervals, with_afterpulses(1, 0.1), DIM)[6:]).max()
+    assert everywhere < laws.z_bound(laws.FALSE_ALARM / 2)
+
+
 def test_cells_belong_to_the_conditions() -> None:
     """Not finer than a tick, nothing below 0, and there for recordings without a detection."""
     for tick, dead_time, cells in ((1e-9, 50e-9, 31), (1e-8, 50e-9, 4), (1e-10, 0.0, 40), (1e-10, 4e-9, 48)):
@@ -75,6 +136,10 @@ def test_cells_belong_to_the_conditions() -> None:
         assert EdgeIntervals().reduce(made[0]).values.sum() == 0  # type: ignore[union-attr]
         assert reduced(Rescaled, made[0]).values.tolist() == [0.0] * 20
         assert RescaledLag().reduce(made[0]) is None
+        few = [tr(1, grid(2, 4), rate, 1e-3, dead_time, tick=tick) for rate in (0.0, 1e3, 1e5)]
+        early = [reduced(EarlyIntervals, recording).values for recording in few]
+        assert len({len(values) for values in early}) == 1 and np.isfinite(early).all()
+        assert EarlyIntervals().reduce(made[0]) is None  # of four pixels
     assert reduced(EdgeIntervals, tr(1, grid(1, 4), 1e5, 1e-3, 0.0)).where(0) == "intervals of 0 to 500 ps"
 
 
@@ -88,9 +153,9 @@ def test_laws_of_steady_light(steady: partial[Recording]) -> None:
     for statistic, least in ((EdgeIntervals, 0.8), (Intervals, 0.6), (Rescaled, 0.9)):
         null_laws.poisson(many(statistic, steady, 120), least)
     null_laws.normal(many(RescaledLag, steady, 120), spread=None)
-    # the rate is fitted, so that u is not quite even where a pixel has few intervals; here it is, to 1 %
-    share = many(Rescaled, steady, 60).sum(axis=0)
-    assert np.abs(share / share.mean() - 1).max() < 5 / math.sqrt(share.mean()) + 0.02
+    early = many(EarlyIntervals, steady, 120)
+    null_laws.normal(early[:, :6])
+    null_laws.normal(early, spread=None)  # of what is not rare there are fewer pairs than go by chance alone
 
 
 def test_laws_fail_where_detections_come_in_clumps() -> None:

@@ -93,7 +93,17 @@ def ticks_of(recording: Recording) -> tuple[list[np.ndarray], float]:
 
 
 @pytest.mark.parametrize(
-    "kind", ["tr", "tr without ticks", "coarse", "hexagons", "two rows", "crowded", "crowded hexagons", "several slabs"]
+    "kind",
+    [
+        "tr",
+        pytest.param("tr without ticks", marks=pytest.mark.slow),
+        "coarse",
+        "hexagons",
+        "two rows",
+        "crowded",
+        "crowded hexagons",
+        "several slabs",
+    ],
 )
 def test_stamps_of_a_small_recording(kind: str) -> None:
     more = {
