@@ -287,6 +287,16 @@ def test_no_chance_is_none_at_all(lab):
     assert 0 < p < 1e-100 and math.isfinite(significance)
 
 
+def test_of_what_is_faint_the_trace_decides_and_not_the_squares(lab):
+    """Chance moves the squares of all cells by more than a faint effect does."""
+    course = course_of.begun(bench_of(lab()))
+    one = given(course, "add afterpulsing", {PROBABILITY: 0.02, LIFETIME: 50e-9}, False)
+    much, none = (replace(one, gain=gain) for gain in (400.0, 0.0))
+    assert chance.of_best(course.bench, course.state, [one], much)[1] < 1e-8  # as where something is plainly wrong
+    of_trace = chance.of_best(course.bench, course.state, [one], none, False)
+    assert chance.of_best(course.bench, course.state, [one], much, False) == of_trace and of_trace[1] > 1e-6
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_several_strengths_the_clearest_tells_the_limit(lab, monkeypatch, order: int) -> None:
     """One that is so weak that it does nothing says nothing of what can be seen."""

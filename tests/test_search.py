@@ -273,9 +273,12 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     )
     seen: list[Tried] = []
     monkeypatch.setattr(Search, "_simulated", lambda self, state, tried, few, only=(): seen.extend(tried) or [])
-    monkeypatch.setattr(Search, "maps", lambda self, state, values: [])
+    asked: list[float] = []
+    monkeypatch.setattr(Search, "maps", lambda self, state, values, least: asked.append(least) or [])
     look.again(state, {}, [far, near])
     assert [one.values[CROSSTALK] for one in seen] == [pytest.approx(0.004 * max(0.8, 1.0), rel=0.3)]
+    look.again(state, {}, [far, replace(near, change=change_of(bench, "add blinking_dark_counts"), chips=True)])
+    assert asked == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
 
 
 def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> None:

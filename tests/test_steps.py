@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -231,14 +232,14 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
     course = course_of.begun(bench_of(lab()))
     map_, other = (
         Tried(change_of(course.bench, name), {}, Moved({}, {}, {}), gain, 1.0)
-        for name, gain in (("per_pixel dark_counts.rate", 18.0), ("add slow_afterpulsing", 37.0))
+        for name, gain in (("per_pixel dark_counts.rate", -3.0), ("add slow_afterpulsing", 37.0))
     )
     for name in ("again", "worth"):
         monkeypatch.setattr(course.search, name, lambda *_: [map_, other])
     monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
     monkeypatch.setattr(diagnose, "refine", lambda bench, state, one: one)
     monkeypatch.setattr(
-        diagnose.chance, "of_best", lambda bench, state, tried, one: (4.0, 1e-5 if one is map_ else 1e-3)
+        diagnose.chance, "of_best", lambda bench, state, tried, one, large: (4.0, 1e-5 if one is map_ else 1e-3)
     )
     taken: list[Tried] = []
 
@@ -247,11 +248,41 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         raise StopIteration
 
     monkeypatch.setattr(diagnose, "accept", accept)
-    map_.chance = 1e-5  # and so no gain is asked of it
     for failed in ([], [object()]):
         with pytest.raises(StopIteration):
             diagnose._added(course, diagnose._Beside([], False), failed)  # type: ignore[arg-type]
     assert taken == [map_, other]
+
+
+@pytest.mark.parametrize("odd", [True, False])
+def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(lab, monkeypatch, odd: bool) -> None:
+    """But not as unlikely as what has nothing to do with pixels."""
+    course = course_of.begun(bench_of(lab()))
+    map_, other = (
+        Tried(change_of(course.bench, name), {}, Moved({}, {}, {}), 50.0, 1.0)
+        for name in ("per_pixel dark_counts.rate", "add blinking_dark_counts")
+    )
+    map_.maps, other.chips = {}, odd
+    map_.maps[map_.change.carrier] = None  # type: ignore[index, assignment]
+    for name in ("again", "worth"):
+        monkeypatch.setattr(course.search, name, lambda *_: [map_, other])
+    monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
+    monkeypatch.setattr(course.search, "preferred", lambda refined, merit: map_)
+    monkeypatch.setattr(diagnose, "refine", lambda bench, state, one: one)
+    monkeypatch.setattr(
+        diagnose.chance, "of_best", lambda bench, state, tried, one, large: (4.0, 0.02 if one is map_ else 1e-4)
+    )
+    taken: list[Tried] = []
+
+    def accept(course: Any, best: Tried, significance: float) -> Any:
+        taken.append(best)
+        raise StopIteration
+
+    monkeypatch.setattr(diagnose, "accept", accept)
+    monkeypatch.setattr(diagnose, "_few", lambda course: False)
+    with pytest.raises(StopIteration) if odd else contextlib.nullcontext():
+        assert not diagnose._added(course, diagnose._Beside([], False), [])
+    assert taken == ([map_] if odd else [])
 
 
 @pytest.mark.parametrize("rival", [pytest.param(False, marks=pytest.mark.slow), True])

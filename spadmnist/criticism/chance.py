@@ -54,8 +54,11 @@ def of_any(bench: Bench, state: State, tried: Sequence[Tried], values: dict[Key,
     return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
 
 
-def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried) -> tuple[float, float]:
-    """(significance of the best in standard deviations, p-value of the largest of all candidates')."""
+def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, large: bool = True) -> tuple[float, float]:
+    """(significance of the best in standard deviations, p-value of the largest of all candidates').
+
+    large: is something plainly wrong, so that it may be more than its trace says?
+    """
     if best.chance is not None:
         others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
@@ -63,9 +66,9 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried) -> 
     found = along(bench, state, best.moved)
     if found.size <= 0:
         return 0.0, 1.0
-    # what is far outside is no matter of the linear law: the gain itself, in the same measure
     mark = abs(found.data) if best.signed else max(found.data, 0.0)
-    mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
+    if large:  # what is far outside is no matter of the linear law: the gain itself, in the same measure
+        mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
     sides = len(best.change.strengths) if _sided(best) else 0
     one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if best.signed else 2)
     return mark, max(_of_least(own, one), LEAST_P)

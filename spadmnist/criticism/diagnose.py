@@ -27,14 +27,13 @@ from .fit import RATES, Bench, State
 from .ladder import placebo_row
 from .refining import refine
 from .search import alike
-from .tried import EACH, Tried
+from .tried import Tried
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
-_TRACE = 2e-3  # p-value of a trace that is followed where no check fails by itself: far less than what checks alarm by
+_TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself: less than what checks alarm by
 _MAYBE, _CLOSER = 100.0, recordings.REPLICATES  # times as likely by chance: worth so many recordings
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
-_TRACE_GAIN = 20.0  # and what such a step must be worth in chi square
 
 
 def diagnose(
@@ -185,14 +184,17 @@ def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> b
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
     refined = [refine(bench, course.state, one) for one in worth]
-    search.weigh(course.state, refined)
-    judged = {id(one): chance.of_best(bench, course.state, beside.tried, one) for one in refined}
+    if failed:  # what is faint is less than the noise of the squares of all cells
+        search.weigh(course.state, refined)
+    judged = {id(one): chance.of_best(bench, course.state, beside.tried, one, bool(failed)) for one in refined}
     # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best
     best = search.preferred(refined, lambda t: (0.0 if failed else -judged[id(t)][1], t.gain))
     significance, p = judged[id(best)]
-    # small differences of many pixels, or codes, are no matter of squares: their chance is known by itself
-    least = LEAST_GAIN if failed else _TRACE_GAIN if best.chance is None else EACH
-    if p > (comparing.FALSE_ALARM if failed else _TRACE) or best.gain < least:
+    likely = min(refined, key=lambda t: judged[id(t)][1])
+    if best.maps and likely.chips:  # a map of the pixels that chance has made odd: as little likely as that
+        p = judged[id(likely)][1]
+    # nor are small differences of many pixels, or codes: their chance is known by itself
+    if p > (comparing.FALSE_ALARM if failed else _TRACE) or (failed and best.gain < LEAST_GAIN):
         if not failed or not _few(course):
             return False
         course.state = _closer(course)  # something is wrong: too few recordings may be all that hides what it is
