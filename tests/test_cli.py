@@ -166,7 +166,7 @@ def test_an_error_that_cannot_be_said_keeps_its_status() -> None:
         assert shell(f"spadmnist verify /nonexistent {redirected}").returncode == 2, redirected
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [COMMANDS[0], *(pytest.param(x, marks=pytest.mark.slow) for x in COMMANDS[1:])])
 def test_closed_streams(command: str, made: tuple[Path, Path]) -> None:
     for redirected in (">&-", "2>&-", "<&-", ">&- 2>&- <&-"):
         result = shell(f"spadmnist {command.format(file=made[0], root=made[1])} {redirected}")
@@ -426,7 +426,10 @@ def test_absurd_values_are_refused_at_once(
     assert sorted(tree(tmp_path)) == ["c.yaml"]
 
 
-@pytest.mark.parametrize("level", [".5 lux", "+5 mlux", "5. mlux", "5e-3 lux", "5 ulux"])
+SPELLINGS = [".5 lux", "5 ulux", *(pytest.param(x, marks=pytest.mark.slow) for x in ("+5 mlux", "5. mlux", "5e-3 lux"))]
+
+
+@pytest.mark.parametrize("level", SPELLINGS)
 def test_levels_in_any_spelling(level: str, tmp_path: Path) -> None:
     """Made and found again by the name that the config gives, or refused with a sentence."""
     file = write_config(tmp_path / "c.yaml", levels=(level,), train=3, test=1)

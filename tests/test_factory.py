@@ -698,6 +698,7 @@ class Slow(Effect, stage="light"):
 '''
 
 
+@pytest.mark.slow
 def test_two_writers(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     file = write_config(tmp_path / "c.yaml", more="    slow: {}\n")
