@@ -505,7 +505,8 @@ captures; the rate of a typical pixel; the largest deviation of one light level 
 between detections that stand elsewhere; the share of detections whose neighbours fire too often or too seldom.</dd>
 <dt>sigma</dt><dd>One standard deviation of what chance does. Of a step: how unlikely it is that chance alone makes its
 effect look so helpful, with all that was tried allowed for.</dd>
-<dt>95 % interval</dt><dd>The range of values that the data bear with.</dd>
+<dt>95 % interval</dt><dd>The range of values that the data bear with, if the model found is right. Where checks still
+fail, or another law is at work than the model's, the truth may lie outside.</dd>
 <dt>placebo</dt><dd>An effect that has nothing to do with it, added all the same: that much falls by itself.</dd>
 <dt>set-up</dt><dd>Light level, exposure, wavelength, a leak in a dark capture: what the measurement states of itself.
 Where it explains everything, the sensor is not to blame.</dd>
