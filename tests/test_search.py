@@ -12,6 +12,7 @@ from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet
 
 from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
+from spadmnist.criticism import search as searching
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.candidates import Dial, first_strengths
 from spadmnist.criticism.chance import along
@@ -278,7 +279,17 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     look.again(state, {}, [far, near])
     assert [one.values[CROSSTALK] for one in seen] == [pytest.approx(0.004 * max(0.8, 1.0), rel=0.3)]
     look.again(state, {}, [far, replace(near, change=change_of(bench, "add blinking_dark_counts"), chips=True)])
-    assert asked == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
+    # of what is faint the trace decides which are looked at again, and how strong they are
+    clear = replace(near, moved=Moved({}, {}, {"flat": 2.0}), gain=0.0)
+    weak = replace(far, change=change_of(bench, "add afterpulsing"), moved=Moved({}, {}, {"flat": 3.0}))
+    traces = {id(clear.moved): 4.5, id(weak.moved): 1.0}
+    monkeypatch.setattr(
+        searching, "along", lambda bench, state, moved: chance.Likeness(9.0, traces[id(moved)], np.zeros(16), 1.0, 15.0)
+    )
+    seen.clear()
+    look.again(state, {}, [weak, clear], faint=True)
+    assert [one.change.name for one in seen] == ["add crosstalk"]
+    assert asked[:2] == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
 
 
 def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import answer, diagnose, findings, fit, likelihood, settling
+from spadmnist.criticism import answer, chance, diagnose, findings, fit, likelihood, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved, State
@@ -248,41 +247,60 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         raise StopIteration
 
     monkeypatch.setattr(diagnose, "accept", accept)
-    for failed in ([], [object()]):
+    for failed in ([object()], []):
         with pytest.raises(StopIteration):
             diagnose._added(course, diagnose._Beside([], False), failed)  # type: ignore[arg-type]
-    assert taken == [map_, other]
+    assert taken == [other, map_] and map_.gain == 16.0  # the square of its trace's, whatever all cells have gained
 
 
-@pytest.mark.parametrize("odd", [True, False])
-def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(lab, monkeypatch, odd: bool) -> None:
-    """But not as unlikely as what has nothing to do with pixels."""
-    course = course_of.begun(bench_of(lab()))
-    map_, other = (
-        Tried(change_of(course.bench, name), {}, Moved({}, {}, {}), 50.0, 1.0)
-        for name in ("per_pixel dark_counts.rate", "add blinking_dark_counts")
+@pytest.mark.parametrize(
+    ("odd", "numbers", "first"),
+    [(True, 0.9, "per_pixel dark_counts.rate"), (True, 0.2, "add blinking"), (False, 0.9, "add blinking")],
+)
+def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(
+    lab, monkeypatch, odd: bool, numbers: float, first: str
+) -> None:
+    """But only where it is their numbers that tell, and not as unlikely as what has nothing to do with pixels."""
+    bench = bench_of(lab())
+    look = quiet(bench)
+    map_, codes, other = (
+        Tried(change_of(bench, name), {}, Moved({}, {}, {}), 50.0, 1.0)
+        for name in ("per_pixel dark_counts.rate", "add tdc_nonlinearity", "add blinking_dark_counts")
     )
-    map_.maps, other.chips = {}, odd
-    map_.maps[map_.change.carrier] = None  # type: ignore[index, assignment]
-    for name in ("again", "worth"):
-        monkeypatch.setattr(course.search, name, lambda *_: [map_, other])
-    monkeypatch.setattr(course.search, "structured", lambda state, tried: tried)
-    monkeypatch.setattr(course.search, "preferred", lambda refined, merit: map_)
-    monkeypatch.setattr(diagnose, "refine", lambda bench, state, one: one)
-    monkeypatch.setattr(
-        diagnose.chance, "of_best", lambda bench, state, tried, one, large: (4.0, 0.02 if one is map_ else 1e-4)
-    )
-    taken: list[Tried] = []
+    map_.maps, codes.maps, other.chips = {(): None}, {(): None}, odd  # type: ignore[dict-item]
+    monkeypatch.setattr(look, "_of_numbers", lambda *_: numbers)
+    judged = {id(map_): (2.0, 0.02), id(codes): (2.1, 0.015), id(other): (4.0, 1e-4)}
+    best, significance, p = look.least_likely(bench.state({}), [codes, map_, other], lambda t: judged[id(t)])
+    assert best.change.name.startswith(first) and (significance, p) == (4.0, 1e-4)
 
-    def accept(course: Any, best: Tried, significance: float) -> Any:
-        taken.append(best)
-        raise StopIteration
 
-    monkeypatch.setattr(diagnose, "accept", accept)
-    monkeypatch.setattr(diagnose, "_few", lambda course: False)
-    with pytest.raises(StopIteration) if odd else contextlib.nullcontext():
-        assert not diagnose._added(course, diagnose._Beside([], False), [])
-    assert taken == ([map_] if odd else [])
+def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
+    bench = bench_of(lab())
+    state, look = bench.state({}), quiet(bench)
+    for name, low, high in (("per_pixel dark_counts.rate", 0.7, 1.0), ("add crosstalk", 0.0, 0.3)):
+        change = change_of(bench, name)
+        if name.startswith("per_pixel"):
+            rng = np.random.default_rng(1)
+            usual = float(np.mean(state.sensors.one.effect("dark_counts").rate))
+            values = {("dark_counts", "rate"): usual * np.exp(1.5 * rng.standard_normal(bench.start.layout.pixels))}
+        else:
+            values = {CROSSTALK: 0.05}
+        (moved,) = bench.moved(state, [state.sensors.changed(values)])
+        assert not isinstance(moved, str) and change.effect
+        assert low <= look._of_numbers(state, moved) <= high, name
+
+
+def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
+    """Settled by chance at twice its strength and more, or with the other sign, it does not."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    one = Tried(change_of(bench, "add crosstalk"), {CROSSTALK: 0.01}, Moved({}, {}, {}), 50.0, 1.0)
+    for size, data, there, good in ((3.0, 4.0, True, True), (9.0, 4.0, True, False), (3.0, -4.0, True, False)):
+        found = chance.Likeness(size, data, np.zeros(16), 1.0, 15.0)
+        monkeypatch.setattr(chance, "along", lambda *_, found=found: found)
+        one.there = Moved({}, {}, {}) if there else None
+        assert chance.helps(bench, state, one) == good
+    assert chance.helps(bench, state, replace(one, there=None)) and chance.helps(bench, state, replace(one, chance=0.1))
 
 
 @pytest.mark.parametrize("rival", [pytest.param(False, marks=pytest.mark.slow), True])

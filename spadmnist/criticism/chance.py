@@ -74,6 +74,14 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
     return mark, max(_of_least(own, one), LEAST_P)
 
 
+def helps(bench: Bench, state: State, one: Tried) -> bool:
+    """Does a settled candidate bring the data nearer along its own trace? Half as much as its numbers say would do."""
+    if one.chance is not None or one.there is None:
+        return True
+    found = along(bench, state, one.there)
+    return found.size < 2.0 * found.data
+
+
 def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list[float], np.ndarray]:
     """(p-value of the trace of each candidate in the data, (recordings,) the least of them in the model's own).
 

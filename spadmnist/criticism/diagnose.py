@@ -153,11 +153,12 @@ def _another(course: Course, beside: _Beside) -> bool:
         bench.say(f"step {number}: no check fails; looking for the trace of every candidate")
         beside.tried = search.scan(course.state, everywhere=True, known=beside.tried)
         before = beside.looked = course.state
-        if _stands_out(course, beside.tried, _TRACE if not course.steps else _LATER_TRACE):
+        trace = _LATER_TRACE if course.steps else _TRACE
+        if _stands_out(course, beside.tried, trace):
             closer = course.state
             if closer is not before:  # which may show lines that the few recordings did not
                 beside.tried = search.scan(closer, everywhere=True, known=beside.tried)
-            if _added(course, beside, failed):
+            if _added(course, beside, failed, trace):
                 return True
             if course.state is not closer:
                 return False
@@ -171,38 +172,47 @@ def _another(course: Course, beside: _Beside) -> bool:
     return _added(course, beside, failed)
 
 
-def _added(course: Course, beside: _Beside, failed: Sequence[checks.Block]) -> bool:
-    """Is the best of the candidates a step after which another one may come? Adds it, if it is one."""
-    bench, search = course.bench, course.search
+def _added(
+    course: Course, beside: _Beside, failed: Sequence[checks.Block], least: float = comparing.FALSE_ALARM
+) -> bool:
+    """Is the best of the candidates a step after which another one may come? Adds it, if it is one.
+
+    least: the p-value that it must have.
+    """
+    bench, search, faint = course.bench, course.search, not failed
     number = len(course.steps) + 1
     # what a step has set is settled anew with every other one: no finding of its own
     beside.tried = [t for t in beside.tried if t.change.kind != "set" or course.values.keys().isdisjoint(t.values)]
     bench.say(f"step {number}: the best of them on all captures")
-    second = search.structured(course.state, search.again(course.state, course.values, beside.tried))
+    second = search.structured(course.state, search.again(course.state, course.values, beside.tried, faint))
     if not second:
         return False
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
     refined = [refine(bench, course.state, one) for one in worth]
-    if failed:  # what is faint is less than the noise of the squares of all cells
+    if not faint:
         search.weigh(course.state, refined)
-    judged = {id(one): chance.of_best(bench, course.state, beside.tried, one, bool(failed)) for one in refined}
-    # of what is faint the squares are mostly chance: the least likely one, not the one that chance has made best
-    best = search.preferred(refined, lambda t: (0.0 if failed else -judged[id(t)][1], t.gain))
-    significance, p = judged[id(best)]
-    likely = min(refined, key=lambda t: judged[id(t)][1])
-    if best.maps and likely.chips:  # a map of the pixels that chance has made odd: as little likely as that
-        p = judged[id(likely)][1]
-    # nor are small differences of many pixels, or codes: their chance is known by itself
-    if p > (comparing.FALSE_ALARM if failed else _TRACE) or (failed and best.gain < LEAST_GAIN):
-        if not failed or not _few(course):
+    judged = {id(one): chance.of_best(bench, course.state, beside.tried, one, not faint) for one in refined}
+    if faint:
+        for one in refined:
+            one.gain = judged[id(one)][0] ** 2
+        refined = [one for one in refined if chance.helps(bench, course.state, one)]
+        if not refined:
+            return False
+        best, significance, p = search.least_likely(course.state, refined, lambda t: judged[id(t)])
+    else:
+        best = search.preferred(refined, lambda t: t.gain)
+        significance, p = judged[id(best)]
+    # small differences of many pixels, or codes, are no matter of squares: their chance is known by itself
+    if p > least or (best.gain < LEAST_GAIN and not faint):
+        if faint or not _few(course):
             return False
         course.state = _closer(course)  # something is wrong: too few recordings may be all that hides what it is
         return True
     before, earlier, fell = course.state, course.kept(), course.misfit
     new = accept(course, best, significance)
     if best.maps is None and not best.phases:
-        unseen = search.scattered(before, course.values, best)
+        unseen = search.scattered(before, course.values, best, faint)
         refined, second = refined + unseen, second + unseen
     new[0].alternatives = _alternatives(bench, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}

@@ -18,10 +18,11 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
+from ..statistics import Statistic
 from . import checks, fit, mapping
 from .candidates import Change, Key, chancy, changes, templates, with_values
-from .chance import LEAST_P, of_map
-from .fit import Bench, Moved, Sensors, State, square, stacked
+from .chance import LEAST_P, along, of_map
+from .fit import RATES, Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
 from .swings import NEAR, TIMES, turned
@@ -40,6 +41,7 @@ _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: 
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
 _TOLD = 50.0  # inverse square of what is known of a pixel by its counts: more is seen in maps
 _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neither is better; what few recordings blur
+_MOSTLY = 0.5  # of the squares of a trace
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _MOVED = 0.3  # standard deviations, by which a cell is moved
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
@@ -278,9 +280,15 @@ class Search:
         dark = [id for id in ids if self.bench.seen[id].capture.light.dark][:1]
         return list(dict.fromkeys([*ids[: 3 - len(dark)], *dark]))
 
-    def again(self, state: State, values: dict[Key, Any], tried: list[Tried]) -> list[Tried]:
-        """The best candidates at the strength that suits them, on all captures; maps beside them."""
+    def again(self, state: State, values: dict[Key, Any], tried: list[Tried], faint: bool = False) -> list[Tried]:
+        """The best candidates at the strength that suits them, on all captures; maps beside them.
+
+        faint: is no check failing? Then the squares of all cells are more noise than effect, and what counts as a gain
+        is the square of how much the data resemble the trace.
+        """
         best: list[Tried] = []
+        if faint:
+            tried = sorted((self._marked(state, t) for t in tried), key=lambda t: -t.gain)
         for one in tried:
             if one.gain > 9 and all(b.change.name != one.change.name for b in best):
                 # of what does nearly as well, what was simulated nearest to where it does so
@@ -315,9 +323,18 @@ class Search:
             else:
                 one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
                 if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
-                    one.gain = max(one.gain, float(stats.norm.isf(max(one.chance, LEAST_P) / 2)) ** 2)
-            kept.append(one)
+                    one.gain = max(one.gain, _mark_of(one.chance) ** 2)
+            kept.append(self._marked(state, one) if faint else one)
         return sorted(kept, key=lambda t: -t.gain)
+
+    def _marked(self, state: State, one: Tried) -> Tried:
+        """The same, its gain being the square of how much the data resemble its trace."""
+        if one.chance is not None:
+            return replace(one, gain=_mark_of(one.chance) ** 2)
+        found = along(self.bench, state, one.moved)
+        mark = abs(found.data) if one.signed else max(found.data, 0.0)
+        suits = found.data / found.size if mark > 0 else one.times
+        return replace(one, gain=mark**2, times=one.times if one.gain > 0 else suits)
 
     def maps(self, state: State, values: dict[Key, Any], least: float = _LEAST_CHANCE) -> list[Tried]:
         """Every map whose values differ beyond their noise, and all that are needed side by side.
@@ -389,10 +406,11 @@ class Search:
             rest.insert(0, first)
         return rest
 
-    def scattered(self, state: State, values: dict[Key, Any], like: Tried) -> list[Tried]:
+    def scattered(self, state: State, values: dict[Key, Any], like: Tried, faint: bool = False) -> list[Tried]:
         """Maps that no pixel tells by its counts, but that may do to all else what a candidate does.
 
         Pixels that differ at random: every recording has others. Those that bring the data as near as `like` does.
+        faint: see `again`.
         """
         levels = mapping.levels_of(self.bench, state)
         out = []
@@ -414,9 +432,10 @@ class Search:
                         continue
                     residuals = self.bench.residuals(state, moved)
                     gain = square(state.residuals) - square(residuals)
-                    if best is None or gain > best.gain:
-                        best = Tried(change, {}, moved, gain, 1.0, sensors, residuals=residuals)
-                        about = float(sigma)
+                    one = Tried(change, {}, moved, gain, 1.0, sensors, residuals=residuals)
+                    one = self._marked(state, one) if faint else one
+                    if best is None or one.gain > best.gain:
+                        best, about = one, float(sigma)
                 if best is None or best.gain < like.gain / 2:
                     break
                 sigmas = about * np.exp(math.log(sigmas[1] / sigmas[0]) * np.array([-0.6, -0.3, 0.3, 0.6]))
@@ -483,9 +502,35 @@ class Search:
             left[id(one)] = len(checks.failing(checks.blocks(self.bench, state, state.residuals)))
         return min(rivals, key=lambda t: (left[id(t)], t.chips, -t.gain))
 
+    def least_likely(
+        self, state: State, refined: Sequence[Tried], judged: Callable[[Tried], tuple[float, float]]
+    ) -> tuple[Tried, float, float]:
+        """(the one of some faint candidates that chance makes least, its significance, its p-value).
+
+        judged: candidate -> (significance, p-value). A pattern of several is the first here, too; and where chance has
+        made pixels odd and it is their numbers that tell so, a map of them tells the same, and is not rarer.
+        """
+        best = refined[0] if is_pattern(refined[0]) else min(refined, key=lambda t: judged(t)[1])
+        maps = [t for t in refined if t.maps and t.change.per == "pixel"]
+        told = best
+        if best.chips and maps and self._of_numbers(state, best.moved) > _MOSTLY:
+            best = min(maps, key=lambda t: judged(t)[1])
+        return best, *judged(told)
+
+    def _of_numbers(self, state: State, moved: Moved) -> float:
+        """The share of a trace, by its squares, in what counts detections and sets none beside another."""
+        squares = {cell: float(t @ t) for cell, t in self.bench.template(state, moved).items() if cell != RATES}
+        counts = sum(x for (_, name), x in squares.items() if Statistic.registry.find(name).among == "")
+        return counts / max(sum(squares.values()), 1e-300)
+
     def beside(self, state: State, sensors: Sensors) -> float:
         """By how much the data lie nearer to another model, each judged by its own scatter."""
         return square(state.residuals) - square(self.bench.state({}, sensors).residuals)
+
+
+def _mark_of(chance: float) -> float:
+    """Standard deviations of a p-value."""
+    return float(stats.norm.isf(max(chance, LEAST_P) / 2))
 
 
 def alike(gain: float) -> float:

@@ -20,7 +20,6 @@ import numpy as np
 
 _FEW = 128  # up to so many detections the law of their pairs is worked out exactly
 _THIN = 0.1  # and if they fill less than this share of the slots, so that slots hardly matter
-_FEWEST_BOXES = 6.0  # in which pairs fall, for their law to be known
 _SPARSE = 30.0  # expectations below it are no normal variable
 _GOLDEN = 0x9E3779B97F4A7C15
 
@@ -115,22 +114,32 @@ def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pair
     return Pairs(all_pairs * (slots - 1.0) / max(1.0, places - 1.0), variance, variance * np.maximum(shape, 1e-3))
 
 
-def unequal_pairs_law(expected: np.ndarray) -> Pairs:
-    """Law of the pairs within boxes that are not equal, given the number of detections. expected: of each box.
+def unequal_pairs_law(number: float, chances: np.ndarray) -> Pairs:
+    """Law of the pairs within boxes, given the number of detections. chances: of each box, 1 in all.
 
-    That of Poisson numbers n of mean m, of n (n - 1) / 2 - c n, whose slope c on the number of all is taken out: the
-    joint cumulants of pairs and numbers are derivatives of m^2 / 2. To the first order in one over the number of all.
-    Nothing is known, and all is 0, where a few boxes have nearly all pairs.
+    Mean and variance are exact. The third cumulant is exact for equal boxes; what others add to it is that of Poisson
+    numbers: it is good to some per cent where no box has most of the pairs.
     """
-    m = np.asarray(expected, np.float64)
-    total = m.sum()
-    if total < 2.0 or (m**2).sum() ** 2 < _FEWEST_BOXES * (m**4).sum():
-        return Pairs(*(np.zeros(()) for _ in range(3)))
-    c = (m**2).sum() / total
-    mean = (m**2).sum() / 2.0
-    variance = (m**2 / 2.0 + m**3).sum() - c**2 * total
-    third = (m**2 / 2 + 4 * m**3 + 4 * m**4 - 3 * c * (m**2 + 3 * m**3) + 6 * c**2 * m**2 - c**3 * m).sum()
-    return Pairs(*(np.asarray(part * (1.0 - 1.0 / total)) for part in (mean, variance, max(third, 1e-3 * variance))))
+    p = np.asarray(chances, np.float64)
+    second, cubes = float((p**2).sum()), float((p**3).sum())
+    two = number * (number - 1.0)
+    three = two * max(0.0, number - 2.0)
+    alone = two * second * (1.0 - second) / 2.0
+    variance = alone + three * max(0.0, cubes - second**2)
+    third = alone * (1.0 - 2.0 * second + 2.0 * max(0.0, number - 2.0) * second)
+    if three > 0:
+        third += (_third_of_poisson(number * p) - number**2 * second / 2.0 - number**3 * second**2) * three / number**3
+    return Pairs(*(np.asarray(x) for x in (two * second / 2.0, variance, max(third, 1e-3 * variance))))
+
+
+def _third_of_poisson(m: np.ndarray) -> float:
+    """Third cumulant of the sum of n (n - 1) / 2 - c n, n being Poisson of mean m, c the slope of the pairs on the sum
+    of n. The joint cumulants of pairs and numbers are derivatives of m^2 / 2; where all m are alike it is m^2 / 2 + m^3
+    of each.
+    """
+    c = float((m**2).sum() / m.sum())
+    terms = m**2 / 2 + 4 * m**3 + 4 * m**4 - 3 * c * (m**2 + 3 * m**3) + 6 * c**2 * m**2 - c**3 * m
+    return float(terms.sum())
 
 
 def gamma_score(number: np.ndarray | float, law: Pairs) -> np.ndarray:

@@ -16,7 +16,6 @@ from ._counting import (
     guide,
     logarithmic,
     of_detections,
-    per_cent,
     place,
     root_of,
     span,
@@ -36,7 +35,7 @@ _PER_DECADE = 10
 _KNOWN = 16  # intervals from which on a pixel's own rate is known well enough
 _LEVELS = 20
 _LAGS = (1, 2, 3, 5, 10, 20)
-_FEWEST_PIXELS = 8  # that can differ
+_FEWEST_PIXELS, _BRIGHTEST = 16, 2.0  # that can differ; times as many short intervals as usual, in a pixel
 _FEWEST = 300  # products from which on a correlation is a normal variable
 
 
@@ -155,11 +154,12 @@ class FineIntervals(Statistic):
 
 
 class EarlyIntervals(Statistic):
-    """How unlike the pixels are in their shortest intervals: the variance of their numbers beyond counting noise.
+    """How unlike the pixels are in their shortest intervals: pairs of short intervals in the same pixel.
 
-    Intervals up to 5, 2 and 0.5 ns below the dead time, up to it, and up to 1, 5, 20 and 100 ns behind it. How
-    many a pixel has, if all have one dead time, follows from its rate. Law: normal, as the score of the pairs of short
-    intervals in the same pixel, given the number of all.
+    Intervals up to 5, 2 and 0.5 ns below the dead time, up to it, and up to 1, 5, 20 and 100 ns behind it. How many of
+    all of them a pixel should have, if all have one dead time, follows from its rate; pixels that should have more than
+    twice as many as usual are left out, lest they have nearly all pairs. Law: normal, as the score of the pairs given
+    the number of intervals; Poisson where there are few pairs.
     Shows: a dead time that differs from pixel to pixel (jitter blurs the edge in all pixels alike, and is not seen),
     afterpulsing that some pixels have and others not.
     Source: index of dispersion (Fisher, Biometrics 6, 1950).
@@ -170,48 +170,52 @@ class EarlyIntervals(Statistic):
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        if not has_data(recording) or recording.pixels < _FEWEST_PIXELS:
-            return None
-        assert recording.events is not None
-        stamps, tick = whole_ticks(recording)
+        tick = tick_of(recording)
         bounds = np.unique(np.rint((recording.dead_time + np.array(_EARLY)) / tick).astype(np.int64))
         bounds = bounds[bounds > 0]
+        if not has_data(recording) or recording.pixels < _FEWEST_PIXELS or not bounds.size:
+            return None
+        assert recording.events is not None
+        stamps, _ = whole_ticks(recording)
         numbers = np.zeros((bounds.size, recording.pixels), np.int64)
         _up_to(stamps, recording.events.offsets, bounds, numbers)
         numbers = numbers.cumsum(axis=0)
 
         detections = recording.totals.astype(np.float64)
         live = np.maximum(recording.conditions.exposure - detections * recording.dead_time, detections * tick)
+        rates = np.divide(detections, live, out=np.zeros_like(live), where=detections > 0)
         # up to a tick behind the dead time in proportion to the time, then ever fewer of what is left
         behind = np.maximum(bounds * tick - recording.dead_time, tick)
-        rates = np.divide(detections, live, out=np.zeros_like(live), where=detections > 0)
         share = shares(recording.totals, bounds.size)
-        laws, scores = [], []
+        laws, pairs, scores = [], [], []
         for number, time, one in zip(numbers, behind, share, strict=True):
-            chance = -detections * np.expm1(-rates * time)
-            law = unequal_pairs_law(number.sum() * chance / max(float(chance.sum()), 1e-300))
-            laws.append(law)
-            pairs = float((number * (number - 1)).sum()) / 2.0
-            # where nothing is known it is a normal variable all the same, as in other recordings
-            scores.append(pooled_score(pairs if law.mean > 0 else 0.0, law, one))
-
-        def relative(cell: int, score: float) -> float:
-            """Relative variance between pixels beyond noise."""
-            law = laws[cell]
-            pairs = number_at(score, lambda number, part: pooled_score(number, law, part), float(law.mean))
-            return pairs / float(law.mean) - 1.0 if law.mean > 0 else 0.0
+            chances = -detections * np.expm1(-rates * time)
+            usual = float(np.median(chances[chances > 0])) if chances.any() else 0.0
+            kept = (chances > 0) & (chances <= _BRIGHTEST * usual)
+            chances, number = chances[kept], number[kept]
+            laws.append(unequal_pairs_law(float(number.sum()), chances / max(float(chances.sum()), 1e-300)))
+            pairs.append(float((number * (number - 1)).sum()) / 2.0)
+            scores.append(pooled_score(pairs[-1], laws[-1], one))
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            found, wanted = (root_of(relative(cell, score)) for score in (measured, expected))
-            text = f"differ by {per_cent(found)} from pixel to pixel beyond counting noise, {per_cent(wanted)} expected"
-            few = float(numbers[cell].sum()) / max(1.0, float(detections.sum()))
-            return text, few * root_of(relative(cell, measured) - relative(cell, expected))
+            law, few = laws[cell], float(numbers[cell].sum())
+
+            def at(score: float) -> float:
+                if score == scores[cell]:
+                    return pairs[cell]
+                return number_at(score, lambda n, part: pooled_score(n, law, part), float(law.mean))
+
+            found, wanted = at(measured), at(expected)
+            # by so much do the numbers differ that make the pairs
+            change = root_of((found - wanted) / max(float(law.mean), 1.0))
+            text = f"{found:.4g} pairs in the same pixel of {few:.0f}, {wanted:.4g} expected"
+            return text, few / max(1.0, float(detections.sum())) * min(max(change, -1.0), 1.0)
 
         seconds = bounds * tick
         return Summary(
             np.array(scores),
             "normal",
-            lambda cell: f"numbers of intervals below {units.show(seconds[cell], 's')}",
+            lambda cell: f"intervals below {units.show(seconds[cell], 's')}, unlike in the pixels",
             size,
             axis=seconds,
             label="interval (s)",
