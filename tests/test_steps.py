@@ -295,10 +295,12 @@ def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
     bench = bench_of(lab())
     state = bench.state({})
     one = Tried(change_of(bench, "add crosstalk"), {CROSSTALK: 0.01}, Moved({}, {}, {}), 50.0, 1.0)
-    for size, data, there, good in ((3.0, 4.0, True, True), (9.0, 4.0, True, False), (3.0, -4.0, True, False)):
-        found = chance.Likeness(size, data, np.zeros(16), 1.0, 15.0)
+    (usual, much, less) = bench.moved(state, [state.sensors.changed({CROSSTALK: x}) for x in (0.02, 0.06, 0.01)])
+    one.moved = usual  # type: ignore[assignment]
+    for data, there, good in ((4.0, usual, True), (4.0, much, False), (4.0, less, True), (-4.0, less, False)):
+        found = chance.Likeness(4.0, data, np.zeros(16), 1.0, 15.0)
         monkeypatch.setattr(chance, "along", lambda *_, found=found: found)
-        one.there = Moved({}, {}, {}) if there else None
+        one.there = there  # type: ignore[assignment]
         assert chance.helps(bench, state, one) == good
     assert chance.helps(bench, state, replace(one, there=None)) and chance.helps(bench, state, replace(one, chance=0.1))
 

@@ -13,7 +13,7 @@ from scipy import stats
 from ..errors import SpadError
 from . import mapping
 from .candidates import Change, Key, changes
-from .fit import RATES, Bench, Cell, Moved, State
+from .fit import RATES, Bench, Cell, Moved, State, stacked
 from .lines import Line
 from .nulls import scores_of_powers
 from .tried import Tried, shape_of
@@ -75,11 +75,17 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
 
 
 def helps(bench: Bench, state: State, one: Tried) -> bool:
-    """Does a settled candidate bring the data nearer along its own trace? Half as much as its numbers say would do."""
+    """Does a settled candidate bring the data nearer along its own trace? Half as much as its numbers say would do.
+
+    The trace is that of the strength at which it was tried: where it is settled, chance may be more than all of it.
+    """
     if one.chance is not None or one.there is None:
         return True
-    found = along(bench, state, one.there)
-    return found.size < 2.0 * found.data
+    found = along(bench, state, one.moved)
+    keys = list(state.residuals)
+    trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved, one.there))
+    settled = found.size * float(trace @ there) / max(float(trace @ trace), 1e-300)
+    return abs(settled - found.data) < abs(found.data)
 
 
 def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list[float], np.ndarray]:
