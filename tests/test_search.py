@@ -292,6 +292,18 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     assert asked[:2] == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
 
 
+def test_a_number_that_a_step_settles_is_no_map(lab) -> None:
+    """It cannot be both: a measurement of pixels whose dark counts blink ended with a fault of the program."""
+    bench = bench_of(lab())
+    look, change = quiet(bench), change_of(bench, "add blinking_dark_counts")
+    state = bench.state({("blinking_dark_counts", "amplitude"): 300.0, ("blinking_dark_counts", "fraction"): 0.1})
+    carrier = ("blinking_dark_counts", "amplitude")
+    before = look.mappable(state)
+    look.accepted.append(change)
+    left = look.mappable(state)
+    assert [c for c in before if c not in left] == [c for c in before if c.carrier == carrier] != []
+
+
 def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> None:
     bench: Bench = bench_of(lab())
     state, look = bench.state({}), quiet(bench)

@@ -345,7 +345,7 @@ class Search:
             return []
         levels = mapping.levels_of(self.bench, state)
         held = [c for c in self.accepted if c.carrier]
-        wanted = [c for c in changes(state.sensors.one) if c.carrier]
+        wanted = self.mappable(state)
         groups = [[c] for c in wanted]
         pixels = [c for c in wanted if c.per == "pixel"]
         if len(pixels) > 1 and all(c.per == "pixel" for c in held):
@@ -372,6 +372,11 @@ class Search:
                 Tried(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), chance=chance)
             )
         return out
+
+    def mappable(self, state: State) -> list[Change]:
+        """Every map that may be tried: not of a number that an earlier step settles, alike in all pixels."""
+        settled = {dial.key for change in self.accepted for dial in change.dials}
+        return [c for c in changes(state.sensors.one) if c.carrier and c.carrier not in settled]
 
     def structured(self, state: State, tried: list[Tried]) -> list[Tried]:
         """Patterns before maps, but only those that stand out of the map's own scatter."""
