@@ -274,6 +274,23 @@ def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(
     assert best.change.name.startswith(first) and (significance, p) == (4.0, 1e-4)
 
 
+def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) -> None:
+    """However many of these there are: the maps that no count tells come last of all that is tried."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    names = ("crosstalk", "slow_afterpulsing", "source_noise", "flicker", "background_light", "blinking_dark_counts")
+    best, *others = (
+        Tried(change_of(bench, f"add {name}"), {}, Moved({}, {}, {}), gain, 1.0, residuals=state.residuals)
+        for name, gain in zip(names, (100.0, 50.0, 40.0, 30.0, 20.0, 99.0), strict=True)
+    )
+    monkeypatch.setattr(diagnose.checks, "failing", lambda *_: [])
+    found = diagnose._alternatives(bench, state, best, [best], others)
+    assert [(a["effect"], a["confused"]) for a in found] == [
+        ("blinking_dark_counts", True),
+        *((name, False) for name in names[1:4]),
+    ]
+
+
 def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
     bench = bench_of(lab())
     state, look = bench.state({}), quiet(bench)

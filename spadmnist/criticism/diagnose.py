@@ -33,6 +33,7 @@ _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself: less than what checks alarm by
 _MAYBE, _CLOSER = 100.0, recordings.REPLICATES  # times as likely by chance: worth so many recordings
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
+_NAMED = 4  # alternatives of a step
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 
 
@@ -339,7 +340,7 @@ def _outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
 def _alternatives(
     bench: Bench, state: State, best: Tried, refined: Sequence[Tried], second: Sequence[Tried]
 ) -> list[dict[str, Any]]:
-    """The other candidates, with the misfit that each leaves."""
+    """The other candidates, with the misfit that each leaves: first those that would do as well."""
     out: list[dict[str, Any]] = []
     for one in second:
         if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
@@ -357,4 +358,4 @@ def _alternatives(
                 "tried": one,
             }
         )
-    return out[:4]
+    return sorted(out, key=lambda other: not other["confused"])[:_NAMED]

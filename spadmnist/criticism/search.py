@@ -449,9 +449,10 @@ class Search:
         return out
 
     def _likeness(self, state: State, one: Moved, other: Moved) -> float:
-        """Cosine between two traces."""
-        keys = list(state.residuals)
-        a, b = (stacked(self.bench.template(state, moved), keys) for moved in (one, other))
+        """Cosine between two traces, in the statistics in which the other has one: it may do more besides."""
+        traces = [self.bench.template(state, moved) for moved in (one, other)]
+        keys = [cell for cell in state.residuals if traces[1][cell].any()]
+        a, b = (stacked(trace, keys) for trace in traces)
         return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
 
     # --- settling ------------------------------------------------------------------------------------------------
