@@ -12,7 +12,7 @@ from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
 from spadmnist.criticism import answer, chance, diagnose, findings, fit, likelihood, settling
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism.answer import Step
+from spadmnist.criticism.answer import Step, plain
 from spadmnist.criticism.fit import RATES, Moved, State
 from spadmnist.criticism.lines import Line
 from spadmnist.criticism.tried import Tried, weaker
@@ -330,6 +330,8 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     taken(course, "set dead_time.duration", {DURATION: 55e-9})
     (step,), state = course.steps, course.state
     step.alternatives = [{"confused": rival}]
+    course.rung("+ another dead time")
+    rows = list(course.ladder)
     usual, settled = dict(step.values), course.values[DURATION]
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(course_of.Course, "failed", property(lambda self: [] if self.state is state else [check]))
@@ -339,3 +341,6 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     assert bool(course.failed) != rival and (course.state is state) == rival
     assert (step.values == usual) == rival
     assert course.values[DURATION] == (settled if rival else 50e-9) and settled != 50e-9
+    # and the ladder ends with the model as it is now
+    assert (course.ladder == rows) == rival and len(course.ladder) == len(rows)
+    assert course.ladder[-1]["model"] == "+ another dead time" and course.ladder[-1]["misfit"] == plain(course.misfit)

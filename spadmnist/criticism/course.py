@@ -313,6 +313,8 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             course.values, course.state, earlier = before
             for step, usual in zip(course.steps, earlier, strict=True):
                 step.values = usual
+        elif course.ladder:  # its last row is the model as it is now
+            course.rung(course.ladder.pop()["model"])
 
 
 def _slopes_known(course: Course) -> dict[Key, dict[Cell, np.ndarray]]:
