@@ -341,6 +341,6 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     assert bool(course.failed) != rival and (course.state is state) == rival
     assert (step.values == usual) == rival
     assert course.values[DURATION] == (settled if rival else 50e-9) and settled != 50e-9
-    # and the ladder ends with the model as it is now
+    course.last_rung()  # and the ladder ends with the model as it is now
     assert (course.ladder == rows) == rival and len(course.ladder) == len(rows)
     assert course.ladder[-1]["model"] == "+ another dead time" and course.ladder[-1]["misfit"] == plain(course.misfit)

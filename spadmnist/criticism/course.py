@@ -79,6 +79,10 @@ class Course:
         errors = errors_of(self.bench, self.state, self.judged)
         self.ladder.append(row(name, self.misfit, errors))
 
+    def last_rung(self) -> None:
+        """The last row anew: a closer look or the likelihood may have changed what it says."""
+        self.rung(self.ladder.pop()["model"])
+
 
 def begun(bench: Bench) -> Course:
     """The model as it is stated, the phases of what swings settled."""
@@ -313,8 +317,6 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             course.values, course.state, earlier = before
             for step, usual in zip(course.steps, earlier, strict=True):
                 step.values = usual
-        elif course.ladder:  # its last row is the model as it is now
-            course.rung(course.ladder.pop()["model"])
 
 
 def _slopes_known(course: Course) -> dict[Key, dict[Cell, np.ndarray]]:

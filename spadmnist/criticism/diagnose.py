@@ -91,6 +91,8 @@ def _diagnosed(
     if course.steps and not short:
         settle_exactly(course, measurement)
     open_ends(course)
+    if course.steps:
+        course.last_rung()
     left = course.failed
     if left and beside.explained and all(b.cell[0] == "" for b in left):
         left = []
