@@ -103,6 +103,14 @@ class Change:
     relative: bool = False  # the map multiplies
 
     @property
+    def blinds(self) -> bool:
+        """Is it a map of how long each pixel is blind? Its shortest interval tells that, not its counts."""
+        if self.per != "pixel" or self.carrier is None:
+            return False
+        kind = Effect.registry.find(self.carrier[0])
+        return hasattr(kind, "blind_time") and kind.parameters[self.carrier[1]].unit == "s"
+
+    @property
     def dials(self) -> tuple[Dial, ...]:
         return self.strengths + self.shapes
 

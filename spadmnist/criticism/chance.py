@@ -20,6 +20,7 @@ from .tried import Tried, shape_of
 
 LEAST_P = 1e-300
 _MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
+_EDGES = "early_intervals"  # how unlike the pixels are in how long they are blind
 _LITTLE = 0.1  # times as strong: what grows with the square is no matter there
 _HELD = 0.9  # of what directions of a candidate have in common, by few recordings
 _SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
@@ -224,6 +225,9 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
         told = mapping.information(bench, values, change, levels)
     except (SpadError, np.linalg.LinAlgError):
         return 1.0
+    if change.blinds:
+        cells = [(id, _EDGES) for id, x in told.items() if x.any() and (id, _EDGES) in state.residuals]
+        return min([1.0, *(len(cells) * state.nulls[cell].chance(state.residuals[cell])[0] for cell in cells)])
     name = mapping.CODES if change.per == "code" else _MAP
     tells = {id: float(x.sum()) for id, x in told.items()}
     cells = [(id, name) for id in tells if tells[id] > 0 and (id, name) in state.residuals]

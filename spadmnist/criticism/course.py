@@ -12,7 +12,7 @@ from scipy import stats
 
 from ..effects import Effect
 from ..measurement import Measurement
-from . import checks, fit, likelihood, mapping, recordings, settling
+from . import checks, edges, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
@@ -197,11 +197,12 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
     """The values of all steps, as they were settled, with their intervals."""
     if settled is not None:
         place = {d.key: i for i, d in enumerate(settled.dials)}
+        wider = settling.unexplained_scatter(settled, settled.residuals, course.state)
         for step in course.steps:
             beside = _of_pixels(course, step, maps)
             for k, dial in enumerate(step.dials):
                 i = place[dial.key]
-                variance = max(float(settled.covariance[i, i]), 0.0) + beside[k]
+                variance = max(float(settled.covariance[i, i]), 0.0) * wider[i] ** 2 + beside[k]
                 u, half = float(settled.point[i]), _HALF * math.sqrt(variance)
                 step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
@@ -317,6 +318,22 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             course.values, course.state, earlier = before
             for step, usual in zip(course.steps, earlier, strict=True):
                 step.values = usual
+            return
+    if course.settled is not None:
+        wider = settling.unexplained_scatter(course.settled, course.state.residuals, course.state)
+        factors = {d.key: float(x) for d, x in zip(course.settled.dials, wider, strict=True)}
+        for step in course.steps:
+            for dial in step.dials:
+                step.values[dial.parameter] = _widened(step.values[dial.parameter], dial, factors.get(dial.key, 1.0))
+
+
+def _widened(value: Value, dial: Dial, factor: float) -> Value:
+    """The value with an interval so many times as wide, in its coordinate."""
+    assert value.low is not None and value.high is not None
+    u = dial.coordinate(value.value)
+    ends = [u + factor * (dial.coordinate(end) - u) for end in (value.low, value.high)]
+    low, high = dial.interval(min(ends), max(ends))
+    return replace(value, low=low, high=high)
 
 
 def _slopes_known(course: Course) -> dict[Key, dict[Cell, np.ndarray]]:
@@ -347,6 +364,8 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
     half = _HALF * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
     ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
     told["sigma"] = Value(sigma, ends[0], ends[1])
+    if map_.likely is not None and map_.said is not None:
+        told["sigma"] = Value(*edges.width(map_.likely[0], map_.said))
     for name in ("low_fraction", "high_fraction"):
         n, k = len(map_.raw), told[name].value * len(map_.raw)
         low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0

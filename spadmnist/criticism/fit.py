@@ -26,6 +26,7 @@ from ..sensor import Sensor
 from ..statistics import Summary
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
+from .edges import Shortest
 from .nulls import LEAST_POWER, Null, _standardized, learn, poisson_scores
 from .shifts import beyond_noise, difference
 
@@ -48,7 +49,7 @@ class Seen:
     """A capture as it was measured: its detections, of each pixel, and its summaries.
 
     counts: None where the mean alone is known. last: s, of the last detection that has a stamp of its own. waited:
-    (pixels,) of first stamps, frames' worth of time before them.
+    (pixels,) of first stamps, frames' worth of time before them. shortest: of time stamps.
     """
 
     capture: Capture
@@ -57,6 +58,7 @@ class Seen:
     summaries: Mapping[str, Summary]
     last: float | None = None
     waited: np.ndarray | None = None
+    shortest: Shortest | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Seen:
@@ -71,7 +73,8 @@ class Seen:
         if recording.events is not None and len(recording.events.times):
             last = float(recording.events.times.max())
         waited = None if recording.waited is None else recording.waited[0]
-        return cls(recording.capture, float(counts.sum()), counts, summaries, last, waited)
+        shortest = Shortest.of(recording)
+        return cls(recording.capture, float(counts.sum()), counts, summaries, last, waited, shortest)
 
 
 @dataclass

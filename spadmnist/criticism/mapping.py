@@ -1,5 +1,7 @@
 """Maps: what each pixel's own value of a parameter is, from how many detections it has in every capture.
 
+How long a pixel is blind its shortest intervals tell (`edges`), how long codes are, how often each occurs.
+
 The closed forms of the effects say how a pixel's rate follows a parameter, in every capture. Maps of several parameters
 are settled together, pixel by pixel, by Newton's method on the logarithms of their values relative to the array's; a
 prior as wide as the pixels turn out to differ keeps noise out, and one with long tails lets odd pixels be odd. Its
@@ -20,7 +22,9 @@ from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
 from .candidates import Change, Key, Values, with_values
+from .edges import likely
 from .fit import Bench, Sensors
+from .likelihood import blur_of
 from .recordings import InTheDark, in_frames
 
 _TAILS = 3.0  # degrees of freedom of the prior
@@ -55,6 +59,8 @@ class Map:
     low: float = 0.0
     high: float = math.inf
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) how likely each is
+    certain: float = _TELLING  # raw_error, below which a value is the estimate, whatever the others are
+    said: np.ndarray | None = None  # as `likely`, by each pixel alone
 
     def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
         """(groups,) values; draw, width: standard normal numbers, for one of the maps that may be true."""
@@ -66,7 +72,7 @@ class Map:
             logs = middle + (self.estimate - middle) * scale + draw * error - error**2 / 2
         relative = np.exp(np.clip(logs, -_MOST, _MOST))
         if self.likely is not None:  # a pixel that says much by itself is where it says
-            relative = np.where(self.raw_error < _TELLING, relative, self._one_of(draw))
+            relative = np.where(self.raw_error < self.certain, relative, self._one_of(draw))
         return np.clip(self.base * relative, self.low, self.high)
 
     def _as_wide(self, draw: float) -> np.ndarray:
@@ -161,10 +167,11 @@ def settle_maps(
 
     The array's own mean rate is the light's matter in lit captures, so they tell the pixels' differences only.
     """
-    codes = {c.carrier: settle_codes(bench, c, use) for c in wanted if c.per == "code" and c.carrier is not None}
-    wanted = [c for c in wanted if c.per != "code"]
+    others = {c.carrier: settle_codes(bench, c, use) for c in wanted if c.per == "code" and c.carrier is not None}
+    others |= {c.carrier: settle_edges(bench, values, c, use) for c in wanted if c.blinds and c.carrier is not None}
+    wanted = [c for c in wanted if by_counts(c)]
     if not wanted:
-        return codes
+        return others
     start = with_values(bench.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
     lines = [
         _Line(bench, id, levels[id]) for id, s in bench.seen.items() if s.counts is not None and (not use or id in use)
@@ -276,7 +283,7 @@ def settle_maps(
                 _WIDE**-2,  # they are of another kind, about which the others say nothing
                 (_TAILS + 1) / (_TAILS * sigma[i] ** 2 + apart**2),
             )
-    out = codes
+    out = others
     for i, change in enumerate(wanted):
         assert change.carrier is not None
         error = np.sqrt(np.maximum(post[i], 0))
@@ -295,29 +302,43 @@ def settle_maps(
 def _of_few_counts(map_: Map, lines: Sequence[_Line], model: Callable[[float], Sensor]) -> Map:
     """A map of pixels that say little each: all together tell the law of their values, without a form for it.
 
-    The nonparametric maximum of the likelihood, by expectation and maximization (Laird, JASA 73, 1978), stopped while
-    it is smooth; and each pixel's values by Bayes's law from there. model: with this logarithm in all pixels.
+    model: with this logarithm in all pixels.
     """
     centre, size = float(np.median(map_.estimate)), map_.estimate.size
     grid = centre + np.linspace(*_GRID)
-    likely = np.stack(
+    logs = np.stack(
         [
             np.bincount(map_.group, sum(line.log_likelihood(line.expected(sensor)) for line in lines), size)
             for sensor in map(model, grid.tolist())
         ],
         axis=1,
     )
-    likely = np.exp(likely - likely.max(axis=1, keepdims=True))
-    prior = np.full(grid.size, 1 / grid.size)
+    weights = _by_their_law(np.exp(logs - logs.max(axis=1, keepdims=True)))
+    mean, error = _mean_of(weights, grid)
+    told = map_.raw_error < _TELLING
+    estimate, error = np.where(told, map_.estimate, mean), np.where(told, map_.error, error)
+    return replace(map_, estimate=estimate, error=error, likely=(grid, weights))
+
+
+def _by_their_law(likely: np.ndarray) -> np.ndarray:
+    """(groups, grid) how probable each value is, by what each pixel says and by the law of all of them.
+
+    That law is the nonparametric maximum of the likelihood, by expectation and maximization (Laird, JASA 73, 1978),
+    stopped while it is smooth; the rest is Bayes's. likely: (groups, grid).
+    """
+    prior = np.full(likely.shape[1], 1 / likely.shape[1])
     for _ in range(_ROUNDS):
         weights = likely * prior
         weights /= weights.sum(axis=1, keepdims=True)
         prior = weights.mean(axis=0)
+    return weights
+
+
+def _mean_of(weights: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(mean, standard deviation) of each row of weights over a grid."""
+    weights = weights / weights.sum(axis=1, keepdims=True)
     mean = weights @ grid
-    error = np.sqrt(np.maximum(weights @ grid**2 - mean**2, 0.0))
-    told = map_.raw_error < _TELLING
-    estimate, error = np.where(told, map_.estimate, mean), np.where(told, map_.error, error)
-    return replace(map_, estimate=estimate, error=error, likely=(grid, weights))
+    return mean, np.sqrt(np.maximum(weights @ grid**2 - mean**2, 0.0))
 
 
 def _odd(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -414,6 +435,33 @@ def settle_codes(bench: Bench, change: Change, use: Sequence[str] = ()) -> Map:
     return found
 
 
+def settle_edges(bench: Bench, values: Values, change: Change, use: Sequence[str] = ()) -> Map:
+    """How long each pixel is blind, from its shortest intervals in the captures in `use` (all).
+
+    Raises SpadError where no capture tells.
+    """
+    assert change.carrier is not None
+    start = with_values(bench.start, {k: v for k, v in values.items() if k != change.carrier})
+    base = _base_of(start, change)
+    captures = [s.shortest for id, s in bench.seen.items() if s.shortest is not None and (not use or id in use)]
+    found = likely(captures, blur_of(start) or 0.0, base) if captures and base > 0 else None
+    if found is None:
+        raise SpadError("no capture has intervals short enough to tell how long each pixel is blind")
+    grid, says = found
+    weights = _by_their_law(says)
+    estimate, error = _mean_of(weights, grid)
+    raw, raw_error = _mean_of(says, grid)
+    group = groups_of(start, change.per)
+    sigma = float(np.sqrt(np.var(estimate) + np.mean(error**2)))
+    known = Map(change.carrier, base, group, estimate, error, raw, raw_error, sigma)
+    return replace(known, likely=(grid, weights), certain=0.0, said=says)
+
+
+def by_counts(change: Change) -> bool:
+    """Is it how many detections pixels have that tells a map?"""
+    return change.per != "code" and not change.blinds
+
+
 def code_periods(cells: int) -> dict[int, slice]:
     """Where the statistic `codes` has the codes of each period."""
     out: dict[int, slice] = {}
@@ -430,8 +478,12 @@ def information(bench: Bench, values: Values, change: Change, levels: dict[str, 
     if change.per == "code":
         return {id: np.array([seen.total * (CODES in seen.summaries)]) for id, seen in bench.seen.items()}
     assert change.carrier is not None
-    effect = with_values(bench.start, values).effect(change.carrier[0])
     pixels = bench.start.layout.pixels
+    if change.blinds:
+        base = _base_of(with_values(bench.start, {k: v for k, v in values.items() if k != change.carrier}), change)
+        told = {id: seen.shortest for id, seen in bench.seen.items()}
+        return {id: np.zeros(pixels) if s is None else (base * s.density) ** 2 for id, s in told.items()}
+    effect = with_values(bench.start, values).effect(change.carrier[0])
     if effect is None:
         now = np.full(int(groups_of(bench.start, change.per).max()) + 1, _base_of(bench.start, change))
     else:

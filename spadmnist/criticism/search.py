@@ -347,7 +347,7 @@ class Search:
         held = [c for c in self.accepted if c.carrier]
         wanted = self.mappable(state)
         groups = [[c] for c in wanted]
-        pixels = [c for c in wanted if c.per == "pixel"]
+        pixels = [c for c in wanted if c.per == "pixel" and mapping.by_counts(c)]
         if len(pixels) > 1 and all(c.per == "pixel" for c in held):
             with contextlib.suppress(SpadError, np.linalg.LinAlgError):
                 together = mapping.needed(self.bench, values, held, pixels, levels)

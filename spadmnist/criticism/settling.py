@@ -20,6 +20,7 @@ _CLOSE = 0.02  # and no nearer
 _TOLD_ASIDE = (0.1, 0.7)  # the same, of slopes that are known but for their size
 _TOLD_SIZE = 2.5  # times what they are thought to be, at most
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
+_PROMISING = 0.01  # of what is left beyond chance: a model that is wrong by far gets no better by less
 _VAIN = 2  # steps in a row, the second one shorter, that gain nothing: what is left is chance
 _BLIND = 0.05  # squared slope of a number that nothing tells
 
@@ -123,7 +124,8 @@ def settle(
         error = np.sqrt(np.maximum(np.diag(covariance_of(slopes, own)), 1e-30))
         # never so short that what is taken for noise, or not, makes a slope
         steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.5)
-        if turn and (promised < 1.0 or np.all(np.abs(u - u0) < 0.3 * error)):
+        vain_below = 1.0 + _PROMISING * max(square - len(z), 0.0)
+        if turn and (promised < vain_below or np.all(np.abs(u - u0) < 0.3 * error)):
             break
     assert best is not None
     square, u, z = best
@@ -313,6 +315,22 @@ def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
     blind = np.einsum("ij,ij->j", slopes, slopes) < _BLIND
     covariance[blind, blind] = np.inf  # nothing tells it
     return covariance
+
+
+def unexplained_scatter(settled: Settled, residuals: Mapping[Cell, np.ndarray], state: State) -> np.ndarray:
+    """(dials,) by how much wider the cells that tell each number lie about the model than chance has it; at least 1.
+
+    A law that is not quite the sensor's leaves something there, and the number is known no better than that lets it be.
+    residuals: of the data, with the numbers as they are settled; of state: how the model's own recordings scatter.
+    Source: White, Econometrica 50 (1982) 1, and the scale factor of the Particle Data Group.
+    """
+    keys = [k for k, slopes in settled.slopes.items() if k in residuals and len(residuals[k]) == len(slopes)]
+    slopes, z = np.concatenate([settled.slopes[k] for k in keys]), stacked(residuals, keys)
+    usual = np.concatenate([np.mean(state.own[k] ** 2, axis=0) for k in keys])
+    inverse = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10)
+    weight = (slopes @ inverse) ** 2
+    expected, found = weight.T @ usual, weight.T @ z**2
+    return np.sqrt(np.maximum(np.divide(found, expected, out=np.ones_like(found), where=expected > 0), 1.0))
 
 
 def _split(stack: np.ndarray, state: State, keys: Sequence[Cell]) -> dict[Cell, np.ndarray]:

@@ -6,15 +6,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from .. import units
 from ..kernels import jit
 from . import Recording, Statistic, Summary
 from ._counting import of_detections, span
 from ._frames import first_stamps
+from ._scores import shares
 
 _BINS = 40
 _FINE = 8  # parts of the first of them, about what is carried over from the frame before
 _AFTER = ("after an empty frame", "after a frame with an early detection", "after a frame with a late one")
 _LATE = 0.9  # of a frame
+_NORMAL = 0.2654  # power of an exponential variable that is as good as normal
 
 
 class FirstArrivals(Statistic):
@@ -78,6 +81,46 @@ class FrameEnds(Statistic):
 
         size = of_detections(float(recording.totals.sum()))
         return Summary(counts.ravel().astype(np.float64), "poisson", where, size)
+
+
+class FrameLimits(Statistic):
+    """How long no pixel ever fires at the beginning and at the end of a frame, as the detections near by have it.
+
+    The ticks before the first detection of all frames and behind the last one, times the detections to a tick in the
+    fortieth of a frame that follows or comes before: exponential of mean 1, whatever the light. Of that the power
+    0.2654, which is as good as normal (Weibull of no skewness). Where in its tick a detection was is left to chance,
+    lest ticks make steps. Here a gate shows that opens late or closes early by less than a bin holds: nothing else
+    says its edge as exactly.
+    """
+
+    modalities = ("str",)
+    unit = "1"
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """(2,) at the beginning, at the end; nothing is said without a detection."""
+        none, tick = int(recording.none), recording.tick or 1.0
+        pieces = [stamps for _, (_, stamps, _) in first_stamps(recording) if len(stamps)]
+        if not pieces:
+            return None
+        ends = min(int(p.min()) for p in pieces), max(int(p.max()) for p in pieces)
+        reach = max(none // _BINS, 1)
+        early = sum(int(np.count_nonzero(p <= ends[0] + reach)) for p in pieces)
+        late = sum(int(np.count_nonzero(p >= ends[1] - reach)) for p in pieces)
+        density = np.array([early, late]) / (reach + 1.0)
+        # the first of those that share its tick, at a time of its own within it
+        alike = np.array([sum(int(np.count_nonzero(p == end)) for p in pieces) for end in ends])
+        within = -np.expm1(np.log1p(-shares(np.asarray(recording.totals), 2)) / alike)
+        quiet = np.array([ends[0], none - 1 - ends[1]]) + within
+
+        def where(cell: int) -> str:
+            return f"the time {('before the first', 'behind the last')[cell]} detection in any frame"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            found, usual = (max(x, 0.0) ** (1 / _NORMAL) / float(density[cell]) for x in (measured, expected))
+            text = f"{units.show(found * tick, 's')}, {units.show(usual * tick, 's')} expected"
+            return text, (found - usual) / none
+
+        return Summary((density * quiet) ** _NORMAL, "normal", where, size)
 
 
 def _edges(none: int) -> np.ndarray:

@@ -6,6 +6,7 @@ import itertools
 import math
 from functools import partial
 
+import laws
 import null_laws
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from simple_sensor import FRAME, many, reduced, sigmas, stamped, str_of
 
 from spadmnist import recording as recordings
 from spadmnist.recording import Recording
-from spadmnist.statistics.first import FirstArrivals, FrameEnds
+from spadmnist.statistics.first import FirstArrivals, FrameEnds, FrameLimits
 
 STEADY = partial(stamped, shape=(500, 8, 8), share=0.3, tick=1e-9)
 
@@ -62,6 +63,47 @@ def test_a_frame_that_ends_a_little_early_is_seen_at_its_end() -> None:
     found = sigmas(FrameEnds, str_of(np.where(stamps >= 9968, 10_000, stamps), 1e-9), STEADY)
     assert found[8 + 5] < -4 and np.abs(found[:8]).max() < 4 and abs(found[-1]) < 4
     null_laws.poisson(many(FrameEnds, STEADY, 120), 0.9)
+
+
+def test_the_limits_of_a_small_recording() -> None:
+    recording = stamped(3, (203, 5, 7), 0.3, 1e-9)
+    stamps = np.asarray(recording.frames[:]).ravel().astype(np.int64)  # type: ignore[index]
+    stamps = np.sort(stamps[stamps < 10_000])
+    early, late = (stamps <= stamps[0] + 250).sum() / 251, (stamps >= stamps[-1] - 250).sum() / 251
+    found = reduced(FrameLimits, recording)
+    # part of a tick is left to chance
+    quiet = found.values ** (1 / 0.2654) / [early, late]
+    assert stamps[0] < quiet[0] < stamps[0] + 1 and 9999 - stamps[-1] < quiet[1] < 10_000 - stamps[-1]
+    assert found.where(1) == "the time behind the last detection in any frame"
+    assert math.isclose(found.size(1, found.values[1], 0.0)[1], quiet[1] / 10_000)
+    assert FrameLimits().reduce(str_of(np.full((20, 2, 2), 10_000), 1e-9)) is None
+    again = reduced(FrameLimits, Recording(**{**recording.__dict__, "_kept": {}}))
+    assert np.array_equal(again.values, found.values)
+
+
+@pytest.mark.parametrize(("share", "tick"), [(0.3, 1e-9), (0.3, 1e-12), (0.6, 1e-7), (0.02, 1e-9)])
+def test_the_law_of_the_limits(share: float, tick: float) -> None:
+    values = many(FrameLimits, partial(stamped, shape=(500, 8, 8), share=share, tick=tick), 400)
+    usual = math.gamma(1.2654)
+    spread = math.sqrt(math.gamma(1.5308) - usual**2)
+    # the density is that of some 800 and more detections, but of 16 where there are few
+    widest = 1.0 if share > 0.1 else 0.9
+    for cell in values.T:
+        assert abs(cell.mean() - usual) < laws.z_bound() * spread / math.sqrt(len(cell)) + 0.02
+        assert widest * 0.75 < cell.std() / spread < 1.25
+    # a tail that is no longer than the normal law's: 4.1 standard deviations are one in a million
+    assert np.abs((values - usual) / spread).max() < 4.2
+
+
+def test_a_frame_that_ends_three_ticks_early_is_seen_by_its_last_detection() -> None:
+    bright = partial(stamped, shape=(4000, 8, 8), share=0.6, tick=1e-9)
+    stamps = np.asarray(bright(1).frames[:])  # type: ignore[index]
+    whole = many(FrameLimits, bright, 40)
+    found, usual = (
+        reduced(FrameLimits, str_of(np.where(stamps >= 9998, 10_000, stamps), 1e-9)).values,
+        whole.mean(axis=0),
+    )
+    assert found[1] > whole[:, 1].max() and abs(found[0] - usual[0]) < 4 * whole[:, 0].std()
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.97])
