@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from spadmnist.criticism.lines import lines
+from spadmnist.criticism.lines import _line, _Spectrum, lines
 
 STEPS = {"dark": 10.0, "dim": 20.0, "bright": 66.7, "red": 33.3}  # Hz, from bin to bin
 BINS = 400
@@ -134,3 +134,28 @@ def test_where_it_lies_between_two_bins() -> None:
         powers[id] = power / np.median(power) * np.log(2)
     found = lines(*beside(powers))
     assert abs(found[0].frequency - 213.0) < 3 * found[0].error and found[0].error < 3.0
+
+
+@pytest.mark.parametrize("strength", [60.0, 560.0, 5000.0])
+@pytest.mark.parametrize("frequency", [307.0, 310.0, 294.0, 300.0])
+def test_how_exactly_it_is_known(strength: float, frequency: float) -> None:
+    """Two captures, of one a bin and of the other a third of one; its distance has a normal law of the stated width.
+
+    In the middle of a bin, 300 Hz, both sides say as much, so that it is nearer than its error says.
+    """
+    rng, trials = np.random.default_rng(8), 300
+    pulls = []
+    for _ in range(trials):
+        group = []
+        for step, bins in ((20.0, 200), (100 / 3, 120)):
+            x = frequency / step - np.arange(1, bins + 1)
+            line = np.sqrt(strength) * np.sinc(x) * np.exp(1j * (2 * np.pi * rng.random() + np.pi * x))
+            power = np.abs(line + (rng.standard_normal(bins) + 1j * rng.standard_normal(bins)) / np.sqrt(2)) ** 2
+            group.append(_Spectrum(power, np.sqrt(power), power, step, False))
+        about = 20.0 * (1 + int(np.argmax(group[0].power[:60])))
+        found = _line(group, about, -50.0)
+        pulls.append((found.frequency - frequency) / found.error)
+    covered = np.abs(pulls) < 1.96
+    # of 300 at 95 %, 265 and fewer have a chance of 1e-6
+    assert covered.sum() > 265
+    assert frequency == 300.0 or 0.8 < np.std(pulls) < 1.5

@@ -197,12 +197,11 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
     """The values of all steps, as they were settled, with their intervals."""
     if settled is not None:
         place = {d.key: i for i, d in enumerate(settled.dials)}
-        wider = settling.unexplained_scatter(settled, settled.residuals, course.state)
         for step in course.steps:
             beside = _of_pixels(course, step, maps)
             for k, dial in enumerate(step.dials):
                 i = place[dial.key]
-                variance = max(float(settled.covariance[i, i]), 0.0) * wider[i] ** 2 + beside[k]
+                variance = max(float(settled.covariance[i, i]), 0.0) + beside[k]
                 u, half = float(settled.point[i]), _HALF * math.sqrt(variance)
                 step.values[dial.parameter] = Value(dial.value(u), *dial.interval(u - half, u + half), dial.unit)
                 course.values[dial.key] = dial.value(u)
@@ -318,13 +317,17 @@ def settle_exactly(course: Course, measurement: Measurement) -> None:
             course.values, course.state, earlier = before
             for step, usual in zip(course.steps, earlier, strict=True):
                 step.values = usual
-            return
-    if course.settled is not None:
-        wider = settling.unexplained_scatter(course.settled, course.state.residuals, course.state)
-        factors = {d.key: float(x) for d, x in zip(course.settled.dials, wider, strict=True)}
-        for step in course.steps:
-            for dial in step.dials:
-                step.values[dial.parameter] = _widened(step.values[dial.parameter], dial, factors.get(dial.key, 1.0))
+
+
+def widen(course: Course) -> None:
+    """No number is known better than what its law leaves unexplained in the cells that tell it."""
+    if course.settled is None:
+        return
+    wider = settling.unexplained_scatter(course.settled, course.state)
+    factors = {d.key: float(x) for d, x in zip(course.settled.dials, wider, strict=True)}
+    for step in course.steps:
+        for dial in step.dials:
+            step.values[dial.parameter] = _widened(step.values[dial.parameter], dial, factors.get(dial.key, 1.0))
 
 
 def _widened(value: Value, dial: Dial, factor: float) -> Value:

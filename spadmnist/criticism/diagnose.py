@@ -21,7 +21,7 @@ from ..sensor import Sensor
 from . import advice, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
-from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly
+from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly, widen
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
@@ -90,6 +90,7 @@ def _diagnosed(
         drop_mimics(course, start, not beside.explained)
     if course.steps and not short:
         settle_exactly(course, measurement)
+    widen(course)
     open_ends(course)
     if course.steps:
         course.last_rung()

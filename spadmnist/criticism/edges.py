@@ -82,8 +82,7 @@ def likely(captures: Sequence[Shortest], blur: float, base: float) -> tuple[np.n
         x = (capture.intervals[some, None] - edges) / width
         passed = x * special.ndtr(x) + np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
         likely[some] += special.log_ndtr(x) - capture.density[some, None] * width * passed
-    likely = np.exp(likely - likely.max(axis=1, keepdims=True))
-    return grid, np.asarray(likely)
+    return grid, np.exp(likely - likely.max(axis=1, keepdims=True)).astype(np.float32)
 
 
 def width(grid: np.ndarray, likely: np.ndarray) -> tuple[float, float, float]:

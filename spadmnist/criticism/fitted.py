@@ -134,7 +134,9 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
     for step in course.steps:
         for name, value in step.values.items():
             low, high = ends.get((step.change.effect, name), (value.low, value.high))
-            how = "counts" if step.change.carrier else "simulation"
+            how = "simulation"
+            if step.change.carrier:
+                how = "intervals" if step.change.blinds else "counts"
             step.values[name] = replace(value, low=low, high=high, method=how)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage, special, stats
 
 from .fit import RATES, Bench, State
 from .nulls import Null
@@ -19,6 +19,8 @@ _BESIDE, _OWN = 12, 3.0  # bins to each side that are alike; standard deviations
 _NEXT, _RAISED = 2, 3.0  # bins to each side that a line leaks into; standard deviations of bins beside that are raised
 _AROUND = [d for d in range(-_BESIDE, _BESIDE + 1) if abs(d) > _NEXT]
 _OTHERS = 2  # of the bins beside, that may be another line
+_WITHIN, _PLACES = 1.2, 481  # bins to both sides of where a line is looked for exactly, in so many steps
+_STRENGTHS = np.linspace(0.7, 1.1, 17)  # times what is seen, part of which is chance
 _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 
@@ -136,28 +138,37 @@ def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
 
 
 def _line(group: Sequence[_Spectrum], about: float, log_p: float) -> Line:
-    """Where exactly: the mean over the spectra that show it."""
-    weight = mean = 0.0
+    """Where exactly: by the likelihood of the powers about it, in all spectra that show it."""
+    step = min(s.step for s in group)
+    grid = about + step * np.linspace(-_WITHIN, _WITHIN, _PLACES)
+    grid = grid[grid > 0]
+    total, shown = np.zeros(grid.size), False
     for s in group:
         cell = int(s.bins(np.array([about]))[0])
-        if cell < 0 or s.z[cell] < _SIGN:
-            continue
-        f, error = _between_bins(s.power, cell, s.step)
-        if abs(f - about) < 1.5 * s.step:
-            mean, weight = mean + f / error**2, weight + error**-2
-    if weight == 0:
-        return Line(about, min(s.step for s in group), log_p)
-    return Line(mean / weight, weight**-0.5, log_p)
+        if cell >= 0 and s.z[cell] >= _SIGN:
+            total, shown = total + _likelihood(s.power, cell, grid / s.step), True
+    if not shown:
+        return Line(about, step, log_p)
+    weights = np.exp(total - total.max())
+    mean = float(np.average(grid, weights=weights))
+    return Line(mean, float(np.sqrt(np.average((grid - mean) ** 2, weights=weights))), log_p)
 
 
-def _between_bins(power: np.ndarray, cell: int, step: float) -> tuple[float, float]:
-    """(frequency of a line, its standard deviation): between the strongest bin and the stronger of its neighbours.
+def _likelihood(power: np.ndarray, cell: int, places: np.ndarray) -> np.ndarray:
+    """(places,) log-likelihood of the powers about a bin if there is a line at a place, in bins, as strong as suits it.
 
-    A line's amplitude falls off as 1 / distance to both sides (Rife, Vincent, Bell Syst. Tech. J. 49 (1970) 197).
+    A line leaks into the bins beside with the amplitude sin(pi x) / (pi x) of its distance x. Chance alone has a mean
+    power of 1; a power to which a line adds S is distributed as exp(-P - S) I0(2 sqrt(P S)) (Rice, Bell Syst. Tech. J.
+    24 (1945) 46).
     """
-    sides = [power[cell - 1] if cell else 0.0, power[cell + 1] if cell + 1 < len(power) else 0.0]
-    other = math.sqrt(max(sides))
-    share = other / (math.sqrt(power[cell]) + other)
-    f = (cell + 1 + (share if sides[1] > sides[0] else -share)) * step
-    # twice what no estimate can be better than
-    return f, 2 * step * math.sqrt(3 / (2 * max(float(power[cell]), 1.0))) / math.pi
+    cells = np.arange(max(cell - _NEXT, 0), min(cell + _NEXT + 1, power.size))
+    seen = np.sqrt(power[cells])
+    leak = np.abs(np.sinc(places[:, None] - (cells + 1)))
+    suits = (leak @ seen) / (leak**2).sum(axis=1)
+    best = np.full(places.size, -np.inf)
+    for factor in _STRENGTHS:
+        amplitude = factor * suits[:, None] * leak
+        x = 2 * seen * amplitude
+        value = (np.log(special.i0e(x)) + x - amplitude**2).sum(axis=1)
+        best = np.maximum(best, value)
+    return best

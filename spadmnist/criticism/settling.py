@@ -317,15 +317,15 @@ def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
     return covariance
 
 
-def unexplained_scatter(settled: Settled, residuals: Mapping[Cell, np.ndarray], state: State) -> np.ndarray:
+def unexplained_scatter(settled: Settled, state: State) -> np.ndarray:
     """(dials,) by how much wider the cells that tell each number lie about the model than chance has it; at least 1.
 
     A law that is not quite the sensor's leaves something there, and the number is known no better than that lets it be.
-    residuals: of the data, with the numbers as they are settled; of state: how the model's own recordings scatter.
+    state: how the model's own recordings scatter.
     Source: White, Econometrica 50 (1982) 1, and the scale factor of the Particle Data Group.
     """
-    keys = [k for k, slopes in settled.slopes.items() if k in residuals and len(residuals[k]) == len(slopes)]
-    slopes, z = np.concatenate([settled.slopes[k] for k in keys]), stacked(residuals, keys)
+    keys = [k for k, own in state.own.items() if len(settled.slopes.get(k, ())) == own.shape[1]]
+    slopes, z = np.concatenate([settled.slopes[k] for k in keys]), stacked(settled.residuals, keys)
     usual = np.concatenate([np.mean(state.own[k] ** 2, axis=0) for k in keys])
     inverse = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10)
     weight = (slopes @ inverse) ** 2
