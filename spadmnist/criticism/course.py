@@ -34,6 +34,7 @@ _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
 _LOST = 30.0  # in chi square: what costs so much is no step to the better
 _STEP = 0.01  # of a coordinate, for how the pixels' light follows it
+_VAIN = 2  # steps that only look like what is there
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
 
 
@@ -502,6 +503,15 @@ def drop_mimics(course: Course, start: State, totals: bool) -> None:
             course.rung("without what only looks alike")
         else:
             course.state, course.settled = start, None
+
+
+def in_vain(course: Course, totals: bool) -> bool:
+    """Do several steps only happen to look like what is there? Then nothing of the catalogue does, and more are no use.
+
+    totals: see `drop_mimics`.
+    """
+    left = [_left_of_own(step, course.state, totals) for step in course.steps]
+    return len(left) >= _VAIN and bool(course.failed) and all(1 <= x < math.inf for x in left)
 
 
 def _left_of_own(step: Step, state: State, totals: bool) -> float:

@@ -21,7 +21,18 @@ from ..sensor import Sensor
 from . import advice, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
-from .course import LEAST_GAIN, Course, accept, begun, drop_mimics, drop_needless, open_ends, settle_exactly, widen
+from .course import (
+    LEAST_GAIN,
+    Course,
+    accept,
+    begun,
+    drop_mimics,
+    drop_needless,
+    in_vain,
+    open_ends,
+    settle_exactly,
+    widen,
+)
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
@@ -83,7 +94,7 @@ def _diagnosed(
 ) -> Diagnosis:
     course = begun(bench)
     start, beside = course.state, _Beside(_too_short(short))
-    while len(course.steps) < max_steps and _another(course, beside):
+    while len(course.steps) < max_steps and not in_vain(course, not beside.explained) and _another(course, beside):
         pass
     if course.steps:
         drop_needless(course)
