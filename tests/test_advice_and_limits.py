@@ -169,6 +169,23 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     assert not course.steps and not course.values and course.state is start
 
 
+def test_two_steps_that_only_look_alike_are_the_last(lab):
+    """One may be half of two effects; and a step that explains its own is no reason to stop."""
+    course = course_of.begun(bench_of(lab()))
+    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 10.0})
+    end = with_residuals(course.state, {"neighbours": 9.0, "intervals": 9.0})
+    for change, values in (("add crosstalk", {CROSSTALK: 0.03}), ("add afterpulsing", {PROBABILITY: 0.05})):
+        assert not course_of.in_vain(course, True)
+        taken(course, change, values, settle=False)
+        course.state = end
+        course.steps[-1].before = dict(start.residuals)
+        name = "neighbours" if change == "add crosstalk" else "intervals"
+        course.steps[-1].template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
+    assert course.failed and course_of.in_vain(course, True)
+    course.state = with_residuals(course.state, {"intervals": 9.0})
+    assert course.failed and not course_of.in_vain(course, True)
+
+
 @pytest.mark.parametrize("totals", [True, False])
 def test_totals_that_the_set_up_explains_take_no_step_away(lab, totals):
     """Where nothing but totals fails; and what swings takes its phases with it when it goes."""

@@ -132,6 +132,26 @@ def test_a_profile_is_the_covariance_where_all_is_linear():
         assert ends[dial.key] == pytest.approx(settled.interval(i)[1:], rel=1e-3)
 
 
+def test_what_a_law_leaves_in_its_own_cells_makes_its_numbers_less_certain():
+    """Of 40 cells the first 20 tell a, the others b; those of a lie three times as wide as chance has it, or less."""
+    rng = np.random.default_rng(7)
+    cell = ("one", "cells")
+    slopes = np.kron(np.eye(2), np.ones((20, 1)))
+    own = rng.standard_normal((96, 40))
+    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    state = fit.State({}, None, {}, {}, {}, {}, {}, {cell: own}, [])
+
+    def wider(wide_of_a):
+        z = np.tile([1.0, -1.0], 20) * np.repeat([wide_of_a, 0.5], 20)
+        settled = settling.Settled(dials, np.zeros(2), np.eye(2), {cell: z}, {cell: slopes}, 0.0, {})
+        return settling.unexplained_scatter(settled, state)
+
+    assert wider(3.0) == pytest.approx([3.0, 1.0], rel=0.05)
+    assert wider(0.5).tolist() == [1.0, 1.0]
+    nothing = settling.Settled(dials, np.zeros(2), np.eye(2), {}, {}, 0.0, {})
+    assert settling.unexplained_scatter(nothing, state).tolist() == [1.0, 1.0]
+
+
 def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     rng = np.random.default_rng(6)
     own = rng.standard_normal((960, 30))

@@ -325,6 +325,8 @@ def unexplained_scatter(settled: Settled, state: State) -> np.ndarray:
     Source: White, Econometrica 50 (1982) 1, and the scale factor of the Particle Data Group.
     """
     keys = [k for k, own in state.own.items() if len(settled.slopes.get(k, ())) == own.shape[1]]
+    if not keys:
+        return np.ones(len(settled.dials))
     slopes, z = np.concatenate([settled.slopes[k] for k in keys]), stacked(settled.residuals, keys)
     usual = np.concatenate([np.mean(state.own[k] ** 2, axis=0) for k in keys])
     inverse = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10)
