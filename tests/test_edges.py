@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
-import laws
 import numpy as np
 import pytest
 from joblib import Parallel
@@ -16,9 +16,10 @@ from spadmnist.criticism import chance, edges, mapping
 from spadmnist.criticism.candidates import changes, with_values
 from spadmnist.criticism.edges import Shortest
 from spadmnist.criticism.fit import Bench
-from spadmnist.effects import Conditions
+from spadmnist.effects import Conditions, Effect, parameter
 from spadmnist.events import Events, Layout
 from spadmnist.recording import Capture, Light, Recording
+from spadmnist.sensor import Sensor
 
 SIDE, DEAD = 16, 50e-9
 DURATION = ("dead_time", "duration")
@@ -55,39 +56,97 @@ def test_the_shortest_intervals_of_a_few_pixels() -> None:
     found = Shortest.of(recorded([[0, 900, 1440, 2500], [], [7], [10, 530, 1060, 3000], [5, 605]]))
     assert found is not None
     assert found.intervals * 1e10 == pytest.approx([540, math.inf, math.inf, 520, 600])
-    # of 5 ns, one interval of a pixel follows, 10 ticks behind; the others have their share of it
-    assert found.density[3] > found.density[0] > found.density[4] > found.density[1] == found.density[2] > 0
-    assert found.density[3] == pytest.approx(
-        5 / (1 + 4 * 19 / 9) / 5e-9
-    )  # 1 + 4, beside 9 / (9 + 9 + 1) that are usual
+    # of 15 ns, from 5 ns behind the shortest on; where a pixel has none of its own, the array's share of it
+    assert found.density[3] > 0 and found.density[1] == found.density[2] == 0
     assert Shortest.of(recorded([[0, 900]]).beside(0.0)) is None
 
 
-@pytest.mark.parametrize(("spread", "blur"), [(0.03, 0.0), (0.006, 0.0), (0.006, 0.2e-9), (0.0, 0.2e-9)])
-def test_how_wide_the_edges_of_pixels_lie_is_in_its_interval(spread: float, blur: float) -> None:
-    """Shortest intervals by the law: later than t behind a blurred edge with the chance exp(-density * passed)."""
-    rng, pixels, density = np.random.default_rng(4), 256, 1 / 0.6e-9
-    own = DEAD * np.exp(spread * rng.standard_normal(pixels))
-    tick = 1e-10
-    # of a Poisson process behind each edge the first one, every interval being blurred by itself
-    intervals = own[:, None] + np.cumsum(rng.exponential(1 / density, (pixels, 60)), axis=1)
-    blurred = intervals + rng.normal(0, blur, intervals.shape) + tick * np.diff(rng.random((pixels, 60, 2)))[:, :, 0]
-    least = np.rint(blurred.min(axis=1) / tick) * tick
-    found = edges.likely([Shortest(least, np.full(pixels, density), tick)], blur, DEAD)
+def fired(
+    dead: np.ndarray,
+    rate: np.ndarray | float,
+    seed: int = 0,
+    exposure: float = 0.7e-3,
+    jitter: float = 0.0,
+    tick: float = 1e-10,
+    recharge: float = 0.0,
+) -> Recording:
+    """Stamps of pixels that are blind for so long after each detection, (pixels,) s, in steady light."""
+    rng = np.random.default_rng(seed)
+    pixels = []
+    for own, light in zip(dead, np.broadcast_to(rate, dead.shape), strict=True):
+        number = int(2 * exposure * light + 40)
+        times = np.cumsum(own + recharge + rng.exponential(1 / light, number))
+        stamps = np.sort(times[times < exposure] + jitter * rng.standard_normal((times < exposure).sum()))
+        pixels.append(np.maximum(np.floor(stamps / tick), 0).astype(int).tolist())
+    return recorded(pixels, tick)
+
+
+def width_of(recording: Recording, jitter: float = 0.0) -> edges.Width:
+    shortest = Shortest.of(recording)
+    assert shortest is not None
+    found = edges.likely([shortest], jitter * math.sqrt(2), DEAD)
     assert found is not None
-    sigma, low, high = edges.width(*found)
-    assert low <= spread <= high and low <= sigma <= high
-    assert high - low < 0.35 * spread + 0.005
-    if spread:
-        weights = found[1] / found[1].sum(axis=1, keepdims=True)
-        apart = weights @ found[0] - np.log(own / DEAD)
-        # each says no more than its one interval does
-        assert np.std(apart) == pytest.approx(1 / density / DEAD, rel=0.35)
+    return edges.width_of(*found)
 
 
-def test_pixels_that_tell_nothing_are_no_edges() -> None:
-    assert edges.likely([Shortest(np.full(4, math.inf), np.full(4, 1.0), 1e-10)], 0.0, DEAD) is None
-    assert edges.likely([Shortest(np.full(4, 60e-9), np.full(4, 1e6), 1e-10)], 0.0, DEAD) is None
+def unlike(spread: float, pixels: int = 256, seed: int = 1) -> np.ndarray:
+    return DEAD * np.exp(spread * np.random.default_rng(seed).standard_normal(pixels))
+
+
+@pytest.mark.parametrize(
+    ("spread", "jitter", "tick"),
+    [
+        (0.03, 0.0, 1e-10),
+        (0.006, 0.0, 1e-10),
+        (0.006, 0.15e-9, 1e-10),
+        (0.0, 0.15e-9, 1e-10),
+        (0.0, 0.0, 1e-10),
+        (0.0, 0.0, 2e-9),
+        (0.02, 0.0, 2e-9),
+        (0.02, 0.0, 1e-12),
+    ],
+)
+def test_how_wide_the_edges_of_pixels_lie_is_in_its_interval(spread: float, jitter: float, tick: float) -> None:
+    """From stamps; and their middle is where it is, to a thousandth, whatever the ticks."""
+    found = width_of(fired(unlike(spread), 1.5e6, 3, jitter=jitter, tick=tick), jitter)
+    own = float(np.std(np.log(unlike(spread) / DEAD)))  # of these pixels
+    assert found.low <= own <= found.high and found.low <= found.sigma <= found.high
+    assert found.high - found.low < 0.35 * spread + 0.006
+    own = float(np.mean(np.log(unlike(spread) / DEAD)))
+    assert abs(found.middle - own) < 1.5e-3 + 0.3 * tick / DEAD
+    assert (found.gain > 10) == (spread > 0)
+
+
+def test_a_few_odd_pixels_are_not_the_width_of_all() -> None:
+    dead = unlike(0.01)
+    dead[[7, 70, 170]] = 0.3 * DEAD, 6 * DEAD, 0.6 * DEAD
+    found = width_of(fired(dead, 1.5e6))
+    assert found.low < 0.011 and found.high < 0.015
+    grid, likely = edges.likely([Shortest.of(fired(dead, 1.5e6))], 0.0, DEAD)  # type: ignore[list-item, misc]
+    weights = likely * edges.width_of(grid, likely).prior
+    values = DEAD * np.exp((weights / weights.sum(axis=1, keepdims=True)) @ grid)
+    assert values[[7, 70, 170]] == pytest.approx(dead[[7, 70, 170]], rel=0.06)
+    assert np.median(values / dead) == pytest.approx(1, abs=2e-3)
+
+
+def test_a_stamp_that_is_there_twice_is_one_odd_pixel() -> None:
+    good = fired(unlike(0.0), 1.5e6)
+    assert good.events is not None and good.events.ticks is not None
+    stamps = [good.events.ticks[a:b].tolist() for a, b in itertools.pairwise(good.events.offsets)]
+    stamps[5].insert(3, stamps[5][3])
+    assert width_of(recorded(stamps)).high < 0.004
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pixels_that_tell_nothing_make_no_edges(seed: int) -> None:
+    """Their shortest intervals lie anywhere, some of them by chance near the listed time."""
+    dim = Shortest.of(fired(np.full(256, DEAD), 2e4, seed, exposure=5e-3))
+    assert dim is not None and edges.likely([dim], 0.0, DEAD) is None
+    assert edges.likely([Shortest(np.full(4, math.inf), np.zeros(4), 1e-10)], 0.0, DEAD) is None
+    # nor do they move those of others
+    rate = np.where(np.arange(256) < 100, 1.5e6, 4e4)
+    found = width_of(fired(unlike(0.01), rate, seed))
+    assert found.low < 0.01 < found.high + 1e-3 and abs(found.middle) < 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -114,11 +173,19 @@ def test_a_map_of_dead_times(benches: dict[float, tuple[Bench, np.ndarray]]) -> 
     apart = map_.values() / own - 1
     noise = float(np.median(map_.error))
     assert 0.005 < noise < 0.015
-    assert np.std(apart) < 1.3 * noise and abs(np.mean(apart)) < laws.z_bound() * noise / SIDE + 1e-3
+    assert np.std(apart) < 1.3 * noise and abs(np.mean(apart)) < 2e-3
     # maps that may be true differ from it as it differs from the truth
     rng = np.random.default_rng(3)
     drawn = np.stack([map_.values(rng.standard_normal(SIDE**2)) for _ in range(100)])
     assert np.mean(np.std(drawn / map_.values() - 1, axis=1)) == pytest.approx(np.std(apart), rel=0.25)
+
+
+def test_pixels_that_are_alike_have_a_map_of_one_value(benches: dict[float, tuple[Bench, np.ndarray]]) -> None:
+    bench, _ = benches[0.0]
+    change = next(c for c in changes(bench.start) if c.carrier == DURATION)
+    map_ = mapping.settle_maps(bench, {}, [change], {})[DURATION]
+    drawn = map_.values(np.random.default_rng(3).standard_normal(SIDE**2))
+    assert np.median(np.abs(drawn / DEAD - 1)) < 2e-3 and np.median(np.abs(map_.values() / DEAD - 1)) < 2e-3
 
 
 def test_the_chance_of_a_map_of_dead_times(benches: dict[float, tuple[Bench, np.ndarray]]) -> None:
@@ -126,4 +193,26 @@ def test_the_chance_of_a_map_of_dead_times(benches: dict[float, tuple[Bench, np.
         state = bench.state({})
         change = next(c for c in changes(bench.start) if c.carrier == DURATION)
         p = chance.of_map(bench, state, change, {}, mapping.levels_of(bench, state))
-        assert p < 1e-6 if spread else p > 1e-4
+        assert p < 1e-6 if spread else p == 1.0
+        # where the model blurs the edge by other laws there is none
+        slow = {("slow_recovery", "time_constant"): 5e-9}
+        assert chance.of_map(bench, state, change, slow, mapping.levels_of(bench, state)) == 1.0
+
+
+def test_which_times_are_the_dead_time(benches: dict[float, tuple[Bench, np.ndarray]]) -> None:
+    sensor = benches[0.0][0].start
+    assert [c.carrier for c in changes(sensor) if c.blinds] == [DURATION]
+
+    class HoldOff(Effect, stage="dead_time"):
+        """Blind for a time by which another one is not seen, and a time that blinds nobody."""
+
+        hold = parameter(10e-9, "s", "blind so long", bounds=(0, None), off=0.0, search=(1e-9, 1e-6), per_pixel=True)
+        slope = parameter(1e-9, "s", "of no matter", bounds=(0, None), off=0.0, search=(1e-9, 1e-6), per_pixel=True)
+
+        def blind_time(self) -> np.ndarray:
+            return np.asarray(self.hold)
+
+    # the longer of two blindnesses is the one that is seen
+    both = Sensor(sensor.layout, [*sensor.effects, HoldOff()], sensor.rules, 0, "two").settled()
+    per_pixel = [c for c in changes(both) if c.per == "pixel" and c.effect in ("dead_time", "hold_off")]
+    assert {c.parameter: c.blinds for c in per_pixel} == {"duration": True, "hold": False, "slope": False}

@@ -23,6 +23,7 @@ Values = Mapping[Key, Any]
 
 _SHAPES = 4  # values of a shape that are tried between the ends of where it is looked for
 _MOST = 6  # templates of one candidate
+_TURNED = 1.02  # times a number, to see what follows it
 _LEAST = 1e-6  # of where a number is looked for, that it may lack
 
 
@@ -101,14 +102,7 @@ class Change:
     per: str = ""
     carrier: Key | None = None  # of a map: the parameter that holds it
     relative: bool = False  # the map multiplies
-
-    @property
-    def blinds(self) -> bool:
-        """Is it a map of how long each pixel is blind? Its shortest interval tells that, not its counts."""
-        if self.per != "pixel" or self.carrier is None:
-            return False
-        kind = Effect.registry.find(self.carrier[0])
-        return hasattr(kind, "blind_time") and kind.parameters[self.carrier[1]].unit == "s"
+    blinds: bool = False  # the map is how long each pixel is blind: its shortest interval tells that, not its counts
 
     @property
     def dials(self) -> tuple[Dial, ...]:
@@ -168,7 +162,7 @@ def changes(sensor: Sensor) -> list[Change]:
             out += _additions(name, kind.parameters)
     for name in sorted(listed):
         out += _settings(listed[name])
-        out += _maps(listed[name])
+        out += _maps(sensor, listed[name])
     return out
 
 
@@ -222,7 +216,7 @@ def _settings(effect: Effect) -> Iterator[Change]:
         yield Change("set", effect.name, name, (dial,))
 
 
-def _maps(effect: Effect) -> Iterator[Change]:
+def _maps(sensor: Sensor, effect: Effect) -> Iterator[Change]:
     whole = {k: p for k, p in effect.parameters.items() if p.per_pixel}
     for name, declared in whole.items():
         value = getattr(effect, name)
@@ -233,7 +227,16 @@ def _maps(effect: Effect) -> Iterator[Change]:
         at = getattr(effect, carrier)
         if isinstance(at, (ByWavelength, bool, np.ndarray)) or isinstance(value, np.ndarray):
             continue
-        yield Change("per_pixel", effect.name, name, (), per="pixel", carrier=(effect.name, carrier), relative=True)
+        key = effect.name, carrier
+        blinds = declared.unit == "s" and _blinds(sensor, key, value)
+        yield Change("per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds)
+
+
+def _blinds(sensor: Sensor, key: Key, value: float) -> bool:
+    """Is a time the sensor's dead time itself, which follows it?"""
+    other = value * _TURNED
+    follows = sensor.dead_times, with_values(sensor, {key: other}).dead_times
+    return value > 0 and all(np.allclose(a, b, rtol=1e-9) for a, b in zip(follows, (value, other), strict=True))
 
 
 def templates(change: Change) -> list[dict[Key, float]]:

@@ -226,8 +226,7 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
     except (SpadError, np.linalg.LinAlgError):
         return 1.0
     if change.blinds:
-        cells = [(id, _EDGES) for id, x in told.items() if x.any() and (id, _EDGES) in state.residuals]
-        return min([1.0, *(len(cells) * state.nulls[cell].chance(state.residuals[cell])[0] for cell in cells)])
+        return _of_edges(bench, state, change, values, told)
     name = mapping.CODES if change.per == "code" else _MAP
     tells = {id: float(x.sum()) for id, x in told.items()}
     cells = [(id, name) for id in tells if tells[id] > 0 and (id, name) in state.residuals]
@@ -255,6 +254,26 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
     laws = [(best, name) for name in _LAWS if (best, name) in state.residuals]
     others = [state.nulls[cell].chance(state.residuals[cell])[0] for cell in laws]
     return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
+
+
+def _of_edges(bench: Bench, state: State, change: Change, values: dict[Key, Any], told: dict[str, np.ndarray]) -> float:
+    """p-value of pixels that are blind for unlike times.
+
+    By the shortest intervals themselves, which jitter may scatter as well, and by pairs of short ones in one pixel,
+    which afterpulses of some pixels may make as well: the larger of the two.
+    """
+    cells = [(id, _EDGES) for id, x in told.items() if x.any() and (id, _EDGES) in state.residuals]
+    if not cells:
+        return 1.0
+    try:
+        width = mapping.settle_edges(bench, values, change).width
+    except SpadError:
+        return 1.0
+    assert width is not None
+    by_edges = float(stats.chi2.sf(width.gain, 1)) / 2 if width.low > 0 else 1.0
+    z = np.concatenate([state.residuals[cell] for cell in cells])
+    by_pairs = min(1.0, z.size * float(stats.norm.sf(float(z.max()))))
+    return max(by_edges, by_pairs)
 
 
 def of_spread(data: np.ndarray, usual: np.ndarray) -> float:

@@ -12,7 +12,7 @@ from scipy import stats
 
 from ..effects import Effect
 from ..measurement import Measurement
-from . import checks, edges, fit, likelihood, mapping, recordings, settling
+from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
@@ -178,7 +178,7 @@ def _followed(
         if square(state.residuals) > square(before[2].residuals):
             # a line or an edge: slopes do not lead further
             course.values, maps, state = before
-            settled = replace(settled, point=settling.point_of(dials, here))
+            settled = replace(settled, point=settling.point_of(dials, here), residuals=state.residuals)
             break
     return settled, state, maps
 
@@ -190,7 +190,7 @@ def _held(course: Course, settled: Settled) -> Settled:
     (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
     now = square(state.residuals)
     if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
-        return replace(settled, point=settling.point_of(dials, course.values))
+        return replace(settled, point=settling.point_of(dials, course.values), residuals=state.residuals)
     return settled
 
 
@@ -368,8 +368,8 @@ def _map_values(map_: mapping.Map) -> dict[str, Value]:
     half = _HALF * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
     ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
     told["sigma"] = Value(sigma, ends[0], ends[1])
-    if map_.likely is not None and map_.said is not None:
-        told["sigma"] = Value(*edges.width(map_.likely[0], map_.said))
+    if map_.width is not None:
+        told["sigma"] = Value(map_.width.sigma, map_.width.low, map_.width.high)
     for name in ("low_fraction", "high_fraction"):
         n, k = len(map_.raw), told[name].value * len(map_.raw)
         low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0

@@ -16,7 +16,7 @@ from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Diagnosis, Step, Value, title
 from .candidates import Change, Key, changes
 from .chance import LEAST_P, of_map
-from .course import Course, accept, begun, errors_known, material, settle_all
+from .course import Course, accept, begun, errors_known, material, settle_all, widen
 from .findings import nuisances, remainder, traces
 from .fit import Bench, Moved, square
 from .refining import refine, state_of
@@ -60,6 +60,7 @@ def fitted(
             _by_simulation(course, wanted)
         else:
             _by_likelihood(course, wanted, exact)
+        widen(course)
         left = course.failed
         return Diagnosis(
             bench.start.name,

@@ -10,6 +10,7 @@ middle is what most pixels have: the listed value may be the mean of a few hot o
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +22,8 @@ from scipy import special, stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
+from . import edges
 from .candidates import Change, Key, Values, with_values
-from .edges import likely
 from .fit import Bench, Sensors
 from .likelihood import blur_of
 from .recordings import InTheDark, in_frames
@@ -60,7 +61,7 @@ class Map:
     high: float = math.inf
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) how likely each is
     certain: float = _TELLING  # raw_error, below which a value is the estimate, whatever the others are
-    said: np.ndarray | None = None  # as `likely`, by each pixel alone
+    width: edges.Width | None = None  # where the likelihood of all pixels tells it
 
     def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
         """(groups,) values; draw, width: standard normal numbers, for one of the maps that may be true."""
@@ -90,12 +91,18 @@ class Map:
         pulled = np.maximum(noise / np.maximum(self.error**2, 1e-30) - 1, 0.0)
         return np.asarray((1 + pulled) / (1 + pulled * self.sigma**2 / other))
 
+    @functools.cached_property
+    def _running(self) -> np.ndarray:
+        """(groups, grid) how probable a value is up to each point."""
+        assert self.likely is not None
+        return np.asarray(np.cumsum(self.likely[1], axis=1))
+
     def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
         assert self.likely is not None
         grid, weights = self.likely
         if draw is None:
             return np.asarray(weights @ np.exp(grid))
-        place = (np.cumsum(weights, axis=1) < special.ndtr(draw)[:, None]).sum(axis=1)
+        place = (self._running < special.ndtr(draw).astype(weights.dtype)[:, None]).sum(axis=1)
         return np.asarray(np.exp(grid[np.minimum(place, grid.size - 1)]))
 
 
@@ -160,6 +167,11 @@ def _base_of(sensor: Sensor, change: Change) -> float:
     return float(off if off is not None else 1.0)
 
 
+def _bounds_of(carrier: Key) -> tuple[float, float]:
+    low, high = Effect.registry.find(carrier[0]).parameters[carrier[1]].bounds
+    return 0.0 if low is None else low, math.inf if high is None else high
+
+
 def settle_maps(
     bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float], use: Sequence[str] = ()
 ) -> dict[Key, Map]:
@@ -181,9 +193,8 @@ def settle_maps(
         assert change.carrier is not None
         declared = Effect.registry.find(change.carrier[0]).parameters[change.carrier[1]]
         base = _base_of(start, change)
-        low, high = declared.bounds
         bases.append(base if base > 0 else float((declared.search or (1e-3, 1))[0]))
-        bounds.append((0.0 if low is None else low, math.inf if high is None else high))
+        bounds.append(_bounds_of(change.carrier))
         groups.append(groups_of(start, change.per))
     sizes = [int(g.max()) + 1 for g in groups]
     delta = [np.zeros(n) for n in sizes]
@@ -438,23 +449,27 @@ def settle_codes(bench: Bench, change: Change, use: Sequence[str] = ()) -> Map:
 def settle_edges(bench: Bench, values: Values, change: Change, use: Sequence[str] = ()) -> Map:
     """How long each pixel is blind, from its shortest intervals in the captures in `use` (all).
 
-    Raises SpadError where no capture tells.
+    Raises SpadError where no capture tells, and where the model blurs the edges in another way than a normal law's.
     """
     assert change.carrier is not None
     start = with_values(bench.start, {k: v for k, v in values.items() if k != change.carrier})
     base = _base_of(start, change)
     captures = [s.shortest for id, s in bench.seen.items() if s.shortest is not None and (not use or id in use)]
-    found = likely(captures, blur_of(start) or 0.0, base) if captures and base > 0 else None
+    blur = blur_of(start)
+    if blur is None or any(hasattr(e, "sensitivity") for e in start.at("dead_time")):
+        raise SpadError("how long each pixel is blind is not told where stamps or the recovery blur it by other laws")
+    found = edges.likely(captures, blur, base) if captures and base > 0 else None
     if found is None:
         raise SpadError("no capture has intervals short enough to tell how long each pixel is blind")
     grid, says = found
-    weights = _by_their_law(says)
+    width = edges.width_of(grid, says)
+    weights = says * width.prior.astype(np.float32)
+    weights /= weights.sum(axis=1, keepdims=True)
     estimate, error = _mean_of(weights, grid)
     raw, raw_error = _mean_of(says, grid)
-    group = groups_of(start, change.per)
-    sigma = float(np.sqrt(np.var(estimate) + np.mean(error**2)))
-    known = Map(change.carrier, base, group, estimate, error, raw, raw_error, sigma)
-    return replace(known, likely=(grid, weights), certain=0.0, said=says)
+    low, high = _bounds_of(change.carrier)
+    map_ = Map(change.carrier, base, groups_of(start, change.per), estimate, error, raw, raw_error, width.sigma)
+    return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)
 
 
 def by_counts(change: Change) -> bool:
@@ -482,7 +497,10 @@ def information(bench: Bench, values: Values, change: Change, levels: dict[str, 
     if change.blinds:
         base = _base_of(with_values(bench.start, {k: v for k, v in values.items() if k != change.carrier}), change)
         told = {id: seen.shortest for id, seen in bench.seen.items()}
-        return {id: np.zeros(pixels) if s is None else (base * s.density) ** 2 for id, s in told.items()}
+        return {
+            id: np.zeros(pixels) if s is None else np.where(s.tells(base), base * s.density, 0.0) ** 2
+            for id, s in told.items()
+        }
     effect = with_values(bench.start, values).effect(change.carrier[0])
     if effect is None:
         now = np.full(int(groups_of(bench.start, change.per).max()) + 1, _base_of(bench.start, change))
@@ -522,7 +540,10 @@ def sensors_with(
             maps[id] = whole
         else:
             others = [i for i in bench.seen if i != id]
-            maps[id] = settle_maps(bench, values, wanted, levels, others)
+            try:
+                maps[id] = settle_maps(bench, values, wanted, levels, others)
+            except SpadError:  # the others tell nothing of one of the maps
+                maps[id] = whole
 
     def of(id: str, number: int) -> Sensor:
         rng = np.random.Generator(np.random.Philox(key=[bench.seed + 7, number]))

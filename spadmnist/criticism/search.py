@@ -322,7 +322,8 @@ class Search:
                     one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
             else:
                 one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
-                if one.chance is not None:  # small differences of many pixels are lost among what chance leaves
+                # small differences of many pixels are lost among what chance leaves, but for edges, which stand out
+                if one.chance is not None and not one.change.blinds:
                     one.gain = max(one.gain, _mark_of(one.chance) ** 2)
             kept.append(self._marked(state, one) if faint else one)
         return sorted(kept, key=lambda t: -t.gain)

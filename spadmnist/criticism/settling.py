@@ -20,7 +20,7 @@ _CLOSE = 0.02  # and no nearer
 _TOLD_ASIDE = (0.1, 0.7)  # the same, of slopes that are known but for their size
 _TOLD_SIZE = 2.5  # times what they are thought to be, at most
 _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slopes hold
-_PROMISING = 0.01  # of what is left beyond chance: a model that is wrong by far gets no better by less
+_PROMISING = 0.1  # of the root of what was gained: far less than what tells two candidates apart
 _VAIN = 2  # steps in a row, the second one shorter, that gain nothing: what is left is chance
 _BLIND = 0.05  # squared slope of a number that nothing tells
 
@@ -88,6 +88,7 @@ def settle(
     own = np.concatenate([state.own[k] for k in keys], axis=1)  # (recordings, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in dials])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
+    begun = 0.0
     slopes, there, damping, promised, vain = np.zeros((0, len(dials))), u, 0.0, 0.0, 0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in dials])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in dials])
@@ -124,8 +125,10 @@ def settle(
         error = np.sqrt(np.maximum(np.diag(covariance_of(slopes, own)), 1e-30))
         # never so short that what is taken for noise, or not, makes a slope
         steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.5)
-        vain_below = 1.0 + _PROMISING * max(square - len(z), 0.0)
-        if turn and (promised < vain_below or np.all(np.abs(u - u0) < 0.3 * error)):
+        begun = square if turn == 0 else begun
+        if turn and (
+            promised < 1.0 + _PROMISING * math.sqrt(max(begun - square, 0.0)) or np.all(np.abs(u - u0) < 0.3 * error)
+        ):
             break
     assert best is not None
     square, u, z = best

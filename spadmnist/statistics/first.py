@@ -17,6 +17,7 @@ _BINS = 40
 _FINE = 8  # parts of the first of them, about what is carried over from the frame before
 _AFTER = ("after an empty frame", "after a frame with an early detection", "after a frame with a late one")
 _LATE = 0.9  # of a frame
+_FEW = 10  # detections near an end, of which nothing is said
 _NORMAL = 0.2654  # power of an exponential variable that is as good as normal
 
 
@@ -87,28 +88,31 @@ class FrameLimits(Statistic):
     """How long no pixel ever fires at the beginning and at the end of a frame, as the detections near by have it.
 
     The ticks before the first detection of all frames and behind the last one, times the detections to a tick in the
-    fortieth of a frame that follows or comes before: exponential of mean 1, whatever the light. Of that the power
-    0.2654, which is as good as normal (Weibull of no skewness). Where in its tick a detection was is left to chance,
-    lest ticks make steps. Here a gate shows that opens late or closes early by less than a bin holds: nothing else
-    says its edge as exactly.
+    fortieth of a frame that follows or comes before: exponential of mean 1 in steady light, where these are many. Of
+    that the power 0.2654, which is nearly normal (Weibull's law of that power has hardly any skewness). Where in its
+    tick a detection was is left to chance, lest ticks make steps. Here a gate shows that opens late or closes early by
+    less than a bin holds.
     """
 
     modalities = ("str",)
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        """(2,) at the beginning, at the end; nothing is said without a detection."""
+        """(2,) at the beginning, at the end; None of a capture that has hardly a detection at either."""
         none, tick = int(recording.none), recording.tick or 1.0
-        pieces = [stamps for _, (_, stamps, _) in first_stamps(recording) if len(stamps)]
-        if not pieces:
-            return None
-        ends = min(int(p.min()) for p in pieces), max(int(p.max()) for p in pieces)
+        ends = none, -1
+        for _, (_, stamps, _) in first_stamps(recording):
+            if len(stamps):
+                ends = min(ends[0], int(stamps.min())), max(ends[1], int(stamps.max()))
         reach = max(none // _BINS, 1)
-        early = sum(int(np.count_nonzero(p <= ends[0] + reach)) for p in pieces)
-        late = sum(int(np.count_nonzero(p >= ends[1] - reach)) for p in pieces)
-        density = np.array([early, late]) / (reach + 1.0)
+        near, alike = np.zeros(2), np.zeros(2)
+        for _, (_, stamps, _) in first_stamps(recording):
+            near += np.count_nonzero(stamps <= ends[0] + reach), np.count_nonzero(stamps >= ends[1] - reach)
+            alike += np.count_nonzero(stamps == ends[0]), np.count_nonzero(stamps == ends[1])
+        if near.min() < _FEW:
+            return None
+        density = near / (reach + 1.0)
         # the first of those that share its tick, at a time of its own within it
-        alike = np.array([sum(int(np.count_nonzero(p == end)) for p in pieces) for end in ends])
         within = -np.expm1(np.log1p(-shares(np.asarray(recording.totals), 2)) / alike)
         quiet = np.array([ends[0], none - 1 - ends[1]]) + within
 
