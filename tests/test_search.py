@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, quiet, taken
+from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken
 
 from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
@@ -387,3 +387,17 @@ def test_a_time_is_tried_short_and_long(lab) -> None:
     assert usual == pytest.approx(math.sqrt(recovery.low * recovery.high)) and recovery.low < short < usual / 5
     (crosstalk,) = first_strengths(change_of(bench, "add crosstalk").strengths[0])
     assert 0 < crosstalk < 1
+
+
+def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(lab) -> None:
+    """What moves an edge does not grow in proportion: a line search may lead to where nothing of it is left."""
+    sensor, data = lab("    slow_recovery: {time_constant: 5 ns}\n", light=900, side=4)
+    course = course_of.begun(bench_of((sensor, data)))
+    key = ("slow_recovery", "time_constant")
+    seen = given(course, "add slow_recovery", {key: 5e-9}, settle=False)
+    far = replace(seen, gain=1000.0, times=30.0)
+    (found,) = course.search.again(course.state, {}, [far])
+    assert found.values[key] == pytest.approx(5e-9) and found.gain > 25
+    # near by it goes where it is led
+    (found,) = course.search.again(course.state, {}, [replace(seen, gain=1000.0, times=1.2)])
+    assert found.values[key] == pytest.approx(6e-9)

@@ -31,6 +31,7 @@ from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
+_FAR_OFF = 0.4  # of the logarithm of a strength
 _REFINED = 3  # of these, that are settled
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _LEAST_CHANCE, _CHANCE_BESIDE = 1e-3, 0.05  # of a map that is tried, and beside what chance makes of pixels
@@ -303,12 +304,15 @@ class Search:
                 continue
             # a faint trace drowns in what is left of chance: a stronger one tells what it looks like, but of an edge
             size = self.bench.size(state, one.moved)
-            least = 0.0 if any(map(is_edge, one.change.strengths)) else min(STRONG / max(size, 1e-9), 1.0)
+            edge = any(map(is_edge, one.change.strengths))
+            least = 0.0 if edge else min(STRONG / max(size, 1e-9), 1.0)
             one.times = math.copysign(max(abs(one.times), least), one.times)
-            given = one.scaled()
-            out.append(
-                replace(one, values=given, gain=size, sensors=state.sensors.changed(given, one.phases, one.chips))
-            )
+            # how far an edge has to go nothing in proportion tells: where it was seen it is nearer than where it is not
+            as_it_was = [replace(one, times=1.0)] if edge and abs(math.log(abs(one.times))) > _FAR_OFF else []
+            for start in [one, *as_it_was]:
+                given = start.scaled()
+                sensors = state.sensors.changed(given, one.phases, one.chips)
+                out.append(replace(start, values=given, gain=size, sensors=sensors))
         # pixels that chance has made odd are a map, too, even where the map alone would be no news
         least = _CHANCE_BESIDE if any(one.chips for one in best) else _LEAST_CHANCE
         for one in self._simulated(state, [*out, *self.maps(state, values, least)], fit.FEW):
@@ -326,7 +330,10 @@ class Search:
                 if one.chance is not None and not one.change.blinds:
                     one.gain = max(one.gain, _mark_of(one.chance) ** 2)
             kept.append(self._marked(state, one) if faint else one)
-        return sorted(kept, key=lambda t: -t.gain)
+        found: dict[int | str, Tried] = {}
+        for one in sorted(kept, key=lambda t: -t.gain):
+            found.setdefault(id(one) if one.maps else one.change.name, one)
+        return list(found.values())
 
     def _marked(self, state: State, one: Tried) -> Tried:
         """The same, its gain being the square of how much the data resemble its trace."""
