@@ -15,6 +15,7 @@ from .fit import RATES, Bench, Cell, Moved, State
 # times the strength of what was simulated: at first, and about the best of these
 TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
+_NEARER = (0.92, 0.96, 1.04, 1.08)
 _PHASES = 24  # that are looked at
 _TURNS = 8  # of them, that are simulated
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step from one to the next
@@ -62,8 +63,8 @@ class Swing:
         every = 2 * math.pi * np.arange(_PHASES) / _PHASES
         around = dict.fromkeys(bench.seen, every)
         best = _best(self, bench, state, times, around)
-        if len(times) > 1:
-            best = max(best, _best(self, bench, state, [best[1] * x for x in NEAR], around), key=lambda b: b[0])
+        for closer in (NEAR, _NEARER) if len(times) > 1 else ():
+            best = max(best, _best(self, bench, state, [best[1] * x for x in closer], around), key=lambda b: b[0])
         step = 2 * math.pi / _PHASES
         return _best(self, bench, state, [best[1]], {id: p + step * _CLOSER for id, p in best[2].items()})
 
