@@ -431,7 +431,8 @@ class Search:
             if change.per != "pixel" or change.carrier is None or change.effect == like.change.effect:
                 continue
             told = sum(mapping.information(self.bench, values, change, levels).values())
-            if float(np.median(told)) > _TOLD:
+            # what intervals tell of each pixel, jitter may have scattered as well
+            if float(np.median(told)) > _TOLD and not change.blinds:
                 continue
             best: Tried | None = None
             about, sigmas = 0.0, np.array(_SIGMAS)
