@@ -83,7 +83,13 @@ def test_the_limits_of_a_small_recording() -> None:
     assert np.array_equal(again.values, found.values)
 
 
-@pytest.mark.parametrize(("share", "tick"), [(0.3, 1e-9), (0.3, 1e-12), (0.6, 1e-7), (0.05, 1e-9)])
+@pytest.mark.parametrize(
+    ("share", "tick"),
+    [
+        (0.6, 1e-7),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0.3, 1e-9), (0.3, 1e-12), (0.05, 1e-9))),
+    ],
+)
 def test_the_law_of_the_limits(share: float, tick: float) -> None:
     values = many(FrameLimits, partial(stamped, shape=(500, 8, 8), share=share, tick=tick), 400)
     usual = math.gamma(1.2654)
