@@ -17,7 +17,7 @@ _BINS = 40
 _FINE = 8  # parts of the first of them, about what is carried over from the frame before
 _AFTER = ("after an empty frame", "after a frame with an early detection", "after a frame with a late one")
 _LATE = 0.9  # of a frame
-_FEW = 10  # detections near an end, of which nothing is said
+_FEW = 10  # detections near an end: of fewer nothing is said
 _NORMAL = 0.2654  # power of an exponential variable that is as good as normal
 
 
