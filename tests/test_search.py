@@ -12,7 +12,6 @@ from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given
 
 from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import search as searching
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.candidates import Dial, first_strengths
 from spadmnist.criticism.chance import along
@@ -112,6 +111,40 @@ def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
             state.residuals[cell] = sign * 10.0 * trace / math.sqrt(float(trace @ trace))
             p.append(chance._of_traces(bench, state, [one])[0][0])
         assert p[0] < 1e-3 and p[1] == (pytest.approx(p[0]) if signed else 1.0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign: float) -> None:
+    """A ramp and a spectrum of four standard deviations each: together 5.7, whichever way the light drifts."""
+    bench = bench_of(lab())
+    state = bench.state({})
+    ramp, power = ("flat", "trend"), ("flat", "fine_intervals")
+    up, down = (
+        Moved({cell: np.full(len(state.residuals[cell]), x) for cell, x in ((ramp, odd), (power, 5.0))}, {}, {})
+        for odd in (5.0, -5.0)
+    )
+    change = change_of(bench, "add source_drift")
+    one = Tried(change, {d.key: 0.1 for d in change.dials}, Moved.both(up, down), 0.0, 1.0)
+    trace = bench.template(state, one.moved)
+    for cell, side in ((ramp, sign), (power, 1.0)):
+        t = trace[cell]
+        state.residuals[cell] = side * 4.0 * t / math.sqrt(float(t @ t))
+    found, times = chance.nearest_face(bench, state, one)
+    assert times * sign > 0
+    there = along(bench, state, one.moved.at(times))
+    assert found.data == there.data > along(bench, state, one.moved.at(-times)).data + 1
+    marked = quiet(bench)._marked(state, one)
+    assert marked.gain == found.data**2 and marked.times * sign > 0
+    # settled as strong as it is seen, it helps, and the opposite does not
+    strong = min((0.02 * k for k in range(1, 50)), key=lambda x: abs(along(bench, state, one.moved.at(x)).size - 5.0))
+    one.there = one.moved.at(sign * strong)
+    assert chance.helps(bench, state, one)
+    one.there = one.moved.at(-sign * strong)
+    assert not chance.helps(bench, state, one)
+    one.there = None
+    # and chance is asked of this one
+    mark, p = chance.of_best(bench, state, [one], one, large=False)
+    assert mark == found.data and p < 0.01
 
 
 # --- faint effects -----------------------------------------------------------------------------------------------
@@ -284,7 +317,7 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     weak = replace(far, change=change_of(bench, "add afterpulsing"), moved=Moved({}, {}, {"flat": 3.0}))
     traces = {id(clear.moved): 4.5, id(weak.moved): 1.0}
     monkeypatch.setattr(
-        searching, "along", lambda bench, state, moved: chance.Likeness(9.0, traces[id(moved)], np.zeros(16), 1.0, 15.0)
+        chance, "along", lambda bench, state, moved: chance.Likeness(9.0, traces[id(moved)], np.zeros(16), 1.0, 15.0)
     )
     seen.clear()
     look.again(state, {}, [weak, clear], faint=True)

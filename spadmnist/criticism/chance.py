@@ -22,6 +22,7 @@ LEAST_P = 1e-300
 _MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _EDGES = "early_intervals"  # how unlike the pixels are in how long they are blind
 _LITTLE = 0.1  # times as strong: what grows with the square is no matter there
+_FACES = 1.0, -1.0, _LITTLE, -_LITTLE
 _HELD = 0.9  # of what directions of a candidate have in common, by few recordings
 _SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
 _LEAST_VARIANCE = 0.3  # of a cell
@@ -64,14 +65,15 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
         others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
     _, own = _of_traces(bench, state, [best, *tried])
-    found = along(bench, state, best.moved)
+    found, _ = nearest_face(bench, state, best)
     if found.size <= 0:
         return 0.0, 1.0
-    mark = abs(found.data) if best.signed else max(found.data, 0.0)
+    two_sided = best.signed and not _faced(best)
+    mark = abs(found.data) if two_sided else max(found.data, 0.0)
     if large:  # what is far outside is no matter of the linear law: the gain itself, in the same measure
         mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
     sides = len(best.change.strengths) if _sided(best) else 0
-    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if best.signed else 2)
+    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if two_sided else 2)
     return mark, max(_of_least(own, one), LEAST_P)
 
 
@@ -82,9 +84,9 @@ def helps(bench: Bench, state: State, one: Tried) -> bool:
     """
     if one.chance is not None or one.there is None:
         return True
-    found = along(bench, state, one.moved)
+    found, times = nearest_face(bench, state, one)
     keys = list(state.residuals)
-    trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved, one.there))
+    trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved.at(times), one.there))
     settled = found.size * float(trace @ there) / max(float(trace @ trace), 1e-300)
     return abs(settled - found.data) < abs(found.data)
 
@@ -100,13 +102,13 @@ def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list
     data: list[float] = []
     least = np.ones(len(state.own[RATES]))
     for group in groups.values():
-        # where a sign matters and more of it looks otherwise: little, too
-        for times in (1.0, _LITTLE) if group[0].moved.even is not None else (1.0,):
+        faced = _faced(group[0])
+        for times in _FACES if faced else (1.0, _LITTLE) if group[0].moved.even is not None else (1.0,):
             found = [along(bench, state, one.moved.at(times)) for one in group]
             found = [x for x in found if x.size > 0]
             if not found:
                 continue
-            p, own = _together(found, group[0].signed)
+            p, own = _together(found, group[0].signed and not faced)
             data.append(p)
             least = np.minimum(least, own)
     return data, least
@@ -115,6 +117,23 @@ def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list
 def _sided(one: Tried) -> bool:
     """Is it one of several directions?"""
     return one.change.kind == "add" and one.signed and len(one.change.strengths) > 1
+
+
+def _faced(one: Tried) -> bool:
+    """Is its opposite more than what it does with the other sign?
+
+    Some of it, a spectrum say, grows with the square, and belongs to either sign alike: each is judged by itself.
+    """
+    return one.signed and one.moved.even is not None and not _sided(one)
+
+
+def nearest_face(bench: Bench, state: State, one: Tried) -> tuple[Likeness, float]:
+    """(how much the data resemble a candidate's trace, times the strength at which they do so most).
+
+    Where more of it, or the opposite, looks otherwise, these are other traces.
+    """
+    looks = [(along(bench, state, one.moved.at(x)), x) for x in (_FACES if _faced(one) else (1.0,))]
+    return max(looks, key=lambda look: look[0].data)
 
 
 def _together(found: Sequence[Likeness], signed: bool) -> tuple[float, np.ndarray]:

@@ -22,7 +22,7 @@ from .search import Search
 from .settling import Settled
 from .showing import captures_showing
 from .swings import turned
-from .tried import Tried
+from .tried import Tried, is_edge
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
 _SAME = 0.35  # of a coordinate: so far slopes hold
@@ -242,16 +242,19 @@ def _of_pixels(course: Course, step: Step, maps: Mapping[Key, mapping.Map]) -> n
 
 
 def errors_known(course: Course, settled: Settled | None = None) -> dict[Key, float]:
-    """Standard deviations of the coordinates of strengths that are settled already: edges have slopes close by only."""
+    """Standard deviations of the coordinates of edges that are settled already: they have slopes close by only.
+
+    All else is followed over longer ways, lest chance hides how.
+    """
     out = {}
     for step in course.steps:
-        for dial in step.dials:
+        for dial in filter(is_edge, step.dials):
             v = step.values.get(dial.parameter)
-            if dial.off is not None and v is not None and v.low is not None and v.high is not None:
+            if v is not None and v.low is not None and v.high is not None:
                 out[dial.key] = abs(dial.coordinate(v.high) - dial.coordinate(v.low)) / (2 * _HALF)
     if settled is not None:
         spread = np.sqrt(np.maximum(np.diag(settled.covariance), 0.0))
-        out |= {d.key: float(x) for d, x in zip(settled.dials, spread, strict=True) if d.off is not None}
+        out |= {d.key: float(x) for d, x in zip(settled.dials, spread, strict=True) if is_edge(d)}
     return out
 
 

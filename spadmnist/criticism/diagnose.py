@@ -36,7 +36,7 @@ from .course import (
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
-from .refining import refine
+from .refining import refine, state_of
 from .search import alike
 from .tried import Tried
 
@@ -360,7 +360,12 @@ def _alternatives(
         if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
-        failed = checks.failing(checks.blocks(bench, state, residuals))
+        # where chance makes pixels odd, the model's own recordings scatter otherwise
+        judged, left = state, residuals
+        if one.chips and one.residuals is not None:
+            judged = state_of(bench, one)
+            left = judged.residuals
+        failed = checks.failing(checks.blocks(bench, judged, left))
         as_good = one.residuals is not None and best.gain - one.gain < alike(best.gain) and not failed
         out.append(
             {

@@ -21,7 +21,7 @@ from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
 from .candidates import Change, Key, chancy, changes, templates, with_values
-from .chance import LEAST_P, along, of_map
+from .chance import LEAST_P, nearest_face, of_map
 from .fit import RATES, Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
@@ -31,6 +31,7 @@ from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
+_BOLDER = 3.0  # times as strong as where a faint trace was seen, for what it looks like
 _FAR_OFF = 0.4  # of the logarithm of a strength
 _REFINED = 3  # of these, that are settled
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
@@ -305,7 +306,7 @@ class Search:
             # a faint trace drowns in what is left of chance: a stronger one tells what it looks like, but of an edge
             size = self.bench.size(state, one.moved)
             edge = any(map(is_edge, one.change.strengths))
-            least = 0.0 if edge else min(STRONG / max(size, 1e-9), 1.0)
+            least = 0.0 if edge else min(STRONG / max(size, 1e-9), _BOLDER if faint else 1.0)
             one.times = math.copysign(max(abs(one.times), least), one.times)
             # how far an edge has to go nothing in proportion tells: where it was seen it is nearer than where it is not
             as_it_was = [replace(one, times=1.0)] if edge and abs(math.log(abs(one.times))) > _FAR_OFF else []
@@ -339,10 +340,10 @@ class Search:
         """The same, its gain being the square of how much the data resemble its trace."""
         if one.chance is not None:
             return replace(one, gain=_mark_of(one.chance) ** 2)
-        found = along(self.bench, state, one.moved)
+        found, times = nearest_face(self.bench, state, one)
         mark = abs(found.data) if one.signed else max(found.data, 0.0)
-        suits = found.data / found.size if mark > 0 else one.times
-        return replace(one, gain=mark**2, times=one.times if one.gain > 0 else suits)
+        suits = times * found.data / found.size if mark > 0 else one.times
+        return replace(one, gain=mark**2, times=one.times if one.gain > 0 and one.times * suits > 0 else suits)
 
     def maps(self, state: State, values: dict[Key, Any], least: float = _LEAST_CHANCE) -> list[Tried]:
         """Every map whose values differ beyond their noise, and all that are needed side by side.
