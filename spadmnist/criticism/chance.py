@@ -22,7 +22,6 @@ LEAST_P = 1e-300
 _MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _EDGES = "early_intervals"  # how unlike the pixels are in how long they are blind
 _LITTLE = 0.1  # times as strong: what grows with the square is no matter there
-_FACES = 1.0, -1.0, _LITTLE, -_LITTLE
 _HELD = 0.9  # of what directions of a candidate have in common, by few recordings
 _SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
 _LEAST_VARIANCE = 0.3  # of a cell
@@ -68,12 +67,11 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
     found, _ = nearest_face(bench, state, best)
     if found.size <= 0:
         return 0.0, 1.0
-    two_sided = best.signed and not _faced(best)
-    mark = abs(found.data) if two_sided else max(found.data, 0.0)
+    mark = abs(found.data) if _two_sided(best) else max(found.data, 0.0)
     if large:  # what is far outside is no matter of the linear law: the gain itself, in the same measure
         mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
     sides = len(best.change.strengths) if _sided(best) else 0
-    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if two_sided else 2)
+    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if _two_sided(best) else 2)
     return mark, max(_of_least(own, one), LEAST_P)
 
 
@@ -102,13 +100,12 @@ def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list
     data: list[float] = []
     least = np.ones(len(state.own[RATES]))
     for group in groups.values():
-        faced = _faced(group[0])
-        for times in _FACES if faced else (1.0, _LITTLE) if group[0].moved.even is not None else (1.0,):
+        for times in _looks(group[0]):
             found = [along(bench, state, one.moved.at(times)) for one in group]
             found = [x for x in found if x.size > 0]
             if not found:
                 continue
-            p, own = _together(found, group[0].signed and not faced)
+            p, own = _together(found, _two_sided(group[0]))
             data.append(p)
             least = np.minimum(least, own)
     return data, least
@@ -119,21 +116,25 @@ def _sided(one: Tried) -> bool:
     return one.change.kind == "add" and one.signed and len(one.change.strengths) > 1
 
 
-def _faced(one: Tried) -> bool:
-    """Is its opposite more than what it does with the other sign?
+def _two_sided(one: Tried) -> bool:
+    """Is its opposite what it does with the other sign, and either a find?
 
-    Some of it, a spectrum say, grows with the square, and belongs to either sign alike: each is judged by itself.
+    Some of a drift, a spectrum say, grows with the square and belongs to either sign alike: each is judged by itself.
     """
-    return one.signed and one.moved.even is not None and not _sided(one)
+    return one.signed and (one.moved.even is None or _sided(one))
+
+
+def _looks(one: Tried) -> Sequence[float]:
+    """Times its strength, at which its trace is another: where a sign matters and more looks otherwise, little, too."""
+    if one.moved.even is None:
+        return (1.0,)
+    return (1.0, _LITTLE) if _two_sided(one) or not one.signed else (1.0, -1.0, _LITTLE, -_LITTLE)
 
 
 def nearest_face(bench: Bench, state: State, one: Tried) -> tuple[Likeness, float]:
-    """(how much the data resemble a candidate's trace, times the strength at which they do so most).
-
-    Where more of it, or the opposite, looks otherwise, these are other traces.
-    """
-    looks = [(along(bench, state, one.moved.at(x)), x) for x in (_FACES if _faced(one) else (1.0,))]
-    return max(looks, key=lambda look: look[0].data)
+    """(how much the data resemble a candidate's trace, times the strength at which they do so most)."""
+    looks = [(along(bench, state, one.moved.at(x)), x) for x in _looks(one)]
+    return max(looks, key=lambda look: abs(look[0].data) if _two_sided(one) else look[0].data)
 
 
 def _together(found: Sequence[Likeness], signed: bool) -> tuple[float, np.ndarray]:
