@@ -38,13 +38,14 @@ from .fit import RATES, Bench, State
 from .ladder import placebo_row
 from .refining import refine, state_of
 from .search import alike
-from .tried import Tried
+from .tried import Tried, at_end
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
 _TRACE = 4e-3  # p-value of a trace that is followed where no check fails by itself: less than what checks alarm by
 _MAYBE, _CLOSER = 100.0, recordings.REPLICATES  # times as likely by chance: worth so many recordings
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
 _NAMED = 4  # alternatives of a step
+_ALMOST = 0.8  # of the gain of what lies at the end of its range: another law may be the right one
 _LATER_TRACE = 5e-4  # the same beside steps that explain all that failed
 
 
@@ -366,7 +367,8 @@ def _alternatives(
             judged = state_of(bench, one)
             left = judged.residuals
         failed = checks.failing(checks.blocks(bench, judged, left))
-        as_good = one.residuals is not None and best.gain - one.gain < alike(best.gain) and not failed
+        near = best.gain - one.gain < alike(best.gain) or (at_end(best) and one.gain > _ALMOST * best.gain)
+        as_good = one.residuals is not None and near and not failed
         out.append(
             {
                 "change": one.change.kind,

@@ -111,6 +111,15 @@ def room_of(dial: Dial, value: float) -> float:
     return (bound - off) / (value - off) if value != off else 1.0
 
 
+def at_end(one: Tried) -> bool:
+    """Does a shape lie at an end of where it is looked for? Then its law is hardly what is there."""
+    shapes = {d: one.values.get(d.key) for d in one.change.shapes}
+    return any(
+        isinstance(x, (int, float)) and any(math.isclose(x, end, rel_tol=1e-6) for end in (d.low, d.high))
+        for d, x in shapes.items()
+    )
+
+
 def is_edge(dial: Dial) -> bool:
     """A strength that is a time, or what lacks of one: nothing grows with it in proportion, an edge moves."""
     return dial.lacks or (dial.unit == "s" and dial.off is not None)
