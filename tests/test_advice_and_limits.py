@@ -243,6 +243,10 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
     many = diagnose._alternatives(bench, state, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
+    # where chance makes pixels odd, by that model's own scatter
+    own = with_residuals(state, {})
+    assert told(residuals=foul, chips=True, state=own) == [("slow_afterpulsing", True)]
+    assert told(chips=True, state=with_residuals(state, {"intervals": 10.0})) == [("slow_afterpulsing", False)]
     # at the end of where it is looked for no law is quite right: what nearly does as well may be
     for lifetime, alike in ((499e-9, False), (500e-9, True), (5e-9, True)):
         best.values = {("afterpulsing", "lifetime"): lifetime}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -322,7 +323,26 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     seen.clear()
     look.again(state, {}, [weak, clear], faint=True)
     assert [one.change.name for one in seen] == ["add crosstalk"]
+    # what hardly shows is simulated up to three times as strong, where nothing is plainly wrong
+    dim = replace(near, moved=Moved({}, {}, {"flat": 0.1}), gain=45.0, times=0.8)
+    traces[id(dim.moved)] = 4.5
+    for faint, times in ((False, 1.0), (True, 3.0)):
+        seen.clear()
+        look.again(state, {}, [dim], faint=faint)
+        assert seen[0].values[CROSSTALK] == pytest.approx(0.004 * times)
     assert asked[:2] == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
+
+
+def test_only_edges_are_followed_close_by(lab) -> None:
+    """A slope of a drift that is known to 0.003 was told by what 0.02 do, of which chance hides nearly all."""
+    bench = bench_of(lab())
+    drift, gate = (change_of(bench, f"add {name}").strengths[0] for name in ("source_drift", "short_gate"))
+    known = Value(0.5, 0.49, 0.51, "")
+    steps = [SimpleNamespace(dials=(d,), values={d.parameter: known}) for d in (drift, gate)]
+    course: Any = SimpleNamespace(steps=steps)
+    assert list(course_of.errors_known(course)) == [gate.key]
+    settled: Any = SimpleNamespace(dials=(drift, gate), covariance=np.diag([0.01, 0.04]))
+    assert course_of.errors_known(course, settled) == {gate.key: pytest.approx(0.2)}
 
 
 def test_a_number_that_a_step_settles_is_no_map(lab) -> None:
