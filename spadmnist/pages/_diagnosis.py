@@ -27,6 +27,7 @@ _FLOOR, _REACHED, _ABOVE, _PLACEBO = "#e3efe6", "#3f7f57", "#c8584c", "#bcc2c6"
 _LINE = 14  # letters of a name below a bar
 _LETTER = 0.078  # inches that one takes
 _MOST = 200  # rows of a table
+_HALF = 0.5  # of an error: what falls further has fallen
 _BEYOND = 1e4  # sigmas: more are no more than that
 _COLUMNS = {
     "mean_rate": "mean rate",
@@ -118,13 +119,16 @@ def _words(found: Diagnosis) -> dict[str, Any]:
 
 
 def _fallen(found: Diagnosis) -> tuple[str, float, float] | None:
-    """(which physical error fell most, from what, to what), where the misfit, which knows no totals, saw nothing."""
+    """(which physical error fell most, from what, to what), where the misfit, which knows no totals, saw nothing.
+
+    None where no error fell to less than a half: then it is no matter of totals.
+    """
     rows = [row["errors"] for row in found.ladder if not row["placebo"]]
     if not found.steps or found.before > found.null_95 or len(rows) < 2:
         return None
     first, last = rows[0], rows[-1]
     most = max(_COLUMNS, key=lambda name: first.get(name, 0.0) - last.get(name, 0.0))
-    fell = first.get(most, 0.0) > last.get(most, 0.0)
+    fell = _HALF * first.get(most, 0.0) > last.get(most, 0.0)
     return (_COLUMNS[most], first[most], last.get(most, 0.0)) if fell else None
 
 
@@ -326,7 +330,9 @@ The misfit {{ "fell" if found.after < found.before else "went" }} from <b>{{ fou
 <b>{{ found.after | number }}</b>{% else %}The misfit is <b>{{ found.before | number }}</b>{% endif %}; \
 chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 100 measurements.\
 {% if fallen %} It was there before, for it knows no totals: the error of the {{ fallen[0] }} fell from \
-<b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.{% endif %}</p>
+<b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.\
+{% elif found.steps and found.before <= found.null_95 %} It was as low before: what was missing is faint in every \
+single statistic, and is told by its trace through all of them.{% endif %}</p>
 <p class="small">{{ found.sensor or "A sensor without a name" }} beside {{ found.measurement }}\
 {% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
 beside this page: <b>{{ next }}</b>{% endif %}\
