@@ -331,8 +331,8 @@ The misfit {{ "fell" if found.after < found.before else "went" }} from <b>{{ fou
 chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 100 measurements.\
 {% if fallen %} It was there before, for it knows no totals: the error of the {{ fallen[0] }} fell from \
 <b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.\
-{% elif found.steps and found.before <= found.null_95 %} It was as low before: what was missing is faint in every \
-single statistic, and is told by its trace through all of them.{% endif %}</p>
+{% elif found.steps and found.before <= found.null_95 %} It was as low before: a mean over everything hardly \
+shows what is faint in each statistic, or what only a few of them tell.{% endif %}</p>
 <p class="small">{{ found.sensor or "A sensor without a name" }} beside {{ found.measurement }}\
 {% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
 beside this page: <b>{{ next }}</b>{% endif %}\
