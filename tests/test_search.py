@@ -136,6 +136,11 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
     assert found.data == there.data > along(bench, state, one.moved.at(-times)).data + 1
     marked = quiet(bench)._marked(state, one)
     assert marked.gain == found.data**2 and marked.times * sign > 0
+    # less than nothing of what both signs do is neither
+    told = dict(state.residuals)
+    state.residuals[ramp], state.residuals[power] = 0.0 * told[ramp], -told[power]
+    assert quiet(bench)._marked(state, one).gain == 0
+    state.residuals.update(told)
     # settled as strong as it is seen, it helps, and the opposite does not
     strong = min((0.02 * k for k in range(1, 50)), key=lambda x: abs(along(bench, state, one.moved.at(x)).size - 5.0))
     one.there = one.moved.at(sign * strong)
