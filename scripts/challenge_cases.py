@@ -273,6 +273,17 @@ def all_lit(lab: Lab, power: float) -> float:
     return sum(lab.pixels * lab.weight(c) * lab.share(c) ** 2 for c in lab.lit) * power
 
 
+def random_level(length: float, relative: float, hold: float, weight: float) -> float:
+    """Square of the Z of a level that jumps at random, its correlation falling as exp(-t / hold).
+
+    relative: variance of the level over its mean's square; weight: detections in so long a time. Nobody knows when it
+    jumps: by the likelihood of the powers of its spectrum (Whittle), but for what the mean alone would tell.
+    """
+    k = np.arange(1, max(50, math.ceil(5 * length / hold)))
+    power = relative * weight * 2 * hold / length / (1 + (2 * np.pi * k * hold / length) ** 2)
+    return 2 * float((power - np.log1p(power)).sum())
+
+
 def edge(lab: Lab, width: float) -> float:
     """Z of detections within `width` of the end of the dead time that one model has and the other has not.
 
@@ -419,10 +430,11 @@ def dead_time_spread(lab: Lab, x: float) -> Hidden:
 @hides(EFFECTS, "tr")
 def paralyzable(lab: Lab, x: float) -> Hidden:
     lab.world.paralyzable = True
-    pulls = [lab.pixels * lab.detections(c) * (lab.rate(c) * DEAD_TIME) ** 3 for c in lab.stated]
+    # from 1 - exp(-lambda tau_d) to none: a third of its square on the average
+    pulls = [lab.pixels * lab.detections(c) * (lab.rate(c) * DEAD_TIME) ** 3 / 3 for c in lab.stated]
     return Hidden(
         math.sqrt(sum(pulls)),
-        "deficit 1 - exp(-lambda tau_d) for a dead time behind the edge",
+        "deficit behind the edge that ends after one more dead time",
         changed("set", "dead_time", "paralyzable"),
         {"paralyzable": True},
     )
@@ -450,18 +462,17 @@ def blinking(lab: Lab, x: float) -> Hidden:
     chosen = lab.rng.choice(lab.pixels, lab.pixels // 12, replace=False)
     on, off = lab.rng.uniform(3, 10), lab.rng.uniform(3, 10)
     lab.world.defects = [(int(p), x * k, on * r, off * r) for p in chosen for k, r in ((1.0, 1.0), (0.5, 2.0))]
-    # in each stretch between switches the rate is known to 1 / sqrt(counts): the log likelihood of a random level
-    total, dark = 0.0, FAMILIES["tr"]["dark"]
-    up = on / (on + off)
+    total, up = 0.0, on / (on + off)
     for c in lab.stated:
-        cells = max(1.0, c.length * 2 * on * off / (on + off))
-        excess = x**2 * up * (1 - up) * c.length / cells / (lab.light(c) + dark + x * up)
-        total += len(chosen) * cells * (excess - math.log1p(excess))
+        for k, r in ((1.0, 1.0), (0.5, 2.0)):
+            rate = lab.rate(c) + 1.5 * x * up
+            relative = (k * x / rate) ** 2 * up * (1 - up)
+            total += len(chosen) * random_level(c.length, relative, 1 / (r * (on + off)), rate * c.length)
     settings = {"pixels": len(chosen), "rate": x, "on": on, "off": off}
     near = {"blinking_dark_counts.amplitude": x, "blinking_dark_counts.fraction": len(chosen) / lab.pixels}
     return Hidden(
         math.sqrt(total),
-        "random level in each stretch between switches",
+        "spectra of pixels whose level jumps at random",
         added("blinking_dark_counts"),
         settings,
         near=near,
@@ -598,15 +609,11 @@ def source_noise(lab: Lab, x: float) -> Hidden:
     """A lamp that jumps between levels: its correlation falls as exp(-t / hold), its coherence time is twice that."""
     lab.world.lamp.contrast = x
     lab.world.lamp.hold = hold = float(np.exp(lab.rng.uniform(math.log(40e-6), math.log(400e-6))))
-    total = 0.0
-    for c in lab.lit:
-        cells = max(1.0, c.length / (2 * hold))
-        mean = x * lab.share(c) ** 2 * lab.pixels * lab.weight(c) / cells
-        total += cells * (mean - math.log1p(mean))
+    total = sum(random_level(c.length, x * lab.share(c) ** 2, hold, lab.pixels * lab.weight(c)) for c in lab.lit)
     settings = {"contrast": x, "hold": hold}
     return Hidden(
         math.sqrt(total),
-        "a random level in each coherence time",
+        "spectrum of a level that jumps at random",
         added("source_noise"),
         settings,
         {"source_noise.contrast": math.sqrt(x)},  # the catalogue's is the standard deviation of the level

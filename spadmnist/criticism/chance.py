@@ -224,16 +224,23 @@ def _weights(state: State, key: Cell) -> list[_Weigh]:
 
     def made() -> list[_Weigh]:
         rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
-        return [_weighing(x, cells / many) for x in [own, *rests]]
+        return [_weighing(x) for x in [own, *rests]]
 
     return state.once(("weights", key), made)
 
 
-def _weighing(own: np.ndarray, doubt: float) -> _Weigh:
-    """Trace -> weights. doubt: cells to a recording; of many cells few recordings hardly tell what they share."""
+def _weighing(own: np.ndarray) -> _Weigh:
+    """Trace -> weights. own: (recordings, cells); how these scatter together is believed as far as it is no chance.
+
+    Source: Schaefer and Strimmer, Stat. Appl. Genet. Mol. Biol. 4 (2005) 32, for correlations.
+    """
     together = own.T @ own / len(own)
     alone = np.maximum(np.diag(together), _LEAST_VARIANCE)
-    together /= 1 + doubt
+    alike = together / np.sqrt(np.outer(alone, alone))
+    np.fill_diagonal(alike, 0.0)
+    square, pairs = float(np.sum(alike**2)), len(alike) * (len(alike) - 1)
+    by_chance = (pairs - square) / len(own)
+    together *= min(max(0.0, 1 - by_chance / max(square, 1e-30)), 1 - 1 / len(own))
     np.fill_diagonal(together, alone)
     inverse = np.linalg.inv(together)
     return lambda t: np.asarray(inverse @ t)

@@ -67,7 +67,7 @@ class Seen:
         for statistic in recordings.statistics_for(recording.modality):
             summary = recordings.reduced(statistic, recording)
             if summary is not None:
-                summaries[statistic.name] = summary
+                summaries[statistic.name] = summary.apart()
         counts = np.asarray(recording.totals, float)
         last = None
         if recording.events is not None and len(recording.events.times):
@@ -267,7 +267,7 @@ def _task(
         for statistic in known:
             summary = recordings.reduced(statistic, recording)
             if summary is not None:
-                found.setdefault(statistic.name, []).append(summary)
+                found.setdefault(statistic.name, []).append(summary.apart())
 
     try:
         for k, model in enumerate(models):

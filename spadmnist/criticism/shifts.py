@@ -48,6 +48,8 @@ def beyond_noise(
         return shift if float(square.mean()) > noise * by_own else np.where(square > noise * one, shift, 0.0)
     mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
     together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # cells that move by themselves
+    # what is another thing in every recording, as random light is, scatters by more than the model's own recordings do
+    most = max(most, noise / _least_ratio((few - 1) * together))
     by_own, by_null, one_by_own, one_by_null = _beyond(together, (few - 1) * together)
     mean = float(square.mean())
     if mean > noise * by_own or mean > most * by_null:
@@ -70,6 +72,12 @@ def _beyond(cells: int, freedom: int) -> tuple[float, ...]:
         float(stats.f.isf(_CHANCE_CELL, 1, free)),
         float(stats.chi2.isf(_CHANCE_CELL, 1)),
     )
+
+
+@functools.cache
+def _least_ratio(freedom: int) -> float:
+    """By how much a variance of such freedom is too large once in a hundred times."""
+    return float(stats.chi2.isf(0.01, max(freedom, 1))) / max(freedom, 1)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ must, for the level is not known exactly: what is left of it is taken out by reg
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -36,7 +36,8 @@ class Summary:
     where: cell -> what it looks at, "side neighbours, 0 to 1 ns". size: (cell, measured, expected) -> the difference in
     physical units, as text, and as a share of the detections or of the rate (for `--tolerance`).
     axis: (cells,) what a picture has on its horizontal axis, and its label; log: on a logarithmic scale. shape: (rows,
-    columns) where the cells are a map of the array.
+    columns) where the cells are a map of the array. nested: (cells,) of normal scores of which each is of what the one
+    before is of and of more, as counts in windows twice as long: their correlation with that one.
     """
 
     values: np.ndarray
@@ -48,6 +49,18 @@ class Summary:
     label: str = ""
     log: bool = False
     shape: tuple[int, int] | None = None
+    nested: np.ndarray | None = None
+
+    def apart(self) -> Summary:
+        """The same, but of a nested cell what it does not share with the one before: cells that are independent."""
+        if self.nested is None:
+            return self
+        shared, new = self.nested[1:], np.array(self.values, np.float64)
+        new[1:] = (new[1:] - shared * new[:-1]) / np.sqrt(1.0 - shared**2)
+        where = self.where
+        return replace(
+            self, values=new, where=lambda cell: where(cell) + ", beyond that in half of it" * (cell > 0), nested=None
+        )
 
 
 class Statistic(Plugin, abstract=True):

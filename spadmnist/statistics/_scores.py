@@ -12,7 +12,7 @@ equal, each with `slots` places that can be taken once (frames), or with any num
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -88,6 +88,28 @@ class Pairs(NamedTuple):
     def pooled(self, times: np.ndarray) -> Pairs:
         """The law of the sum of independent numbers. times: how often there is each of them."""
         return Pairs(*(np.asarray((part * times).sum()) for part in self))
+
+
+def nested(laws: Sequence[Pairs]) -> np.ndarray:
+    """(laws,) correlation of the score of each number of pairs with that of the one before, whose pairs are among them.
+
+    What is new in the larger number is independent of the smaller one. Of few pairs a part of the score is chance.
+    """
+    variance = np.array([float(law.variance) for law in laws])
+    told = np.sqrt([_told_by_count(float(law.mean)) for law in laws])
+    shared = np.sqrt(np.divide(variance[:-1], variance[1:], out=np.zeros(len(laws) - 1), where=variance[1:] > 0))
+    return np.append(0.0, np.minimum(shared * told[:-1] * told[1:], 0.99))
+
+
+def _told_by_count(mean: float) -> float:
+    """Of the variance of the score of a Poisson count, what the count itself makes; the rest is its random share."""
+    from scipy import special, stats
+
+    if mean >= _SPARSE:
+        return 1.0
+    own = stats.poisson.pmf(np.arange(200), mean)
+    at = stats.norm.pdf(special.ndtri(np.clip(np.append(0.0, np.cumsum(own)), 0.0, 1.0)))
+    return float(np.sum(np.diff(at) ** 2 / np.maximum(own, 1e-300)))
 
 
 def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pairs:

@@ -11,7 +11,7 @@ from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
 from ._frames import as_words, bits, count_ones, frame_sums
-from ._scores import Pairs, minority, number_at, pair_scores, pairs_law, pooled_score, shares
+from ._scores import Pairs, minority, nested, number_at, pair_scores, pairs_law, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 
 _ALL = ("tr", "str", "qis", "counts")
@@ -283,6 +283,7 @@ def _summary(
         axis=lengths,
         label="window, s",
         log=True,
+        nested=nested(laws),
     )
 
 

@@ -176,6 +176,20 @@ def test_scores_of_steady_light_are_normal(statistic: type, kind: str) -> None:
     assert abs(values.std() - 1) < 0.08
 
 
+@pytest.mark.parametrize("kind", ["tr", "tr, few", "qis", "qis, few"])
+@pytest.mark.parametrize("statistic", [PixelFano, ArrayFano])
+def test_what_is_new_in_a_longer_window_is_independent_of_what_is_in_the_shorter(statistic: type, kind: str) -> None:
+    """Of 250 recordings: a correlation above 0.35 of one of 15 pairs of windows comes once in a million times."""
+    found = [reduced(statistic, STEADY[kind](seed)) for seed in range(250)]
+    nested, apart = (np.array([s.values for s in some]) for some in (found, [s.apart() for s in found]))
+    beside = ~np.eye(nested.shape[1], dtype=bool)
+    assert np.corrcoef(nested.T)[beside].max() > 0.5
+    assert np.abs(np.corrcoef(apart.T)[beside]).max() < 0.35
+    assert np.abs(apart.std(axis=0) - 1).max() < 0.25
+    assert np.array_equal(apart[:, 0], nested[:, 0])
+    assert found[0].apart().where(1).startswith(found[0].where(1))
+
+
 def test_the_law_is_seen_to_fail() -> None:
     """Light that fluctuates by 20 % from window to window of 50 us."""
     rng = np.random.default_rng(3)
