@@ -130,7 +130,7 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
     for cell, side in ((ramp, sign), (power, 1.0)):
         t = trace[cell]
         state.residuals[cell] = side * 4.0 * t / math.sqrt(float(t @ t))
-    found, times = chance.nearest_face(bench, state, one)
+    _, found, times = chance.nearest_face(bench, state, one)
     assert times * sign > 0
     there = along(bench, state, one.moved.at(times))
     assert found.data == there.data > along(bench, state, one.moved.at(-times)).data + 1

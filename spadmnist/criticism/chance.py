@@ -64,14 +64,13 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
         others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
     _, own = _of_traces(bench, state, [best, *tried])
-    found, _ = nearest_face(bench, state, best)
+    mark, found, _ = nearest_face(bench, state, best)
     if found.size <= 0:
         return 0.0, 1.0
-    mark = abs(found.data) if two_sided(best) else max(found.data, 0.0)
     if large:  # what is far outside is no matter of the linear law: the gain itself, in the same measure
         mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
     sides = len(best.change.strengths) if _sided(best) else 0
-    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if two_sided(best) else 2)
+    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if _two_sided(best) else 2)
     return mark, max(_of_least(own, one), LEAST_P)
 
 
@@ -82,7 +81,7 @@ def helps(bench: Bench, state: State, one: Tried) -> bool:
     """
     if one.chance is not None or one.there is None:
         return True
-    found, times = nearest_face(bench, state, one)
+    _, found, times = nearest_face(bench, state, one)
     keys = list(state.residuals)
     trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved.at(times), one.there))
     settled = found.size * float(trace @ there) / max(float(trace @ trace), 1e-300)
@@ -105,7 +104,7 @@ def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list
             found = [x for x in found if x.size > 0]
             if not found:
                 continue
-            p, own = _together(found, two_sided(group[0]))
+            p, own = _together(found, _two_sided(group[0]))
             data.append(p)
             least = np.minimum(least, own)
     return data, least
@@ -116,7 +115,7 @@ def _sided(one: Tried) -> bool:
     return one.change.kind == "add" and one.signed and len(one.change.strengths) > 1
 
 
-def two_sided(one: Tried) -> bool:
+def _two_sided(one: Tried) -> bool:
     """Is its opposite what it does with the other sign, and either a find?
 
     Some of a drift, a spectrum say, grows with the square and belongs to either sign alike: each is judged by itself.
@@ -128,13 +127,17 @@ def _looks(one: Tried) -> Sequence[float]:
     """Times its strength, at which its trace is another: where a sign matters and more looks otherwise, little, too."""
     if one.moved.even is None:
         return (1.0,)
-    return (1.0, _LITTLE) if two_sided(one) or not one.signed else (1.0, -1.0, _LITTLE, -_LITTLE)
+    return (1.0, _LITTLE) if _two_sided(one) or not one.signed else (1.0, -1.0, _LITTLE, -_LITTLE)
 
 
-def nearest_face(bench: Bench, state: State, one: Tried) -> tuple[Likeness, float]:
-    """(how much the data resemble a candidate's trace, times the strength at which they do so most)."""
+def nearest_face(bench: Bench, state: State, one: Tried) -> tuple[float, Likeness, float]:
+    """Where the data resemble a candidate's trace most: (by how much, in standard deviations and never less than 0; the
+    likeness; times the strength at which it does so).
+    """
     looks = [(along(bench, state, one.moved.at(x)), x) for x in _looks(one)]
-    return max(looks, key=lambda look: abs(look[0].data) if two_sided(one) else look[0].data)
+    marks = [abs(found.data) if _two_sided(one) else max(found.data, 0.0) for found, _ in looks]
+    best = max(range(len(looks)), key=lambda k: (marks[k], looks[k][0].data))
+    return marks[best], *looks[best]
 
 
 def _together(found: Sequence[Likeness], signed: bool) -> tuple[float, np.ndarray]:

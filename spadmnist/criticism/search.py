@@ -21,7 +21,7 @@ from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
 from .candidates import Change, Key, chancy, changes, templates, with_values
-from .chance import LEAST_P, nearest_face, of_map, two_sided
+from .chance import LEAST_P, nearest_face, of_map
 from .fit import RATES, Bench, Moved, Sensors, State, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
@@ -340,8 +340,7 @@ class Search:
         """The same, its gain being the square of how much the data resemble its trace."""
         if one.chance is not None:
             return replace(one, gain=_mark_of(one.chance) ** 2)
-        found, times = nearest_face(self.bench, state, one)
-        mark = abs(found.data) if two_sided(one) else max(found.data, 0.0)
+        mark, found, times = nearest_face(self.bench, state, one)
         suits = times * found.data / found.size if mark > 0 else one.times
         return replace(one, gain=mark**2, times=one.times if one.gain > 0 and one.times * suits > 0 else suits)
 

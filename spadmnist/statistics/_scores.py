@@ -103,13 +103,14 @@ def nested(laws: Sequence[Pairs]) -> np.ndarray:
 
 def _told_by_count(mean: float) -> float:
     """Of the variance of the score of a Poisson count, what the count itself makes; the rest is its random share."""
-    from scipy import special, stats
+    from scipy import special
 
     if mean >= _SPARSE:
         return 1.0
-    own = stats.poisson.pmf(np.arange(200), mean)
-    at = stats.norm.pdf(special.ndtri(np.clip(np.append(0.0, np.cumsum(own)), 0.0, 1.0)))
-    return float(np.sum(np.diff(at) ** 2 / np.maximum(own, 1e-300)))
+    k = np.arange(100)
+    own = np.exp(special.xlogy(k, mean) - mean - special.gammaln(k + 1.0))
+    at = special.ndtri(np.clip(np.append(0.0, np.cumsum(own)), 1e-300, 1.0 - 1e-16))
+    return float(np.sum(np.diff(np.exp(-(at**2) / 2.0)) ** 2 / np.maximum(own, 1e-300)) / (2.0 * np.pi))
 
 
 def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pairs:
