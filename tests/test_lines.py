@@ -103,6 +103,21 @@ def test_a_strong_line_is_seen_wherever_it_is_and_beside_another(bin_: int) -> N
         assert min(abs(found[0].frequency - 10.0 * (k + 1)) for k in (bin_, *others)) < 10.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_what_swings_less_than_one_and_a_half_times_is_no_line(seed: int) -> None:
+    """A ramp's harmonics fall as 1 over their number; what swings twice in the longest capture does swing."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(1, BINS + 1)
+
+    def lit(amplitude: Any) -> dict[str, np.ndarray]:
+        chance = {id: rng.standard_normal(BINS) + 1j * rng.standard_normal(BINS) for id in STEPS}
+        return {id: abs(z / np.sqrt(2) + (id != "dark") * amplitude(id)) ** 2 for id, z in chance.items()}
+
+    assert all(line.frequency >= 30.0 for line in lines(*beside(lit(lambda id: 4.0 / k))))
+    found = lines(*beside(lit(lambda id: 12.0 * np.sinc(40.0 / STEPS[id] - k))))
+    assert found and abs(found[0].frequency - 40.0) < 5.0
+
+
 def test_what_few_recordings_hide_their_neighbours_tell() -> None:
     """7 more in each of three bins are seen in 55 of 60 sets; each beside its own mean of 32 recordings, in 11."""
     found = [lines(*beside(swinging(seed, 200.0, 7.0))) for seed in range(60)]

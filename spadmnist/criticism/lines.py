@@ -21,6 +21,7 @@ _AROUND = [d for d in range(-_BESIDE, _BESIDE + 1) if abs(d) > _NEXT]
 _OTHERS = 2  # of the bins beside, that may be another line
 _WITHIN, _PLACES = 1.2, 481  # bins to both sides of where a line is looked for exactly, in so many steps
 _STRENGTHS = np.linspace(0.7, 1.1, 17)  # times what is seen, part of which is chance
+_SWINGS = 1.5  # in the longest capture; what swings less often is a drift, whose powers are those of a line beside 0
 _SIGN = 2.0  # standard deviations of a bin that tells where the line is
 
 
@@ -133,7 +134,9 @@ def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
     for k in np.argsort(log_p)[: 2 * _MOST]:
         if log_p[k] > math.log(_CLEAR):
             break
-        out.append(_line(group, float(grid[k]), float(log_p[k])))
+        line = _line(group, float(grid[k]), float(log_p[k]))
+        if line.frequency >= _SWINGS * step:
+            out.append(line)
     return out
 
 
