@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joblib import Parallel
 from scipy import stats
 
 from spadmnist import config, measurement, twin
+from spadmnist.criticism import checks, fit, memory, nulls
 from spadmnist.criticism import compare as criticism
-from spadmnist.criticism import memory, nulls
 from spadmnist.effects import Conditions, Effect
 from spadmnist.events import Layout
 from spadmnist.measurement import Measurement
@@ -153,6 +154,23 @@ def test_a_wrong_model_fails_at_the_right_place(
     data = json.loads(criticism.canonical(found))
     assert data["format"] == "spadmnist-comparison/1" and data["verdict"] == "fails"
     assert "fails" in criticism.table(found) and max(map(len, criticism.table(found).splitlines())) <= 100
+
+
+def test_the_misfit_is_that_of_a_diagnosis() -> None:
+    """One measure: a source whose noise is in every long window is not counted again for each of them.
+
+    Each learns from 48 recordings of its own: such misfits agree to a fifth.
+    """
+    data = measured(sensor(flicker={"amplitude": 0.2, "frequency": 20.0}), "str", 8)
+    found = compared(sensor(), data)
+    bench = fit.Bench(sensor(), data, 0, Parallel(n_jobs=1), 48)
+    state = bench.state({})
+    of_checks = {(c.capture, c.statistic): c.misfit for c in found.checks}
+    said = checks.misfits(state, state.residuals)
+    fanos = {cell for cell in said if cell[1].endswith("fano")}
+    assert fanos <= of_checks.keys() and max(said[cell] for cell in fanos) > 3
+    for cell in fanos:
+        assert of_checks[cell] == pytest.approx(said[cell], rel=0.3, abs=0.5), cell
 
 
 def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:

@@ -16,10 +16,12 @@ from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
 from spadmnist.criticism.candidates import Dial, first_strengths
 from spadmnist.criticism.chance import along
-from spadmnist.criticism.fit import Bench, Moved
+from spadmnist.criticism.fit import Bench, Moved, likelier
+from spadmnist.criticism.nulls import learn
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.tried import Tried
 from spadmnist.recording import Capture, Light
+from spadmnist.statistics import Summary
 
 CELL, OTHER = ("flat", "a"), ("flat", "b")
 
@@ -301,6 +303,47 @@ def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
     assert better(1, 0) == "blinking_dark_counts"
     assert better(0, 1) == "dark_counts"
     assert better(0, 0, third) == "crosstalk"
+
+
+@pytest.mark.parametrize("law", ["normal", "scaled", "poisson"])
+def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
+    """Twice the exact logarithm of the likelihood ratio of 400 cells, one model scattering twice as much.
+
+    It is -254 or 645 on average, with a spread of 21 or 85: neither comes near 0. Without the logarithm of the scatter
+    it would be 300 of data of the narrower one.
+    """
+    rng = np.random.default_rng(11)
+    cells, mean = 400, 900.0
+    own = math.sqrt(mean) if law == "poisson" else 1.0
+
+    def drawn(times: float, *size: int) -> np.ndarray:
+        return mean + times * own * rng.standard_normal((*size, cells))
+
+    def state_of(times: float, data: np.ndarray) -> Any:
+        scale = np.ones(cells) if law == "scaled" else None
+        kind = "poisson" if law == "poisson" else "normal"
+        made = [Summary(x, kind, str, recordings.no_size, scale) for x in drawn(times, 64)]
+        null = learn(made, np.full(64, mean))
+        return SimpleNamespace(nulls={CELL: null}, residuals={CELL: null.judge(data, mean).residuals})
+
+    for truth in (1.0, 2.0):
+        data = drawn(truth)
+        z = (data - mean) / own
+        exact = float(z @ z) * (1 - 1 / 4) - 2 * cells * math.log(2)
+        found = likelier(state_of(1.0, data), state_of(2.0, data))
+        assert found == pytest.approx(exact, rel=0.25, abs=30), (law, truth)
+        assert (found > 0) == (truth == 2.0)
+
+
+def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> None:
+    bench = bench_of(lab())
+    look, nothing = quiet(bench), Moved({}, {}, {})
+    chance = Tried(change_of(bench, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True)
+    other = Tried(change_of(bench, "add crosstalk"), {}, nothing, 90.0, 1.0)
+    map_ = Tried(change_of(bench, "per_pixel dark_counts.rate"), {}, nothing, 10.0, 1.0)
+    map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
+    assert [t.change.name for t in look.worth([chance, other, map_])] == [t.change.name for t in (chance, other, map_)]
+    assert look.worth([other, map_]) == [other]
 
 
 def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:

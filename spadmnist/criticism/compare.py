@@ -157,7 +157,7 @@ def compare(
     measurement.check_layout(sensor.layout)
     say = progress or (lambda what, share: None)
     checks: list[Check] = []
-    judged: list[tuple[Judgement, Null]] = []
+    judged: list[tuple[float, Null]] = []  # misfit, null of independent cells
     levels: list[tuple[Capture, float, float, float]] = []  # capture, log of the light factor, its error, elasticity
     captures = list(measurement.captures)
     with Parallel(n_jobs=jobs, return_as="generator") as parallel:
@@ -185,11 +185,14 @@ def compare(
                     float(summary.values[judgement.worst]),
                     float(judgement.expected[judgement.worst]),
                 )
+                # what a window has because a shorter one has it is not counted again
+                single = made.apart.get(statistic.name, null)
+                misfit = single.judge(summary.apart().values, total).misfit
                 checks.append(
                     Check(
                         statistic.name,
                         capture.id,
-                        judgement.misfit,
+                        misfit,
                         judgement.p_value,
                         summary.where(judgement.worst),
                         text,
@@ -199,13 +202,13 @@ def compare(
                     )
                 )
                 if null.law != "exact":
-                    judged.append((judgement, null))
+                    judged.append((misfit, single))
     nuisances, common = light_of(levels, captures)
     checks += common
     checks += _between_wavelengths(captures, checks, sensor.layout.columns)
     checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
     # of means alone there are no statistics: their totals stand in
-    squares = [j.misfit for j, _ in judged] or [c.misfit for c in checks if c.statistic == "rate"]
+    squares = [x for x, _ in judged] or [c.misfit for c in checks if c.statistic == "rate"]
     misfit = float(np.mean(squares)) if squares else 1.0
     own = np.mean([null.own / max(null.own.mean(), 1e-30) for _, null in judged], axis=0) if judged else np.ones(1)
     verdict = "adequate" if all(c.passes for c in checks) else "fails"

@@ -38,6 +38,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point fa
 _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than these are none
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
+_WIDEST = 2.3  # of the logarithm of two scatters
 _SURE_SQUARE = 30.0  # in variances, of what is never chance
 _BESIDE = 9  # powers beside one, of which most are no line
 FEW = 4  # recordings that tell the difference between two models
@@ -728,6 +729,19 @@ def _judged(
 def square(residuals: Mapping[Cell, np.ndarray]) -> float:
     """Sum of all squared residuals."""
     return sum(float(z @ z) for z in residuals.values())
+
+
+def likelier(state: State, other: State) -> float:
+    """By how much twice the log likelihood of another model is larger, each cell judged by that model's own scatter.
+
+    A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts.
+    """
+    out = square(state.residuals) - square(other.residuals)
+    for cell in other.nulls.keys() & state.nulls.keys() & other.residuals.keys():
+        wider = np.log(other.nulls[cell].breadth / state.nulls[cell].breadth)
+        # a cell that never moved has no scatter to compare with
+        out -= 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), state.residuals[cell].shape)))
+    return out
 
 
 def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:

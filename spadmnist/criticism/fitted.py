@@ -18,7 +18,7 @@ from .candidates import Change, Key, changes
 from .chance import LEAST_P, of_map
 from .course import Course, accept, begun, errors_known, material, settle_all, widen
 from .findings import nuisances, remainder, traces
-from .fit import Bench, Moved, square
+from .fit import Bench, Moved, likelier
 from .refining import refine, state_of
 from .settling import Settled
 from .tried import Tried
@@ -116,7 +116,7 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
             continue
         best = refine(bench, course.state, _started(course, change), 5)
         if not change.dials:  # a switch, which may be as it should be
-            best.gain = square(course.state.residuals) - square(state_of(bench, best).residuals)
+            best.gain = likelier(course.state, state_of(bench, best))
             if best.gain <= 0:
                 _kept(course, change)
                 continue

@@ -25,6 +25,7 @@ from .nulls import Null
 
 _MOST_BYTES = 1 << 30  # of all entries together
 _ARRAYS = ("coefficients", "inverse", "spread", "own")
+_GROUPS = ("nulls", "apart")
 _FACTS = ("law", "middle", "recordings", "factor", "tail", "scaled")
 
 
@@ -45,27 +46,35 @@ def name_of(sensor: Sensor, capture: Capture, *more: Any) -> str:
     return digest.hexdigest()[:32]
 
 
-def recall(name: str) -> tuple[dict[str, np.ndarray], dict[str, Null]] | None:
-    """(further arrays, nulls by statistic), or None where there is no such entry, or none that can be read."""
+def recall(name: str) -> tuple[dict[str, np.ndarray], dict[str, Null], dict[str, Null]] | None:
+    """(further arrays, nulls by statistic, the same of cells `apart`), or None where no such entry can be read."""
     path = _folder() / f"{name}.npz"
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         facts = json.loads(arrays.pop("facts").tobytes().decode())
-        nulls = {
-            statistic: Null(**facts[statistic], **{key: arrays.pop(f"{statistic}/{key}") for key in _ARRAYS})
-            for statistic in facts
-        }
+        nulls, apart = (
+            {
+                statistic: Null(**told, **{key: arrays.pop(f"{group}/{statistic}/{key}") for key in _ARRAYS})
+                for statistic, told in facts[group].items()
+            }
+            for group in _GROUPS
+        )
         os.utime(path)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-    return arrays, nulls
+    return arrays, nulls, apart
 
 
-def keep(name: str, further: Mapping[str, np.ndarray], nulls: Mapping[str, Null]) -> None:
+def keep(name: str, further: Mapping[str, np.ndarray], nulls: Mapping[str, Null], apart: Mapping[str, Null]) -> None:
     """Put an entry there. Where that is not possible nothing happens."""
-    facts = {statistic: {key: getattr(null, key) for key in _FACTS} for statistic, null in nulls.items()}
-    arrays = {f"{statistic}/{key}": getattr(null, key) for statistic, null in nulls.items() for key in _ARRAYS}
+    facts: dict[str, dict[str, Any]] = {}
+    arrays: dict[str, np.ndarray] = {}
+    for group, known in zip(_GROUPS, (nulls, apart), strict=True):
+        facts[group] = {statistic: {key: getattr(null, key) for key in _FACTS} for statistic, null in known.items()}
+        arrays |= {
+            f"{group}/{statistic}/{key}": getattr(null, key) for statistic, null in known.items() for key in _ARRAYS
+        }
     header = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     folder = _folder()
     try:

@@ -104,6 +104,13 @@ class Null:
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
         return min(1.0, 2 * min(p_sum, p_cell)), worst
 
+    @property
+    def breadth(self) -> np.ndarray | float:
+        """How wide the cells scatter, in units that another model's have as well: of all alike, or (cells,) of each."""
+        if self.law == "normal" and not self.scaled:
+            return np.asarray(self.spread)
+        return self.factor
+
     def spread_at(self, expected: np.ndarray) -> np.ndarray:
         if self.law == "poisson":
             return np.asarray(np.sqrt(np.maximum(expected, 0.0)) * self.factor)

@@ -10,7 +10,7 @@ import functools
 import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -110,6 +110,7 @@ class CaptureNull:
 
     level: photons/s on a pixel, in the dark a factor on the rates, about which the recordings were made; stated:
     what the measurement says; totals: (recordings,) the detections of each.
+    apart: of statistics with nested cells, the nulls of what is new in each (`Summary.apart`), for the misfit.
     law: log of the total as (offset, slope) of the log of what the closed form `expected` says; scatter: about that.
     """
 
@@ -120,6 +121,7 @@ class CaptureNull:
     law: tuple[float, float]
     scatter: float
     nulls: Mapping[str, Null]
+    apart: Mapping[str, Null] = field(default_factory=dict)
 
     def total_at(self, level: float) -> float:
         """Detections of the whole array expected at a level."""
@@ -256,8 +258,8 @@ def model_of(
     known = memory.recall(entry) if entry else None
     if known is not None:
         told(replicates)
-        (offset, slope, scatter), array, nulls = known[0]["law"], known[0]["totals"], known[1]
-        return CaptureNull(centre, stated, array, expected, (float(offset), float(slope)), float(scatter), nulls)
+        (offset, slope, scatter), array = known[0]["law"], known[0]["totals"]
+        return CaptureNull(centre, stated, array, expected, (float(offset), float(slope)), float(scatter), *known[1:])
     numbers = np.arange(replicates, dtype=np.uint64)
     # evenly spread, in an order that has nothing to do with the number
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
@@ -277,10 +279,14 @@ def model_of(
     array = np.array(totals, float)
     whole = {name: summaries for name, summaries in found.items() if len(summaries) == replicates}
     nulls = {name: learn(summaries, array) for name, summaries in whole.items()}
+    nested = {
+        name: [s.apart() for s in summaries] for name, summaries in whole.items() if summaries[0].nested is not None
+    }
+    apart = {name: learn(summaries, array) for name, summaries in nested.items()}
     law, scatter = law_of(array, np.array([expected(float(centre * f)) for f in factors]))
     if entry:
-        memory.keep(entry, {"law": np.array([*law, scatter]), "totals": array}, nulls)
-    return CaptureNull(centre, stated, array, expected, law, scatter, nulls)
+        memory.keep(entry, {"law": np.array([*law, scatter]), "totals": array}, nulls, apart)
+    return CaptureNull(centre, stated, array, expected, law, scatter, nulls, apart)
 
 
 def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from . import checks, fit, settling
 from .candidates import Dial, Key
-from .fit import RATES, Bench, State, square, stacked
+from .fit import RATES, Bench, State, likelier, square, stacked
 from .settling import Settled
 from .showing import captures_showing
 from .swings import NEAR, turned
@@ -73,7 +73,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.gain = square(state.residuals) - found.square
     if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
-        one.gain = max(one.gain, square(state.residuals) - square(state_of(bench, one).residuals))
+        one.gain = max(one.gain, likelier(state, state_of(bench, one)))
     return one
 
 

@@ -22,7 +22,7 @@ from ..statistics import Statistic
 from . import checks, fit, mapping
 from .candidates import Change, Key, chancy, changes, templates, with_values
 from .chance import LEAST_P, nearest_face, of_map
-from .fit import RATES, Bench, Moved, Sensors, State, square, stacked
+from .fit import RATES, Bench, Moved, Sensors, State, likelier, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
 from .swings import NEAR, TIMES, turned
@@ -467,10 +467,16 @@ class Search:
     # --- settling ------------------------------------------------------------------------------------------------
 
     def worth(self, second: Sequence[Tried]) -> list[Tried]:
-        """Those that may turn out best when they are settled."""
+        """Those that may turn out best when they are settled.
+
+        Where chance may have made pixels odd, a map of them, too, though its small differences are hardly seen here.
+        """
         best = max(t.gain for t in second)
         first = second[0]
-        return [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
+        out = [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
+        if any(t.chips for t in out):
+            out += [t for t in second if t.maps and t.change.per == "pixel" and all(t is not one for one in out)]
+        return out
 
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:
         """Those that may be best get states of their own: differences of a few recordings blur an edge.
@@ -539,8 +545,8 @@ class Search:
         return counts / max(sum(squares.values()), 1e-300)
 
     def beside(self, state: State, sensors: Sensors) -> float:
-        """By how much the data lie nearer to another model, each judged by its own scatter."""
-        return square(state.residuals) - square(self.bench.state({}, sensors).residuals)
+        """By how much another model makes the data likelier, each judged by its own scatter."""
+        return likelier(state, self.bench.state({}, sensors))
 
 
 def _mark_of(chance: float) -> float:
