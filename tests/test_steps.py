@@ -320,6 +320,11 @@ def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
         one.there = there  # type: ignore[assignment]
         assert chance.helps(bench, state, one) == good
     assert chance.helps(bench, state, replace(one, there=None)) and chance.helps(bench, state, replace(one, chance=0.1))
+    # where few recordings show nothing of it beyond chance, all that they show is looked at
+    monkeypatch.setattr(chance, "along", lambda *_: chance.Likeness(4.0, 4.0, np.zeros(16), 1.0, 15.0))
+    unseen = replace(one, there=Moved({}, {}, {}))
+    for settled, good in ((0.02, True), (0.06, False), (0.0, False)):
+        assert chance.helps(bench, state, replace(unseen, sensors=state.sensors.changed({CROSSTALK: settled}))) == good
 
 
 @pytest.mark.parametrize("rival", [pytest.param(False, marks=pytest.mark.slow), True])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy import stats
 from ..errors import SpadError
 from . import mapping
 from .candidates import Change, Key, changes
-from .fit import RATES, Bench, Cell, Moved, State, stacked
+from .fit import FEW, RATES, Bench, Cell, Moved, State, stacked
 from .lines import Line
 from .nulls import scores_of_powers
 from .tried import Tried, shape_of
@@ -63,15 +63,19 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
     if best.chance is not None:
         others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
-    _, own = _of_traces(bench, state, [best, *tried])
+    directions = [t for t in tried if _sided(best) and _kin(t) == _kin(best)]
+    _, own = _of_traces(bench, state, tried if directions else [best, *tried])
     mark, found, _ = nearest_face(bench, state, best)
     if found.size <= 0:
         return 0.0, 1.0
+    sides = max(len(best.change.strengths) if _sided(best) else 1, 1)
+    # of several directions it may be none by itself that the data resemble, but all of them together
+    together = min((p for p, _ in _of_group(bench, state, directions)), default=1.0)
+    mark = max(mark, float(stats.t.isf(max(together, LEAST_P) / 2, found.freedom)))
     if large:  # what is far outside is no matter of the linear law: the gain itself, in the same measure
         mark = max(mark, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
-    sides = len(best.change.strengths) if _sided(best) else 0
-    one = float(_chance_of(mark**2, max(sides, 1), found.freedom)) / (1 if _two_sided(best) else 2)
-    return mark, max(_of_least(own, one), LEAST_P)
+    one = float(_chance_of(mark**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
+    return mark, max(_of_least(own, min(one, together)), LEAST_P)
 
 
 def helps(bench: Bench, state: State, one: Tried) -> bool:
@@ -84,6 +88,11 @@ def helps(bench: Bench, state: State, one: Tried) -> bool:
     _, found, times = nearest_face(bench, state, one)
     keys = list(state.residuals)
     trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved.at(times), one.there))
+    if one.sensors is not None and not trace @ there:
+        # so faint that all of it may be chance in each cell, and is left out of it: not so along the whole trace
+        (whole,) = bench.moved(state, [one.sensors], 2 * FEW, kept="all")
+        if not isinstance(whole, str):
+            there = stacked(bench.template(state, whole), keys)
     settled = found.size * float(trace @ there) / max(float(trace @ trace), 1e-300)
     return abs(settled - found.data) < abs(found.data)
 
@@ -95,19 +104,28 @@ def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list
     """
     groups: dict[tuple[Any, ...], list[Tried]] = {}
     for n, one in enumerate(tried):
-        groups.setdefault((one.change.name, shape_of(one)) if _sided(one) else (n,), []).append(one)
+        groups.setdefault(_kin(one) if _sided(one) else (n,), []).append(one)
     data: list[float] = []
     least = np.ones(len(state.own[RATES]))
     for group in groups.values():
-        for times in _looks(group[0]):
-            found = [along(bench, state, one.moved.at(times)) for one in group]
-            found = [x for x in found if x.size > 0]
-            if not found:
-                continue
-            p, own = _together(found, _two_sided(group[0]))
+        for p, own in _of_group(bench, state, group):
             data.append(p)
             least = np.minimum(least, own)
     return data, least
+
+
+def _of_group(bench: Bench, state: State, group: Sequence[Tried]) -> Iterator[tuple[float, np.ndarray]]:
+    """As `_of_traces`, of a candidate or of all directions of one; for each strength at which its trace is another."""
+    for times in _looks(group[0]) if group else ():
+        found = [along(bench, state, one.moved.at(times)) for one in group]
+        found = [x for x in found if x.size > 0]
+        if found:
+            yield _together(found, _two_sided(group[0]))
+
+
+def _kin(one: Tried) -> tuple[Any, ...]:
+    """What the directions of a candidate have in common."""
+    return one.change.name, shape_of(one)
 
 
 def _sided(one: Tried) -> bool:

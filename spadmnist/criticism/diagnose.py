@@ -37,7 +37,7 @@ from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State
 from .ladder import placebo_row
 from .refining import refine, state_of
-from .search import alike
+from .search import alike, gain_beside
 from .tried import Tried, at_end
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
@@ -367,7 +367,8 @@ def _alternatives(
             judged = state_of(bench, one)
             left = judged.residuals
         failed = checks.failing(checks.blocks(bench, judged, left))
-        near = best.gain - one.gain < alike(best.gain) or (at_end(best) and one.gain > _ALMOST * best.gain)
+        most, gain = gain_beside(best, one), gain_beside(one, best)
+        near = most - gain < alike(most) or (at_end(best) and gain > _ALMOST * most)
         as_good = one.residuals is not None and near and not failed
         out.append(
             {

@@ -63,6 +63,14 @@ class Map:
     certain: float = _TELLING  # raw_error, below which a value is the estimate, whatever the others are
     width: edges.Width | None = None  # where the likelihood of all pixels tells it
 
+    @property
+    def price(self) -> float:
+        """How much less twice the log likelihood of values that scatter by sigma rises than the squares fall, if each
+        is put where its estimate is.
+        """
+        ratio = (self.sigma / np.maximum(self.raw_error, 1e-12)) ** 2
+        return float(np.sum(ratio / (1 + ratio) + np.log1p(ratio)))
+
     def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
         """(groups,) values; draw, width: standard normal numbers, for one of the maps that may be true."""
         logs = self.estimate

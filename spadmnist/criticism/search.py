@@ -26,7 +26,7 @@ from .fit import RATES, Bench, Moved, Sensors, State, likelier, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, state_of
 from .swings import NEAR, TIMES, turned
-from .tried import EACH, Tried, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
+from .tried import EACH, Tried, further, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
@@ -37,6 +37,7 @@ _REFINED = 3  # of these, that are settled
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _LEAST_CHANCE, _CHANCE_BESIDE = 1e-3, 0.05  # of a map that is tried, and beside what chance makes of pixels
 _SILENT = 6.0  # standard deviations of a trace that is none
+_FURTHER = 3  # times that a stronger edge is looked for
 _LOUD, _WEAKER = 300.0, 3  # the same of one that says little of a smaller one; times that one is looked for
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
@@ -180,6 +181,7 @@ class Search:
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = old + self._raised(state, self._looked_at(state, tries, some), some)
             out += self._lowered(state, out, some)
+            out += self._further(state, out, some)
         return sorted(out, key=lambda t: -t.gain)
 
     def _by_totals(self, state: State, tries: Sequence[tuple[Change, dict[Key, Any]]]) -> list[Tried]:
@@ -230,6 +232,20 @@ class Search:
             loud = [t for t in loud if self.bench.size(state, t.moved) > _LOUD]
             if not loud:
                 break
+        return out
+
+    def _further(self, state: State, tried: Sequence[Tried], some: Sequence[str]) -> list[Tried]:
+        """Stronger ones for edges of which the data want more: much of a blur is not so many times a little."""
+        out: list[Tried] = []
+        wanted = [t for t in tried if t.gain > _PROMISING and t.times > 1]
+        for _ in range(_FURTHER):
+            ups = [(t.change, up) for t in wanted if (up := further(t)) and not _among(tried, t.change, up)]
+            before: dict[tuple[Any, ...], float] = {}
+            for t in wanted:
+                before[t.change.name, shape_of(t)] = max(t.gain, before.get((t.change.name, shape_of(t)), 0.0))
+            found = self._looked_at(state, ups, some) if ups else []
+            out += found
+            wanted = [t for t in found if t.gain > before[t.change.name, shape_of(t)]]
         return out
 
     def _still(
@@ -552,6 +568,16 @@ class Search:
 def _mark_of(chance: float) -> float:
     """Standard deviations of a p-value."""
     return float(stats.norm.isf(max(chance, LEAST_P) / 2))
+
+
+def gain_beside(one: Tried, other: Tried) -> float:
+    """The gain of a candidate as it is to be compared with another's: where chance makes the pixels of that one odd, a
+    map has no number for each for nothing.
+    """
+    if not (other.chips and one.maps and one.chance is not None):
+        return one.gain
+    price = sum(map_.price for map_ in one.maps.values())
+    return min(one.gain, max(one.gain - price, _mark_of(one.chance) ** 2))
 
 
 def alike(gain: float) -> float:

@@ -86,13 +86,22 @@ def shape_of(one: Tried) -> tuple[Any, ...]:
 
 def weaker(one: Tried) -> dict[Key, Any] | None:
     """The values of an added edge half as far, of a logarithm, from the least that is looked for; None of all else."""
+    return _half_way(one, False)
+
+
+def further(one: Tried) -> dict[Key, Any] | None:
+    """As `weaker`, towards the most that is looked for."""
+    return _half_way(one, True)
+
+
+def _half_way(one: Tried, up: bool) -> dict[Key, Any] | None:
     if one.change.kind != "add" or len(one.change.strengths) != 1:
         return None
     dial = one.change.strengths[0]
-    value = float(one.values[dial.key])
-    if dial.off != 0 or not is_edge(dial) or not 0 < dial.low < value:
+    value, end = float(one.values[dial.key]), dial.high if up else dial.low
+    if dial.off != 0 or not is_edge(dial) or not dial.low > 0 or (value >= end if up else value <= end):
         return None
-    return {**one.values, dial.key: math.sqrt(dial.low * value)}
+    return {**one.values, dial.key: math.sqrt(end * value)}
 
 
 def stronger(one: Tried) -> dict[Key, Any] | None:
