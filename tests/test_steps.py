@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
-from spadmnist.criticism import answer, chance, diagnose, findings, fit, likelihood, settling
+from spadmnist.criticism import answer, chance, diagnose, findings, fit, likelihood, mapping, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Step, plain
 from spadmnist.criticism.fit import RATES, Moved, State
 from spadmnist.criticism.lines import Line
+from spadmnist.criticism.search import gain_beside
 from spadmnist.criticism.tried import Tried, weaker
 
 
@@ -88,6 +89,52 @@ def test_an_edge_that_drowns_all_else_is_tried_weaker(lab):
     assert weaker(Tried(change, {service: least}, nothing, 0.0, 1.0)) is None
     assert weaker(Tried(change_of(bench, "add crosstalk"), {CROSSTALK: 0.1}, nothing, 0.0, 1.0)) is None
     assert weaker(Tried(change_of(bench, "set dead_time.duration"), {jitter: 1e-8}, nothing, 0.0, 1.0)) is None
+
+
+def test_an_edge_of_which_the_data_want_more_is_tried_further_off(lab, monkeypatch):
+    """A blur of 3 ns is not twenty times one of 0.15 ns: its gain goes on rising, and is followed while it does."""
+    bench = bench_of(lab())
+    look, state = quiet(bench), bench.state({})
+    jitter, change = ("jitter", "sigma"), change_of(bench, "add jitter")
+    high = change.strengths[0].high
+    asked: list[float] = []
+
+    def looked_at(state: Any, tries: Any, some: Any = ()) -> list[Tried]:
+        asked.extend(tried[jitter] for _, tried in tries)
+        return [Tried(c, tried, Moved({}, {}, {}), gains.pop(0), 1.7) for c, tried in tries]
+
+    monkeypatch.setattr(look, "_looked_at", looked_at)
+    one = Tried(change, {jitter: high / 16}, Moved({}, {}, {}), 100.0, 1.7)
+    gains = [200.0, 150.0]
+    found = look._further(state, [one], [])
+    assert asked == pytest.approx([high / 4, high / 2]) and [t.gain for t in found] == [200.0, 150.0]
+    asked.clear()
+    assert not look._further(state, [replace(one, times=0.7)], [])  # less of it would do
+    assert not look._further(state, [replace(one, gain=20.0)], [])  # nor is it worth it
+    assert not look._further(state, [replace(one, values={jitter: high})], [])
+    assert not asked
+
+
+def test_beside_chance_a_map_pays_for_its_numbers(lab):
+    """The price against twice the exact logarithms of the likelihood of 400 values: 1e-6 would be 5 of its spread."""
+    rng = np.random.default_rng(5)
+    error, sigma = np.full(400, 0.5), 0.4
+    raw = np.hypot(error, sigma) * rng.standard_normal(400)
+    shrunk = raw * sigma**2 / (sigma**2 + error**2)
+    zeros = np.zeros(400)
+    map_ = mapping.Map(("dark_counts", "rate"), 1.0, np.arange(400), shrunk, zeros, raw, error, sigma)
+    squares = float(np.sum((raw / error) ** 2) - np.sum(((raw - shrunk) / error) ** 2))
+    wide = error**2 + sigma**2
+    exact = float(np.sum(raw**2 / error**2 + np.log(error**2) - raw**2 / wide - np.log(wide)))
+    assert squares - map_.price == pytest.approx(exact, abs=0.1 * map_.price)
+    bench = bench_of(lab())
+    change = change_of(bench, "per_pixel dark_counts.rate")
+    maps = {("dark_counts", "rate"): map_}
+    told = Tried(change, {}, Moved({}, {}, {}), squares, 1.0, maps=maps, chance=1e-9)
+    chips = Tried(change_of(bench, "add blinking_dark_counts"), {}, Moved({}, {}, {}), 90.0, 1.0, chips=True)
+    assert gain_beside(told, told) == squares and gain_beside(chips, told) == 90.0
+    assert gain_beside(told, chips) == pytest.approx(max(squares - map_.price, 6.1**2), rel=0.01)
+    assert gain_beside(replace(told, gain=20.0), chips) == 20.0  # never more than it gains
 
 
 def test_expectations_of_many_captures_are_those_of_each(lab):
