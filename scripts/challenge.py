@@ -3,7 +3,7 @@
     python scripts/challenge.py list
     python scripts/challenge.py make all -o out --seed 1        # cases in out/cases, the truth in out/sealed
     python scripts/challenge.py run out --minutes 90            # spadmnist compare and diagnose; again: what is missing
-    python scripts/challenge.py score out                       # opens the truth; writes out/score.md
+    python scripts/challenge.py score out                       # opens the truth; writes out/score.md; several: as one
 
 CASES are `all`, a class (null, single, double, outside, setup) or a pattern of names (`tr-crosstalk-*`). Case folders
 have numbers for names, drawn at random: the first so many are a fair sample. Beside them stands the sha256 of each
@@ -319,29 +319,32 @@ def opened(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def score(args: argparse.Namespace) -> int:
-    folder = Path(args.folder)
-    truths, faults = opened(folder)
+    folders = [Path(folder) for folder in args.folders]
+    sets = [opened(folder) for folder in folders]
+    faults = [f"{folder}: {fault}" for folder, (_, wrong) in zip(folders, sets, strict=True) for fault in wrong]
     if faults:
         for fault in faults:
             print(f"challenge: {fault}", file=sys.stderr)
         print("challenge: nothing is scored with a broken seal", file=sys.stderr)
         return 1
     cases, answers = [], []
-    for truth in truths:
-        if not answer_file(folder, truth["case"], "diagnose").exists():
-            continue  # not yet asked
-        told = {question: answer_of(folder, truth["case"], question) for question in QUESTIONS}
-        answers += list(told.values())
-        cases.append(judged(truth, {name: one["answer"] for name, one in told.items()}, told["diagnose"]["seconds"]))
-    (folder / "sealed" / "opened").touch()
-    text = report(cases, len(truths))
+    for folder, (truths, _) in zip(folders, sets, strict=True):
+        for truth in truths:
+            if not answer_file(folder, truth["case"], "diagnose").exists():
+                continue  # not yet asked
+            told = {question: answer_of(folder, truth["case"], question) for question in QUESTIONS}
+            answers += list(told.values())
+            found = {name: one["answer"] for name, one in told.items()}
+            cases.append(judged(truth, found, told["diagnose"]["seconds"]))
+        (folder / "sealed" / "opened").touch()
+    text = report(cases, sum(len(truths) for truths, _ in sets))
     blind = {one["package"] for one in answers if one["answer"] and not one["after_opening"]}
     late = sum(bool(one["after_opening"]) and one["package"] not in blind for one in answers)
     if late:
         text += (
             f"\n{late} answers are of a program that was changed after the truth had been opened: they are not blind.\n"
         )
-    (folder / "score.md").write_text(text)
+    (folders[0] / "score.md").write_text(text)
     print(text, end="")
     return 0
 
@@ -372,8 +375,8 @@ def main(arguments: list[str] | None = None) -> int:
     running.add_argument("--ask", nargs="+", choices=QUESTIONS, default=QUESTIONS, help="these questions only")
     running.add_argument("--minutes", type=float, default=math.inf, help="ask no new question after so long [no end]")
     running.add_argument("--timeout", type=float, default=1800.0, help="seconds for one answer [1800]")
-    scoring = verbs.add_parser("score", help="open the truth, check the seals, write score.md")
-    scoring.add_argument("folder", metavar="FOLDER")
+    scoring = verbs.add_parser("score", help="open the truth, check the seals, write score.md into the first")
+    scoring.add_argument("folders", nargs="+", metavar="FOLDER", help="scored together")
     args = parser.parse_args(arguments)
     if args.verb == "list":
         print("\n".join(case.name for case in all_cases()))

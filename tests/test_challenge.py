@@ -11,6 +11,7 @@ import importlib.util
 import itertools
 import json
 import math
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -681,6 +682,16 @@ def test_a_part_of_the_cases_is_scored(
     table = (made / "score.md").read_text()
     assert "3 of 8 cases, those asked so far" in table
     assert "## No answer: 1\n\n- case-002 " in table  # the one that failed
+    # two sets as one; not with a broken seal in either
+    second = made.with_name("second set")
+    shutil.copytree(made, second)
+    assert challenge.main(["score", str(second), str(made)]) == 0
+    assert "6 of 16 cases, those asked so far" in (second / "score.md").read_text()
+    assert (made / "score.md").read_text() == table
+    (made / "sealed" / "case-001.salt").write_text("another")
+    capsys.readouterr()
+    assert challenge.main(["score", str(second), str(made)]) == 1
+    assert f"{made}: case-001: the truth is not the one that was sealed" in capsys.readouterr().err
 
 
 def test_what_has_failed_is_asked_last(made: Path, stub: Path) -> None:
