@@ -355,6 +355,18 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
         assert (found > 0) == (truth == 2.0)
 
 
+def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
+    """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
+    null = SimpleNamespace(breadth=1.0)
+    now, there = (
+        SimpleNamespace(nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)})
+        for x, y in ((1.0, 1.1), (3.0, 1.0))
+    )
+    trace = {CELL: np.array([2.0]), OTHER: np.full(1000, 0.01)}
+    assert likelier(now, there, trace) == pytest.approx(-8.0)  # type: ignore[arg-type]
+    assert likelier(now, there) == pytest.approx(210.0 - 8.0)  # type: ignore[arg-type]
+
+
 def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> None:
     bench = bench_of(lab())
     look, nothing = quiet(bench), Moved({}, {}, {})

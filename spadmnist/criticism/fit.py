@@ -38,6 +38,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2  # turns, after each of which the next point fa
 _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than these are none
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
+_SEEN = 1.0  # variance of chance, of what a trace has in a statistic
 _WIDEST = 2.3  # of the logarithm of two scatters
 _SURE_SQUARE = 30.0  # in variances, of what is never chance
 _BESIDE = 9  # powers beside one, of which most are no line
@@ -731,16 +732,21 @@ def square(residuals: Mapping[Cell, np.ndarray]) -> float:
     return sum(float(z @ z) for z in residuals.values())
 
 
-def likelier(state: State, other: State) -> float:
+def likelier(state: State, other: State, trace: Mapping[Cell, np.ndarray] | None = None) -> float:
     """By how much twice the log likelihood of another model is larger, each cell judged by that model's own scatter.
 
-    A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts.
+    A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts. trace:
+    of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide.
     """
-    out = square(state.residuals) - square(other.residuals)
-    for cell in other.nulls.keys() & state.nulls.keys() & other.residuals.keys():
-        wider = np.log(other.nulls[cell].breadth / state.nulls[cell].breadth)
-        # a cell that never moved has no scatter to compare with
-        out -= 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), state.residuals[cell].shape)))
+    out = 0.0
+    for cell in other.residuals.keys() & state.residuals.keys():
+        if trace is not None and not float(trace[cell] @ trace[cell]) > _SEEN:
+            continue
+        out += float(state.residuals[cell] @ state.residuals[cell] - other.residuals[cell] @ other.residuals[cell])
+        if cell in other.nulls and cell in state.nulls:
+            wider = np.log(other.nulls[cell].breadth / state.nulls[cell].breadth)
+            # a cell that never moved has no scatter to compare with
+            out -= 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), state.residuals[cell].shape)))
     return out
 
 

@@ -41,7 +41,8 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     given = one.scaled()
     dials = [d for d in one.change.dials if d.key in given and not d.whole]
     boost, power = _boost(bench, state, one, given)
-    some = captures_showing(bench.template(state, one.moved.at(one.times)), *UNSEEN)
+    trace = bench.template(state, one.moved.at(one.times))
+    some = captures_showing(trace, *UNSEEN)
 
     def settled(values: Mapping[Key, Any], rounds: int = rounds) -> Settled | str:
         return settling.settle(
@@ -73,7 +74,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.gain = square(state.residuals) - found.square
     if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
-        one.gain = max(one.gain, likelier(state, state_of(bench, one)))
+        one.gain = likelier(state, state_of(bench, one), trace)
     return one
 
 

@@ -340,7 +340,7 @@ class Search:
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 if one.chips and one.gain > _PROMISING:
-                    one.gain = max(one.gain, self.beside(state, state.sensors.changed(one.scaled(), None, True)))
+                    one.gain = self.beside(state, one)
             else:
                 one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
                 # small differences of many pixels are lost among what chance leaves, but for edges, which stand out
@@ -560,9 +560,10 @@ class Search:
         counts = sum(x for (_, name), x in squares.items() if Statistic.registry.find(name).among == "")
         return counts / max(sum(squares.values()), 1e-300)
 
-    def beside(self, state: State, sensors: Sensors) -> float:
-        """By how much another model makes the data likelier, each judged by its own scatter."""
-        return likelier(state, self.bench.state({}, sensors))
+    def beside(self, state: State, one: Tried) -> float:
+        """By how much a candidate makes the data likelier where it has a trace, judged by its own scatter."""
+        there = self.bench.state({}, state.sensors.changed(one.scaled(), None, True))
+        return likelier(state, there, self.bench.template(state, one.moved.at(one.times)))
 
 
 def _mark_of(chance: float) -> float:
