@@ -376,6 +376,10 @@ def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> Non
     map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
     assert [t.change.name for t in look.worth([chance, other, map_])] == [t.change.name for t in (chance, other, map_)]
     assert look.worth([other, map_]) == [other]
+    # and beside a map what chance makes, where there is something in it
+    clear = replace(map_, gain=1000.0)
+    assert look.worth([clear, other, chance]) == [clear, chance]
+    assert look.worth([clear, replace(chance, gain=20.0)]) == [clear]
 
 
 def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:

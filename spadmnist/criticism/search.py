@@ -485,14 +485,15 @@ class Search:
     def worth(self, second: Sequence[Tried]) -> list[Tried]:
         """Those that may turn out best when they are settled.
 
-        Where chance may have made pixels odd, a map of them, too, though its small differences are hardly seen here.
+        Where chance may have made pixels odd, a map of them, too, though its small differences are hardly seen here;
+        and where a map is tried, what chance would make of pixels, though no number of its suits each of them.
         """
         best = max(t.gain for t in second)
         first = second[0]
         out = [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
-        if any(t.chips for t in out):
-            out += [t for t in second if t.maps and t.change.per == "pixel" and all(t is not one for one in out)]
-        return out
+        chips, maps = (any(x) for x in zip(*((t.chips, _of_pixels(t)) for t in out), strict=True))
+        beside = [t for t in second if (chips and _of_pixels(t)) or (maps and t.chips and t.gain > _PROMISING)]
+        return out + [t for t in beside if all(t is not one for one in out)]
 
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:
         """Those that may be best get states of their own: differences of a few recordings blur an edge.
@@ -530,7 +531,7 @@ class Search:
         decided once and for all is a map.
         """
         best = refined[0] if is_pattern(refined[0]) else max(refined, key=merit)
-        rivals = [t for t in refined if t.chips or (t.maps and t.change.per == "pixel")]
+        rivals = [t for t in refined if t.chips or _of_pixels(t)]
         if best not in rivals or len({t.chips for t in rivals}) < 2:
             return best
         left = {}
@@ -548,7 +549,7 @@ class Search:
         made pixels odd and it is their numbers that tell so, a map of them tells the same, and is not rarer.
         """
         best = refined[0] if is_pattern(refined[0]) else min(refined, key=lambda t: judged(t)[1])
-        maps = [t for t in refined if t.maps and t.change.per == "pixel"]
+        maps = [t for t in refined if _of_pixels(t)]
         told = best
         if best.chips and maps and self._of_numbers(state, best.moved) > _MOSTLY:
             best = min(maps, key=lambda t: judged(t)[1])
@@ -569,6 +570,11 @@ class Search:
 def _mark_of(chance: float) -> float:
     """Standard deviations of a p-value."""
     return float(stats.norm.isf(max(chance, LEAST_P) / 2))
+
+
+def _of_pixels(one: Tried) -> bool:
+    """Is it a map of pixels?"""
+    return one.maps is not None and one.change.per == "pixel"
 
 
 def gain_beside(one: Tried, other: Tried) -> float:
