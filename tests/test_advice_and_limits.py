@@ -247,6 +247,13 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     own = with_residuals(state, {})
     assert told(residuals=foul, chips=True, state=own) == [("slow_afterpulsing", True)]
     assert told(chips=True, state=with_residuals(state, {"intervals": 10.0})) == [("slow_afterpulsing", False)]
+    # whose squares fall as much, though the law of its scatter gains little
+    odd = with_residuals(state, {"intervals": 0.0}).residuals
+    fell = fit.square(state.residuals) - fit.square(odd)
+    for most, alike in ((fell, True), (fell + 100.0, False)):
+        best.gain = most
+        assert told(residuals=odd, gain=-50.0, chips=True, state=own) == [("slow_afterpulsing", alike)], fell
+    best.gain = 100.0
     # at the end of where it is looked for no law is quite right: what nearly does as well may be
     for lifetime, alike in ((499e-9, False), (500e-9, True), (5e-9, True)):
         best.values = {("afterpulsing", "lifetime"): lifetime}

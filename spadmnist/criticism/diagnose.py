@@ -34,7 +34,7 @@ from .course import (
     widen,
 )
 from .findings import mimicked, nuisances, remainder, traces
-from .fit import RATES, Bench, State
+from .fit import RATES, Bench, State, square
 from .ladder import placebo_row
 from .refining import refine, state_of
 from .search import alike, gain_beside
@@ -368,6 +368,8 @@ def _alternatives(
             left = judged.residuals
         failed = checks.failing(checks.blocks(bench, judged, left))
         most, gain = gain_beside(best, one), gain_beside(one, best)
+        if judged is not state:  # a few odd pixels do not follow the law of scatter by which it may gain little
+            gain = max(gain, square(state.residuals) - square(residuals))
         near = most - gain < alike(most) or (at_end(best) and gain > _ALMOST * most)
         as_good = one.residuals is not None and near and not failed
         out.append(
