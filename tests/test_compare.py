@@ -156,6 +156,7 @@ def test_a_wrong_model_fails_at_the_right_place(
     assert "fails" in criticism.table(found) and max(map(len, criticism.table(found).splitlines())) <= 100
 
 
+@pytest.mark.slow
 def test_the_misfit_is_that_of_a_diagnosis() -> None:
     """One measure: a source whose noise is in every long window is not counted again for each of them.
 
