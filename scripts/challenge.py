@@ -327,8 +327,9 @@ def score(args: argparse.Namespace) -> int:
             print(f"challenge: {fault}", file=sys.stderr)
         print("challenge: nothing is scored with a broken seal", file=sys.stderr)
         return 1
-    cases, answers = [], []
+    cases, late = [], 0
     for folder, (truths, _) in zip(folders, sets, strict=True):
+        answers = []
         for truth in truths:
             if not answer_file(folder, truth["case"], "diagnose").exists():
                 continue  # not yet asked
@@ -337,9 +338,10 @@ def score(args: argparse.Namespace) -> int:
             found = {name: one["answer"] for name, one in told.items()}
             cases.append(judged(truth, found, told["diagnose"]["seconds"]))
         (folder / "sealed" / "opened").touch()
+        # of each set by itself: what is blind of one may have been written with the truth of another in view
+        blind = {one["package"] for one in answers if one["answer"] and not one["after_opening"]}
+        late += sum(bool(one["after_opening"]) and one["package"] not in blind for one in answers)
     text = report(cases, sum(len(truths) for truths, _ in sets))
-    blind = {one["package"] for one in answers if one["answer"] and not one["after_opening"]}
-    late = sum(bool(one["after_opening"]) and one["package"] not in blind for one in answers)
     if late:
         text += (
             f"\n{late} answers are of a program that was changed after the truth had been opened: they are not blind.\n"

@@ -186,8 +186,10 @@ def compare(
                     float(judgement.expected[judgement.worst]),
                 )
                 # what a window has because a shorter one has it is not counted again
-                single = made.apart.get(statistic.name, null)
-                misfit = single.judge(summary.apart().values, total).misfit
+                single, misfit = null, judgement.misfit
+                if summary.nested is not None:
+                    single = made.apart[statistic.name]
+                    misfit = single.judge(summary.apart().values, total).misfit
                 checks.append(
                     Check(
                         statistic.name,

@@ -194,7 +194,7 @@ def _recordings_of(
             summary = reduced(statistic, recording)
             if summary is not None:
                 # words and functions stay behind: numbers travel between processes
-                bare = Summary(summary.values, summary.law, str, no_size, summary.scale)
+                bare = Summary(summary.values, summary.law, str, no_size, summary.scale, nested=summary.nested)
                 found.setdefault(statistic.name, []).append(bare)
     return totals, found
 

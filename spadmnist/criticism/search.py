@@ -583,7 +583,7 @@ def gain_beside(one: Tried, other: Tried) -> float:
     """
     if not (other.chips and one.maps and one.chance is not None):
         return one.gain
-    price = sum(map_.price for map_ in one.maps.values())
+    price = sum(one.maps[c.carrier].price for c in one.changes if c.carrier in one.maps)  # not of those held before
     return min(one.gain, max(one.gain - price, _mark_of(one.chance) ** 2))
 
 
