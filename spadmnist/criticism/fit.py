@@ -736,7 +736,8 @@ def likelier(state: State, other: State, trace: Mapping[Cell, np.ndarray] | None
     """By how much twice the log likelihood of another model is larger, each cell judged by that model's own scatter.
 
     A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts. trace:
-    of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide.
+    of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide. Of
+    spectra, whose scatter is their mean, the squares alone count.
     """
     out = 0.0
     for cell in other.residuals.keys() & state.residuals.keys():
