@@ -325,23 +325,25 @@ def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
     assert better(0, 0, third) == "crosstalk"
 
 
-@pytest.mark.parametrize("law", ["normal", "scaled", "poisson"])
+@pytest.mark.parametrize("law", ["normal", "scaled", "poisson", "exponential"])
 def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
     """Twice the exact logarithm of the likelihood ratio of 400 cells, one model scattering twice as much.
 
-    It is -254 or 645 on average, with a spread of 21 or 85: neither comes near 0. Without the logarithm of the scatter
-    it would be 300 of data of the narrower one.
+    It is -254 or 645 on average, with a spread of 21 or 85, of powers -155 or 245 with one of 20 or 40: none comes near
+    0. Without the logarithm of the scatter it would be 300 of data of the narrower one.
     """
     rng = np.random.default_rng(11)
     cells, mean = 400, 900.0
     own = math.sqrt(mean) if law == "poisson" else 1.0
 
     def drawn(times: float, *size: int) -> np.ndarray:
+        if law == "exponential":
+            return times * mean * rng.exponential(size=(*size, cells))
         return mean + times * own * rng.standard_normal((*size, cells))
 
     def state_of(times: float, data: np.ndarray) -> Any:
         scale = np.ones(cells) if law == "scaled" else None
-        kind = "poisson" if law == "poisson" else "normal"
+        kind = "normal" if law == "scaled" else law
         made = [Summary(x, kind, str, recordings.no_size, scale) for x in drawn(times, 64)]
         null = learn(made, np.full(64, mean))
         return SimpleNamespace(nulls={CELL: null}, residuals={CELL: null.judge(data, mean).residuals})
@@ -350,6 +352,8 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
         data = drawn(truth)
         z = (data - mean) / own
         exact = float(z @ z) * (1 - 1 / 4) - 2 * cells * math.log(2)
+        if law == "exponential":
+            exact = float(np.sum(data / mean)) - 2 * cells * math.log(2)
         found = likelier(state_of(1.0, data), state_of(2.0, data))
         assert found == pytest.approx(exact, rel=0.25, abs=30), (law, truth)
         assert (found > 0) == (truth == 2.0)
@@ -357,7 +361,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0)
+    null = SimpleNamespace(breadth=1.0, law="normal")
     now, there = (
         SimpleNamespace(nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)})
         for x, y in ((1.0, 1.1), (3.0, 1.0))
@@ -370,7 +374,7 @@ def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
 def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> None:
     bench = bench_of(lab())
     look, nothing = quiet(bench), Moved({}, {}, {})
-    chance = Tried(change_of(bench, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True)
+    chance = Tried(change_of(bench, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True, fell=100.0)
     other = Tried(change_of(bench, "add crosstalk"), {}, nothing, 90.0, 1.0)
     map_ = Tried(change_of(bench, "per_pixel dark_counts.rate"), {}, nothing, 10.0, 1.0)
     map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
@@ -379,7 +383,9 @@ def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> Non
     # and beside a map what chance makes, where there is something in it
     clear = replace(map_, gain=1000.0)
     assert look.worth([clear, other, chance]) == [clear, chance]
-    assert look.worth([clear, replace(chance, gain=20.0)]) == [clear]
+    assert look.worth([clear, replace(chance, gain=20.0, fell=20.0)]) == [clear]
+    # as the squares say: until its number is settled, how it scatters may tell against it
+    assert [t.chips for t in look.worth([clear, replace(chance, gain=-50.0)])] == [False, True]
 
 
 def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:

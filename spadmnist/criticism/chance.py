@@ -21,6 +21,7 @@ from .tried import Tried, shape_of
 LEAST_P = 1e-300
 _MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _EDGES = "early_intervals"  # how unlike the pixels are in how long they are blind
+_BY_CHANCE = 0.25  # of what the data have of a trace: as much a few recordings may have of it by chance
 _LITTLE = 0.1  # times as strong: what grows with the square is no matter there
 _HELD = 0.9  # of what directions of a candidate have in common, by few recordings
 _SMALL, _FOLDS = 32, 4  # cells of a statistic of which it can be told how they go together; parts of the recordings
@@ -86,15 +87,16 @@ def helps(bench: Bench, state: State, one: Tried) -> bool:
     if one.chance is not None or one.there is None:
         return True
     _, found, times = nearest_face(bench, state, one)
-    keys = list(state.residuals)
+    keys, least = list(state.residuals), 0.0
     trace, there = (stacked(bench.template(state, moved), keys) for moved in (one.moved.at(times), one.there))
     if one.sensors is not None and not trace @ there:
         # so faint that all of it may be chance in each cell, and is left out of it: not so along the whole trace
         (whole,) = bench.moved(state, [one.sensors], 2 * FEW, kept="all")
         if not isinstance(whole, str):
             there = stacked(bench.template(state, whole), keys)
+            least = _BY_CHANCE
     settled = found.size * float(trace @ there) / max(float(trace @ trace), 1e-300)
-    return abs(settled - found.data) < abs(found.data)
+    return abs(settled - found.data) < (1 - least) * abs(found.data)
 
 
 def _of_traces(bench: Bench, state: State, tried: Sequence[Tried]) -> tuple[list[float], np.ndarray]:

@@ -27,7 +27,7 @@ from ..statistics import Summary
 from . import recordings
 from .candidates import Key, Values, on_chip, with_values
 from .edges import Shortest
-from .nulls import LEAST_POWER, Null, _standardized, learn, poisson_scores
+from .nulls import LEAST_POWER, Null, _standardized, learn, poisson_scores, powers_of
 from .shifts import beyond_noise, difference
 
 T = TypeVar("T")
@@ -736,18 +736,24 @@ def likelier(state: State, other: State, trace: Mapping[Cell, np.ndarray] | None
     """By how much twice the log likelihood of another model is larger, each cell judged by that model's own scatter.
 
     A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts. trace:
-    of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide. Of
-    spectra, whose scatter is their mean, the squares alone count.
+    of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide.
     """
     out = 0.0
     for cell in other.residuals.keys() & state.residuals.keys():
         if trace is not None and not float(trace[cell] @ trace[cell]) > _SEEN:
             continue
-        out += float(state.residuals[cell] @ state.residuals[cell] - other.residuals[cell] @ other.residuals[cell])
-        if cell in other.nulls and cell in state.nulls:
-            wider = np.log(other.nulls[cell].breadth / state.nulls[cell].breadth)
-            # a cell that never moved has no scatter to compare with
-            out -= 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), state.residuals[cell].shape)))
+        z, there = state.residuals[cell], other.residuals[cell]
+        if cell not in other.nulls or cell not in state.nulls:
+            out += float(z @ z - there @ there)
+            continue
+        null, new = state.nulls[cell], other.nulls[cell]
+        if null.law == "exponential":  # a power scatters as its mean does
+            powers, relative = powers_of(z * null.factor), powers_of(there * new.factor)
+            fall, wider = 2 * float(np.sum(powers - relative)), np.log(powers / relative)
+        else:
+            fall, wider = float(z @ z - there @ there), np.log(new.breadth / null.breadth)
+        # a cell that never moved has no scatter to compare with
+        out += fall - 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)))
     return out
 
 

@@ -116,7 +116,7 @@ def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
             continue
         best = refine(bench, course.state, _started(course, change), 5)
         if not change.dials:  # a switch, which may be as it should be
-            best.gain = likelier(course.state, state_of(bench, best))
+            best.gain = likelier(course.state, state_of(bench, best), bench.template(course.state, best.moved))
             if best.gain <= 0:
                 _kept(course, change)
                 continue

@@ -68,8 +68,14 @@ class Map:
         """How much less twice the log likelihood of values that scatter by sigma rises than the squares fall, if each
         is put where its estimate is.
         """
-        ratio = (self.sigma / np.maximum(self.raw_error, 1e-12)) ** 2
+        # how wide they are thought to lie: an odd one has a prior of its own
+        ratio = 1 / np.maximum(self._pulled, (np.minimum(self.raw_error, _MOST) / _WIDE) ** 2)
         return float(np.sum(ratio / (1 + ratio) + np.log1p(ratio)))
+
+    @property
+    def _pulled(self) -> np.ndarray:
+        """(groups,) what the prior knows of each beside what its counts tell, both as inverse squares."""
+        return np.maximum(np.minimum(self.raw_error**2, _MOST) / np.maximum(self.error**2, 1e-30) - 1, 0.0)
 
     def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
         """(groups,) values; draw, width: standard normal numbers, for one of the maps that may be true."""
@@ -96,7 +102,7 @@ class Map:
         doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + usual)
         other = max(self.sigma**2 + draw * doubt, min(_LEAST_WIDTH, self.sigma) ** 2)
         # by what the prior has done to each: an odd one is none of those whose width is in doubt
-        pulled = np.maximum(noise / np.maximum(self.error**2, 1e-30) - 1, 0.0)
+        pulled = self._pulled
         return np.asarray((1 + pulled) / (1 + pulled * self.sigma**2 / other))
 
     @functools.cached_property

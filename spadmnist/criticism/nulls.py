@@ -19,6 +19,7 @@ from ..statistics import Summary
 
 _LEAST = 1e-300
 _FEW = 20.0  # expected counts below which a cell does not tell by itself how it follows the light
+_LEAST_RATIO = 1e-3  # of a power to its mean: less says no more
 LEAST_POWER = 0.3  # of a spectrum, that a change leaves
 _MANY = 200.0  # expected counts beyond which a root of them is normal enough
 
@@ -226,7 +227,7 @@ def _standardized(
         ratio = values / np.maximum(expected, _LEAST)
         # the mean is known from so many recordings only. Hardly any power says nothing: of few detections the sum at a
         # simple fraction of the clock may be exactly 0
-        log_tail = -recordings * np.log1p(np.maximum(ratio, 1e-3) / recordings)
+        log_tail = -recordings * np.log1p(np.maximum(ratio, _LEAST_RATIO) / recordings)
         return _score_of_tail(log_tail)
     z = (values - expected) / np.where(spread > 0, spread, 1.0) / widened
     if scaled:
@@ -257,6 +258,11 @@ def scores_of_powers(more: np.ndarray) -> np.ndarray:
     The score of a power p is about the root of 2 p.
     """
     return np.asarray(_score_of_tail(-np.maximum(1.0 + more, LEAST_POWER)) - _score_of_tail(np.array(-1.0)))
+
+
+def powers_of(scores: np.ndarray) -> np.ndarray:
+    """The powers, in units of their mean, that have these normal scores."""
+    return np.asarray(np.maximum(-special.log_ndtr(-scores), _LEAST_RATIO))
 
 
 def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:

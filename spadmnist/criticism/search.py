@@ -37,8 +37,8 @@ _REFINED = 3  # of these, that are settled
 _PROMISING = 25.0  # in chi square, of what is worth a state of its own
 _LEAST_CHANCE, _CHANCE_BESIDE = 1e-3, 0.05  # of a map that is tried, and beside what chance makes of pixels
 _SILENT = 6.0  # standard deviations of a trace that is none
-_FURTHER = 3  # times that a stronger edge is looked for
-_LOUD, _WEAKER = 300.0, 3  # the same of one that says little of a smaller one; times that one is looked for
+_LOUD = 300.0  # the same of one that says little of a smaller one
+_STEPS = 3  # times that a weaker or a stronger edge is looked for
 _INSTANT = 0.03  # of a frame: times below it are alike without stamps
 _SWINGS = (1.0, 4.0)  # times the usual strength at which what swings is tried: in a spectrum it grows as the square
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)  # of a logarithm, of pixels that differ unseen
@@ -223,29 +223,29 @@ class Search:
 
     def _lowered(self, state: State, tried: Sequence[Tried], some: Sequence[str]) -> list[Tried]:
         """Weaker ones for those that drown all else: where it does not grow in proportion, they tell nothing of it."""
-        out: list[Tried] = []
-        loud = [t for t in tried if self.bench.size(state, t.moved) > _LOUD]
-        for _ in range(_WEAKER):
-            lower = [(t.change, down) for t in loud if (down := weaker(t)) and not _among(tried, t.change, down)]
-            loud = [t for t in self._looked_at(state, lower, some) if self.bench.size(state, t.moved) > _SILENT]
-            out += loud
-            loud = [t for t in loud if self.bench.size(state, t.moved) > _LOUD]
-            if not loud:
-                break
-        return out
+        loud = self._onward(state, tried, some, weaker, lambda t: self.bench.size(state, t.moved) > _LOUD)
+        return [t for t in loud if self.bench.size(state, t.moved) > _SILENT]
 
     def _further(self, state: State, tried: Sequence[Tried], some: Sequence[str]) -> list[Tried]:
         """Stronger ones for edges of which the data want more: much of a blur is not so many times a little."""
+        return self._onward(state, tried, some, further, lambda t: t.gain > _PROMISING and t.times > 1)
+
+    def _onward(
+        self,
+        state: State,
+        tried: Sequence[Tried],
+        some: Sequence[str],
+        step: Callable[[Tried], dict[Key, Any] | None],
+        wanted: Callable[[Tried], bool],
+    ) -> list[Tried]:
+        """What lies a step on from those that are wanted, and from these again while they are."""
         out: list[Tried] = []
-        wanted = [t for t in tried if t.gain > _PROMISING and t.times > 1]
-        for _ in range(_FURTHER):
-            ups = [(t.change, up) for t in wanted if (up := further(t)) and not _among(tried, t.change, up)]
-            before: dict[tuple[Any, ...], float] = {}
-            for t in wanted:
-                before[t.change.name, shape_of(t)] = max(t.gain, before.get((t.change.name, shape_of(t)), 0.0))
-            found = self._looked_at(state, ups, some) if ups else []
+        here = [t for t in tried if wanted(t)]
+        for _ in range(_STEPS):
+            on = [(t.change, to) for t in here if (to := step(t)) and not _among(tried, t.change, to)]
+            found = self._looked_at(state, on, some) if on else []
             out += found
-            wanted = [t for t in found if t.gain > before[t.change.name, shape_of(t)]]
+            here = [t for t in found if wanted(t)]
         return out
 
     def _still(
@@ -340,7 +340,7 @@ class Search:
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 if one.chips and one.gain > _PROMISING:
-                    one.gain = self.beside(state, one)
+                    one.fell, one.gain = one.gain, self.beside(state, one)
             else:
                 one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
                 # small differences of many pixels are lost among what chance leaves, but for edges, which stand out
@@ -492,7 +492,7 @@ class Search:
         first = second[0]
         out = [first, *(t for t in second[1:] if t.gain > 0.4 * best)][:_REFINED]
         chips, maps = (any(x) for x in zip(*((t.chips, _of_pixels(t)) for t in out), strict=True))
-        beside = [t for t in second if (chips and _of_pixels(t)) or (maps and t.chips and t.gain > _PROMISING)]
+        beside = [t for t in second if (chips and _of_pixels(t)) or (maps and t.chips and t.fell > _PROMISING)]
         return out + [t for t in beside if all(t is not one for one in out)]
 
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:

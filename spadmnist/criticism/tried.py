@@ -25,8 +25,9 @@ _RAISED = 12.0  # times as strong is what is tried where a trace is none
 class Tried:
     """A candidate at some values: what it does, and by how much it brings the data nearer.
 
-    gain: in chi square; times: the strength, relative to that of `values`, at which it is largest; phases: of what
-    begins anew in every capture; intervals: 95 % of numbers that `settled` does not hold.
+    gain: in chi square; times: the strength, relative to that of `values`, at which it is largest; fell: by how much
+    the squares fall, where the gain is another measure; phases: of what begins anew in every capture; intervals: 95 %
+    of numbers that `settled` does not hold.
     """
 
     change: Change
@@ -35,6 +36,7 @@ class Tried:
     gain: float
     times: float
     sensors: Sensors | None = None
+    fell: float = 0.0
     power: float = 1.0  # what it does grows with this power of its strength
     chance: float | None = None  # p-value, where it is known by itself
     settled: Settled | None = None
