@@ -322,10 +322,15 @@ def score(args: argparse.Namespace) -> int:
     folders = [Path(folder) for folder in args.folders]
     sets = [opened(folder) for folder in folders]
     faults = [f"{folder}: {fault}" for folder, (_, wrong) in zip(folders, sets, strict=True) for fault in wrong]
+    seen: dict[str, Path] = {}
+    for path in (path for folder in folders for path in sorted((folder / "cases").glob("*.sha256"))):
+        first = seen.setdefault(path.read_text().strip(), path)
+        if first is not path:
+            faults.append(f"{path} is {first} once more: give each set once")
     if faults:
         for fault in faults:
             print(f"challenge: {fault}", file=sys.stderr)
-        print("challenge: nothing is scored with a broken seal", file=sys.stderr)
+        print("challenge: nothing is scored", file=sys.stderr)
         return 1
     cases, late = [], 0
     for folder, (truths, _) in zip(folders, sets, strict=True):
@@ -336,7 +341,8 @@ def score(args: argparse.Namespace) -> int:
             told = {question: answer_of(folder, truth["case"], question) for question in QUESTIONS}
             answers += list(told.values())
             found = {name: one["answer"] for name, one in told.items()}
-            cases.append(judged(truth, found, told["diagnose"]["seconds"]))
+            name = truth["case"] if len(folders) == 1 else f"{folder.resolve().name}/{truth['case']}"
+            cases.append(judged({**truth, "case": name}, found, told["diagnose"]["seconds"]))
         (folder / "sealed" / "opened").touch()
         # of each set by itself: what is blind of one may have been written with the truth of another in view
         blind = {one["package"] for one in answers if one["answer"] and not one["after_opening"]}

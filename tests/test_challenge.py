@@ -685,8 +685,18 @@ def test_a_part_of_the_cases_is_scored(
     # two sets as one; not with a broken seal in either
     second = made.with_name("second set")
     shutil.copytree(made, second)
+    capsys.readouterr()
+    assert challenge.main(["score", str(second), str(made)]) == 1  # the same cases
+    assert f"{made / 'cases' / 'case-001.sha256'} is {second / 'cases' / 'case-001.sha256'} once more" in (
+        capsys.readouterr().err
+    )
+    for path in (second / "sealed").glob("*.json"):
+        path.with_suffix(".salt").write_text("another")
+        (second / "cases" / f"{path.stem}.sha256").write_text(challenge.seal("another", path.read_text()))
     assert challenge.main(["score", str(second), str(made)]) == 0
-    assert "6 of 16 cases, those asked so far" in (second / "score.md").read_text()
+    both = (second / "score.md").read_text()
+    assert "6 of 16 cases, those asked so far" in both
+    assert all(f"- {folder.name}/case-002 " in both for folder in (made, second))
     assert (made / "score.md").read_text() == table
     (made / "sealed" / "case-001.salt").write_text("another")
     capsys.readouterr()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -155,7 +156,7 @@ def test_what_a_law_leaves_in_its_own_cells_makes_its_numbers_less_certain():
 def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     rng = np.random.default_rng(6)
     own = rng.standard_normal((960, 30))
-    dial = candidates.Dial("any", "a", "", -0.3, 5.0, 0.0)
+    dial = candidates.Dial("any", "a", "", -0.3, 5.0, 0.0, bounds=(-0.3, None))
     law = lambda a: np.full(30, np.expm1(a))  # noqa: E731
     settled, ends = profile_of(law, np.ones((30, 1)), own, (dial,), [0.0])
     wide = 1.96 * float(np.sqrt(settled.covariance[0, 0]))
@@ -163,6 +164,21 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     assert low == -0.3, "at -0.3 the squares have risen by less"
     assert high == pytest.approx(np.log1p(wide), rel=0.03)
     assert high < 0.9 * wide
+
+
+@pytest.mark.parametrize(
+    ("ends", "bounds", "off", "reach", "expected"),
+    [
+        ((1e-9, 1e-6), (0, None), 0.0, (math.log(0.9e-9), math.log(1.2e-9)), (0.9e-9, 1.2e-9)),
+        ((1e-9, 1e-6), (0, None), 0.0, (-math.inf, 800.0), (1e-9, 1e-6)),  # nothing tells it
+        ((-0.3, 5.0), (-0.35, None), 0.0, (-0.4, 5.5), (-0.35, 5.5)),
+        ((0.1, 1.0), (0, 1), 1.0, (math.log(1e-9), math.log(0.92)), (0.08, 1.0)),  # what lacks
+    ],
+)
+def test_where_a_number_is_looked_for_is_no_bound_of_what_it_may_be(ends, bounds, off, reach, expected):
+    dial = candidates.Dial("any", "a", "", *ends, off, bounds=bounds)
+    assert dial.interval(*reach) == pytest.approx(expected)
+    assert all(ends[0] <= dial.value(u) <= ends[1] for u in reach)
 
 
 def test_a_number_that_nothing_follows_stays_as_it_is():

@@ -24,6 +24,7 @@ Values = Mapping[Key, Any]
 _SHAPES = 4  # values of a shape that are tried between the ends of where it is looked for
 _MOST = 6  # templates of one candidate
 _TURNED = 1.02  # times a number, to see what follows it
+_BEYOND = 0.3  # of a logarithm, or of where a number is looked for: as far as what is seen within holds
 _LEAST = 1e-6  # of where a number is looked for, that it may lack
 
 
@@ -32,7 +33,7 @@ class Dial:
     """A number that may be turned: where it is looked for, and whether on a scale of ratios.
 
     off: where the effect vanishes, None for a shape; if that is the upper end, the scale is that of what lacks.
-    whole: there are whole numbers of it only.
+    whole: there are whole numbers of it only. bounds: beyond which there are none, where it has any.
     """
 
     effect: str
@@ -42,6 +43,7 @@ class Dial:
     high: float
     off: float | None
     whole: bool = False
+    bounds: tuple[float | None, float | None] = (None, None)
 
     @property
     def key(self) -> Key:
@@ -68,15 +70,27 @@ class Dial:
         return math.log(max(value, 1e-300)) if self.log else value
 
     def value(self, coordinate: float) -> float:
-        value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
-        value = self.high - value if self.lacks else value
-        value = float(round(value)) if self.whole else value
-        return min(max(value, self.low), self.high)
+        return min(max(self._anywhere(coordinate), self.low), self.high)
 
     def interval(self, low: float, high: float) -> tuple[float, float]:
-        """(low, high) of the values between two coordinates."""
-        ends = self.value(low), self.value(high)
+        """(low, high) of the values between two coordinates.
+
+        Where a number is looked for is no bound of what it may be: the interval ends beyond it if it does so near by.
+        """
+        low_bound, high_bound = self.bounds
+        least = -math.inf if low_bound is None else low_bound
+        most = math.inf if high_bound is None else high_bound
+        beyond = _BEYOND if self.log else _BEYOND * (self.high - self.low)
+        ends = []
+        for u in (low, high):
+            near = self.ends[0] - beyond <= u <= self.ends[1] + beyond
+            ends.append(min(max(self._anywhere(u), least), most) if near else self.value(u))
         return min(ends), max(ends)
+
+    def _anywhere(self, coordinate: float) -> float:
+        value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
+        value = self.high - value if self.lacks else value
+        return float(round(value)) if self.whole else value
 
     def scaled(self, value: float, factor: float) -> float:
         """The value whose distance from `off` is so many times that of `value`."""
@@ -145,7 +159,7 @@ def _dial(effect: str, declared: Parameter, off: float | None) -> Dial:
     low, high = map(float, declared.search)
     ends = (low, high, float(declared.default))
     whole = not declared.unit and low >= 1 and declared.bounds[0] is not None and all(x == int(x) for x in ends)
-    return Dial(effect, declared.name, declared.unit, low, high, off, whole)
+    return Dial(effect, declared.name, declared.unit, low, high, off, whole, declared.bounds)
 
 
 def _numeric(declared: Parameter) -> bool:
@@ -212,7 +226,7 @@ def _settings(effect: Effect) -> Iterator[Change]:
             continue  # a line that stands elsewhere is another one
         low, high = declared.search  # type: ignore[misc]
         low, high = min(low, value) if value > 0 else low, max(high, value)
-        dial = Dial(effect.name, name, declared.unit, float(low), float(high), float(value))
+        dial = Dial(effect.name, name, declared.unit, float(low), float(high), float(value), bounds=declared.bounds)
         yield Change("set", effect.name, name, (dial,))
 
 
