@@ -15,7 +15,7 @@ from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
-from .fit import RATES, Bench, Cell, Sensors, State, square, stacked
+from .fit import RATES, Bench, Cell, Sensors, State, square
 from .ladder import errors_of, row
 from .refining import EXCLUDED, UNSEEN
 from .search import Search
@@ -53,7 +53,9 @@ class Course:
     @property
     def judged(self) -> dict[Cell, np.ndarray]:
         """Residuals of each capture, the numbers being settled without it as far as there are others."""
-        return self.state.residuals if self.settled is None else _unseen(self.state, self.settled)
+        return (
+            self.state.residuals if self.settled is None else settling.unseen(self.state.residuals, self.settled.slopes)
+        )
 
     @property
     def failed(self) -> list[checks.Block]:
@@ -388,37 +390,6 @@ def material(one: Tried) -> str:
     """What a candidate changes of the mean rate, for people."""
     logs = list(one.moved.at(one.times).logs.values())
     return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
-
-
-def _stacked(state: State, settled: Settled) -> tuple[list[Cell], np.ndarray, np.ndarray]:
-    keys = [k for k in settled.slopes if k in state.residuals and len(state.residuals[k]) == len(settled.slopes[k])]
-    return keys, stacked(state.residuals, keys), np.concatenate([settled.slopes[k] for k in keys])
-
-
-def _unseen(state: State, settled: Settled) -> dict[Cell, np.ndarray]:
-    """Residuals of each capture, the numbers being settled without it (to first order).
-
-    Where one capture alone tells a number, each of its cells is judged by what the others of them say.
-    """
-    keys, z, slopes = _stacked(state, settled)
-    normal = slopes.T @ slopes
-    out = dict(state.residuals)
-    ridge = 1e-9 * np.trace(normal) * np.eye(len(normal))
-    for id in {k[0] for k in keys}:
-        mine = np.concatenate([np.full(len(state.residuals[k]), k[0] == id) for k in keys])
-        rest = normal - slopes[mine].T @ slopes[mine]
-        alone = bool(np.any(np.diag(rest) < 0.3 * np.diag(normal)))
-        start = 0
-        if not alone:
-            shift = -np.linalg.pinv(rest + ridge) @ (slopes[~mine].T @ z[~mine])  # 0 where nothing follows any number
-        hat = np.einsum("ij,jk,ik->i", slopes, np.linalg.pinv(normal + ridge), slopes)
-        for key in keys:
-            size = len(state.residuals[key])
-            part = slice(start, start + size)
-            start += size
-            if key[0] == id and key != RATES:
-                out[key] = z[part] / (1 - np.minimum(hat[part], 0.9)) if alone else z[part] + slopes[part] @ shift
-    return out
 
 
 def drop_needless(course: Course) -> None:

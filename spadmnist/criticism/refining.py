@@ -32,7 +32,7 @@ _BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains,
 
 
 def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
-    """Settle the numbers of a candidate."""
+    """Settle the numbers of a candidate. Its gain is that on captures that they are not settled with."""
     if one.maps is not None or not one.change.dials:
         one.residuals = bench.residuals(state, one.moved, noisy=True)
         return one
@@ -75,7 +75,15 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     one.gain = square(state.residuals) - found.square
     if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
         one.gain = likelier(state, state_of(bench, one), trace)
+    one.gain -= optimism(one)
     return one
+
+
+def optimism(one: Tried) -> float:
+    """By how much a settled candidate's squares are smaller than on captures that its numbers are not settled with."""
+    if one.settled is None or one.residuals is None:
+        return 0.0
+    return settling.optimism(one.residuals, one.settled) + 2.0 * len(one.phases)
 
 
 def state_of(bench: Bench, one: Tried) -> State:
@@ -184,7 +192,7 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     gain, times, found = swing.suited(bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     moved = swing.at(found)
     one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
-    one.moved, one.gain = moved.at(times), gain - 2 * len(one.phases)
+    one.moved = moved.at(times)
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
     one.times, one.faint = 1.0, True
     one.residuals = residuals = bench.residuals(state, moved, times)
@@ -200,6 +208,7 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     own = np.concatenate([state.own[cell] for cell in residuals], axis=1)
     covariance = settling.covariance_of(np.concatenate(list(slopes.values())), own)
     one.settled = Settled(dials, now, covariance, residuals, slopes, square(residuals), one.values)
+    one.gain = gain - optimism(one)
     return one
 
 

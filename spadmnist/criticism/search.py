@@ -24,7 +24,7 @@ from .candidates import Change, Key, chancy, changes, templates, with_values
 from .chance import LEAST_P, nearest_face, of_map
 from .fit import RATES, Bench, Moved, Sensors, State, likelier, square, stacked
 from .lines import Line, lines
-from .refining import STRONG, state_of
+from .refining import STRONG, optimism, state_of
 from .swings import NEAR, TIMES, turned
 from .tried import EACH, Tried, further, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
@@ -518,7 +518,7 @@ class Search:
             moved = np.any([np.abs(one.residuals[cell] - z) > _MOVED for one, _ in states if one.residuals], axis=0)
             for one, there in states:
                 left = there.residuals[cell][moved]
-                costs[id(one)] = costs.get(id(one), 2.0 * len(one.phases)) + float(left @ left)
+                costs[id(one)] = costs.get(id(one), optimism(one)) + float(left @ left)
         best = min((one for one, _ in states), key=lambda one: costs[id(one)])
         for one, _ in states:
             one.gain = best.gain - (costs[id(one)] - costs[id(best)])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .candidates import Dial, Key
-from .fit import FEW, Bench, Cell, Sensors, State, stacked
+from .fit import FEW, RATES, Bench, Cell, Sensors, State, square, stacked
 
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _CLOSE = 0.02  # and no nearer
@@ -100,8 +100,8 @@ def settle(
         if isinstance(found[0], str):
             return found[0]
         z = found[0]
-        square = float(z @ z)
-        if best is not None and not anew and best[0] - square < 0.3 * promised:
+        cost = float(z @ z)
+        if best is not None and not anew and best[0] - cost < 0.3 * promised:
             if promised < 4:
                 break
             found = [z, *evaluate(_aside(dials, u, steps, seen))]
@@ -110,30 +110,30 @@ def settle(
             slopes, there = np.zeros((len(z), len(dials))), u
             slopes[:, seen] = _slopes(found[1:], _aside(dials, u, steps, seen), len(z), np.flatnonzero(seen))
             seen = np.einsum("ij,ij->j", slopes, slopes) >= _BLIND
-        if best is None or square < best[0]:
-            best, damping, vain = (square, u, z), damping / 3, 0
+        if best is None or cost < best[0]:
+            best, damping, vain = (cost, u, z), damping / 3, 0
         else:
             damping, vain = max(3 * damping, 1.0), vain + 1
             if vain == _VAIN:
                 break
-        square, u0, z = best
+        cost, u0, z = best
         normal = slopes.T @ slopes
         step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (slopes.T @ z)
         step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
         u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(dials, u0 + step, strict=True)])
-        promised = float(square - ((z + slopes @ (u - u0)) ** 2).sum())
+        promised = float(cost - ((z + slopes @ (u - u0)) ** 2).sum())
         error = np.sqrt(np.maximum(np.diag(covariance_of(slopes, own)), 1e-30))
         # never so short that what is taken for noise, or not, makes a slope
         steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in dials], 0.5)
-        begun = square if turn == 0 else begun
+        begun = cost if turn == 0 else begun
         if turn and (
-            promised < 1.0 + _PROMISING * math.sqrt(max(begun - square, 0.0)) or np.all(np.abs(u - u0) < 0.3 * error)
+            promised < 1.0 + _PROMISING * math.sqrt(max(begun - cost, 0.0)) or np.all(np.abs(u - u0) < 0.3 * error)
         ):
             break
     assert best is not None
-    square, u, z = best
+    cost, u, z = best
     return Settled(
-        dials, u, covariance_of(slopes, own), _split(z, state, keys), _split(slopes, state, keys), square, at(u)
+        dials, u, covariance_of(slopes, own), _split(z, state, keys), _split(slopes, state, keys), cost, at(u)
     )
 
 
@@ -306,6 +306,46 @@ def profiled(
         reach = reach * np.clip(np.where(np.isnan(rise), 1.0, more), 0.5, 2.0)
     out = [settled.point[i] + side * h for (i, side), h in zip(ends, reach, strict=True)]
     return {settled.dials[i].key: settled.dials[i].interval(out[2 * k], out[2 * k + 1]) for k, i in enumerate(told)}
+
+
+def unseen(
+    residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray], cells: bool = True
+) -> dict[Cell, np.ndarray]:
+    """Residuals of each capture, the numbers being settled without it (to first order).
+
+    cells: where one capture alone tells a number, is each of its cells judged by what the others of them say?
+    """
+    keys = [k for k in slopes if k in residuals and len(residuals[k]) == len(slopes[k])]
+    z, slope = stacked(residuals, keys), np.concatenate([slopes[k] for k in keys])
+    normal = slope.T @ slope
+    out = dict(residuals)
+    ridge = 1e-9 * np.trace(normal) * np.eye(len(normal))
+    for id in {k[0] for k in keys}:
+        mine = np.concatenate([np.full(len(residuals[k]), k[0] == id) for k in keys])
+        rest = normal - slope[mine].T @ slope[mine]
+        alone = bool(np.any(np.diag(rest) < 0.3 * np.diag(normal)))
+        if alone and not cells:
+            continue
+        start = 0
+        if alone:
+            hat = np.einsum("ij,jk,ik->i", slope, np.linalg.pinv(normal + ridge), slope)
+        else:
+            shift = -np.linalg.pinv(rest + ridge) @ (slope[~mine].T @ z[~mine])  # 0 where nothing follows any number
+        for key in keys:
+            size = len(residuals[key])
+            part = slice(start, start + size)
+            start += size
+            if key[0] == id and key != RATES:
+                out[key] = z[part] / (1 - np.minimum(hat[part], 0.9)) if alone else z[part] + slope[part] @ shift
+    return out
+
+
+def optimism(residuals: Mapping[Cell, np.ndarray], settled: Settled) -> float:
+    """By how much the squares are smaller than on captures that the numbers are not settled with.
+
+    Of a capture that alone tells a number nothing can be said.
+    """
+    return square(unseen(residuals, settled.slopes, cells=False)) - square(residuals)
 
 
 def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
