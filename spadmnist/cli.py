@@ -648,6 +648,7 @@ def compare(
         from . import pages
 
         pages.check_place(output)
+    _check_answer(json_file)
     with _terminal() as progress:
         progress.start("comparing", 100, 0)
         done = [0.0]
@@ -709,7 +710,8 @@ def diagnose(
         from . import pages
 
         pages.check_place(output, "diagnosis")
-        next_sensor.check_place(sensor, output / "sensor.yaml")
+        next_sensor.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
+    _check_answer(json_file)
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
         with _writing(output):
@@ -752,11 +754,29 @@ def fit(
     _load(plugin_files)
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
     next_sensor.check_place(sensor, output)
+    _check_answer(json_file)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
     with _writing(output):
         found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found)))
     _write_answer(json_file, answer.canonical(found))
     click.echo(answer.table(found))
+
+
+def _check_answer(file: Path | None) -> None:
+    """Refuse to put an answer where something else is, before any work is done."""
+    from .errors import InputError
+
+    if file is None or not file.exists():
+        return
+    if file.is_dir():
+        raise InputError(f"--json {file}: is a folder; name a file, for example {file / 'answer.json'}")
+    if file.is_file():
+        with open(file, "rb") as there:
+            head = there.read(_HEAD)
+        if head and b'"format": "spadmnist-' not in head:
+            raise InputError(
+                f"--json {file}: is there already and no answer of this program; it is left alone: name another file"
+            )
 
 
 def _write_answer(file: Path | None, text: str) -> None:
@@ -809,6 +829,9 @@ def _duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.1f} min"
+
+
+_HEAD = 200  # bytes in which an answer says its format
 
 
 def _processors() -> int:

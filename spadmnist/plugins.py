@@ -436,6 +436,7 @@ def source_file(cls: type) -> str:
 
 
 _discovered = False
+_MODULE = "spadmnist_plugin_"  # how the modules of such files are named
 _loaded: dict[Path, str] = {}
 
 
@@ -470,7 +471,7 @@ def load_file(path: str | Path) -> None:
     except (OSError, UnicodeDecodeError) as error:
         raise EffectError(f"{path}: the plug-in cannot be read ({error})") from None
     digest = hashlib.sha256(text.encode()).hexdigest()
-    name = f"spadmnist_plugin_{file.stem}_{digest[:12]}"
+    name = f"{_MODULE}{file.stem}_{digest[:12]}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
         raise EffectError(f"{path}: a plug-in is a Python file; its name ends in .py")
@@ -486,7 +487,19 @@ def load_file(path: str | Path) -> None:
         if isinstance(error, (EffectError, KeyboardInterrupt)):
             raise
         raise EffectError(f"{_place(error, file)}: the plug-in cannot be loaded: {_what(error)}") from error
+    kinds = {cls for registry in _registries for cls in registry.classes.values()}
+    if not any(isinstance(one, type) and one in kinds for one in vars(module).values()):
+        del sys.modules[name]
+        raise EffectError(
+            f"{path}: defines no effect, statistic or method, and nothing would come of it; `spadmnist effects --new "
+            "NAME` begins an effect"
+        )
     _loaded[file] = text
+
+
+def is_from_file(cls: type) -> bool:
+    """Does a class come from a file that `load_file` has loaded?"""
+    return cls.__module__.startswith(_MODULE)
 
 
 def loaded_files() -> dict[Path, str]:

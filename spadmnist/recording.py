@@ -5,6 +5,7 @@ Simulated and measured data are the same type, so that no statistic can know whi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
@@ -15,7 +16,7 @@ from . import kernels
 from .effects import Conditions
 from .errors import InputError
 from .events import Events, Layout
-from .readout import Recorded, no_detection
+from .readout import Recorded, no_detection, unsigned_for
 from .units import show
 
 T = TypeVar("T")
@@ -51,7 +52,8 @@ class Capture:
     """One entry of a measurement: how it was made.
 
     id: its name; modality: "tr", "str", "qis" or "counts"; conditions: exposure, frames, wavelength (SI).
-    mean: detections per pixel over the capture where that alone is known.
+    mean: detections per pixel over the capture where that alone is known. tick: s, in which stamps are written; None
+    where they are written as the converter gives them.
     """
 
     id: str
@@ -59,6 +61,7 @@ class Capture:
     light: Light
     conditions: Conditions
     mean: float | None = None
+    tick: float | None = None
 
     @property
     def counts_events(self) -> bool:
@@ -192,9 +195,30 @@ class Recording:
         still = {name: x for name, x in self._kept.items() if name in ("totals", "waited")}
         return replace(self, dead_time=dead_time, _kept=still)
 
+    def on_ticks(self, tick: float) -> Recording:
+        """The same stamps as a file has them that counts in other ticks (s): rounded down."""
+        if self.modality not in ("tr", "str") or (
+            self.tick is not None and math.isclose(self.tick, tick, rel_tol=1e-9)
+        ):
+            return self
+        if self.events is not None:
+            end = no_detection(self.conditions.exposure, tick)
+            ticks = _whole(self.events.times / tick, end - 1).astype(unsigned_for(end, "time stamps"))
+            events = Events(None, self.events.offsets, self.pixels, ticks, tick, end=self.conditions.exposure)
+            return replace(self, events=events, tick=tick, _kept={})
+        assert self.frames is not None and self.tick is not None
+        stamps, none = np.asarray(self.frames[:]), no_detection(self.conditions.frame_time, tick)
+        whole = np.where(stamps == self.none, none, _whole(stamps * (self.tick / tick), none - 1))
+        return replace(self, frames=whole.astype(unsigned_for(none, "time stamps")), tick=tick, _kept={})
+
     def watched(self, read: Callable[[float], None]) -> Recording:
         """The same data; `read` is told which share of the frames is read, each time."""
         return self if self.frames is None else replace(self, frames=_Watched(self.frames, read))
+
+
+def _whole(stamps: np.ndarray, last: int) -> np.ndarray:
+    """Stamps rounded down to whole ticks: what a product of two numbers lacks of one is none."""
+    return np.minimum(np.floor(stamps + 1e-6), last)
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ from joblib import Parallel
 from scipy import stats
 
 from spadmnist import config, measurement, twin
-from spadmnist.criticism import checks, fit, memory, nulls
+from spadmnist.criticism import checks, fit, memory, nulls, recordings
 from spadmnist.criticism import compare as criticism
 from spadmnist.effects import Conditions, Effect
-from spadmnist.events import Layout
+from spadmnist.errors import InputError
+from spadmnist.events import Events, Layout
 from spadmnist.measurement import Measurement
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -210,6 +211,77 @@ def test_the_same_seed_gives_the_same_answer_from_memory_and_anew(
     assert memory.recall("no such entry") is None
     other = criticism.canonical(compared(sensor(dark_counts={"rate": 201.0}), data))
     assert other != first  # another model has other nulls
+
+
+def test_a_lamp_that_was_off_is_no_light_level() -> None:
+    """As few detections as the dark has say nothing of the light, and everything of the set-up."""
+    dark, per = 20.0, 4e-3
+    made = recordings.CaptureNull(
+        1e6, 1e6, np.full(48, 4020.0), lambda level: dark + per * level, (0.0, 1.0), 0.016, {}
+    )
+    assert [made.drowned(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
+    assert made.score(18.0) < -40 and made.score(18.0, 0.05) < -15
+    # Poisson's own where the dark is most of it: 25 expected, 17 found
+    dim = replace(made, level=1250.0, stated=1250.0, totals=np.full(48, 25.0), scatter=0.2)
+    assert dim.drowned(17.0) and dim.score(17.0) == pytest.approx(-1.7, abs=0.1)
+    found = compared(sensor(dark_counts={"rate": 2000.0}), blacked_out(), replicates=16)
+    (failing,) = (c for c in found.failing if c.statistic == "rate")
+    assert (failing.capture, failing.where) == ("bright", "all pixels, hardly any light")
+    assert failing.p_value < 1e-100 and -1 < failing.relative < -0.99
+
+
+def blacked_out() -> Measurement:
+    """The last capture is without light."""
+    given = measured(sensor(dark_counts={"rate": 2000.0}), "tr", 3)
+
+    def read(index: int, layout: Layout, dead_time: float) -> tuple[Recording, list[str]]:
+        if index < 2:
+            return given._read(index, layout, dead_time)
+        made, notes = measured(sensor(dark_counts={"rate": 2000.0}), "tr", 4, 1e-6)._read(index, layout, dead_time)
+        return made, notes
+
+    return replace(given, _read=read)
+
+
+def test_a_mean_of_nothing_is_compared_and_nothing_at_all_is_not() -> None:
+    clock = Conditions(4000e-5, 4000, 1e-5, 1e-5, 500e-9)
+    light = captures("qis")[1].light
+    known = Capture("mean", "qis", light, clock, mean=0.0)
+    found = compared(sensor(), replace(measured(sensor(), "qis", 0), captures=(known,)))
+    assert found.verdict == "fails" and found.failing[0].statistic in ("light", "rate")
+    free = replace(known, light=replace(light, level=None), mean=3.0)
+    with pytest.raises(InputError, match="nothing here can be compared"):
+        compared(sensor(), replace(measured(sensor(), "qis", 0), captures=(free,)))
+
+
+@pytest.mark.parametrize("resolution", [1e-9, 1.3e-10, 1e-11, None])
+def test_ticks_of_the_file_are_those_that_are_counted_in(resolution: float | None) -> None:
+    """A data sheet with another converter, or with none, is set beside the data; a coarser one is seen."""
+    data = measured(sensor(), "tr", 5)
+    only = replace(data, captures=data.captures[2:], _read=lambda index, *more: data._read(2, *more))
+    model = sensor(tdc=None if resolution is None else {"resolution": resolution})
+    found = compared(model, only, replicates=16)
+    failing = {c.statistic for c in found.failing}
+    assert ("codes" in failing) == (resolution == 1e-9)
+
+
+def test_stamps_in_other_ticks_are_rounded_down() -> None:
+    clock = Conditions(1e-6, 2, 5e-7, 5e-7, 500e-9)
+    capture, layout = Capture("one", "tr", Light(), clock), Layout(1, 2, 25e-12, 1.0)
+    times = np.array([0.0, 2.95e-8, 3e-8, 9.999e-7])
+    one = Recording(capture, layout, Events(times, np.array([0, 3, 4]), 2, end=1e-6), None, None)
+    coarse = one.on_ticks(1e-8)
+    assert coarse.events is not None and coarse.tick == 1e-8
+    assert coarse.events.ticks is not None and coarse.events.ticks.tolist() == [0, 2, 3, 99]
+    assert coarse.on_ticks(1e-8 * (1 + 1e-12)) is coarse
+    fine = coarse.on_ticks(1e-9)
+    assert fine.events is not None and fine.events.ticks is not None and fine.events.ticks.tolist() == [0, 20, 30, 990]
+    # STR: 50 ticks of 10 ns in a frame, 50 means none; in ticks of 30 ns 17 does
+    stamps = np.array([[[3, 50]], [[49, 0]]], np.uint32)
+    first = Recording(replace(capture, modality="str"), layout, None, stamps, 1e-8)
+    assert np.asarray(first.on_ticks(3e-8).frames).tolist() == [[[1, 17]], [[16, 0]]]
+    bits = Recording(replace(capture, modality="qis"), layout, None, np.zeros((2, 1, 1), np.uint8))
+    assert bits.on_ticks(1e-8) is bits
 
 
 def test_a_free_level_is_found_and_a_known_mean_is_enough() -> None:

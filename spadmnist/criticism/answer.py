@@ -240,19 +240,21 @@ def _limit(entry: Mapping[str, Any]) -> str:
 
 def sentence(found: Diagnosis) -> str:
     """The verdict in words."""
+    settled = " and ".join(title(s.change) for s in found.steps)
+    if found.verdict == "adequate" and found.steps:
+        return f"{settled}: settled. No check failed before, and none fails now."
     if found.verdict == "adequate":
         return "nothing is missing that this measurement could show."
     if found.verdict == "setup":
         return "the set-up explains everything, the sensor nothing."
-    names = " and ".join(title(s.change) for s in found.steps)
     if found.verdict == "explained":
-        return f"{names} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
+        return f"{settled} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
     if found.verdict == "confused" and found.setup and not found.steps:
         return f"the set-up of {found.setup[0]['capture']}, or {NONLINEARITY}: it is the brightest capture."
     if found.verdict == "confused":
-        return f"{names}, or something that looks the same here."
+        return f"{settled}, or something that looks the same here."
     if found.verdict == "partly_explained":
-        return f"{names} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
+        return f"{settled} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
     return f"something is missing that no known effect explains: {mechanism(found.unexplained, found.dark)}."
 
 

@@ -22,11 +22,12 @@ from joblib import Parallel
 from scipy import stats
 
 from .. import units
+from ..errors import InputError
 from ..measurement import Measurement
 from ..recording import Capture
 from ..sensor import Sensor
 from ..statistics import Summary
-from .nulls import Judgement, Null, poisson_scores
+from .nulls import Judgement, Null
 from .recordings import REPLICATES, CaptureNull, model_of, reduced, statistics_for
 
 FALSE_ALARM = 0.01  # of the whole comparison, if the model is right
@@ -168,7 +169,7 @@ def compare(
                 total = float(recording.totals.sum())
             else:
                 total = (capture.mean or 0.0) * sensor.layout.pixels
-            seen = capture if recording is None else recording.capture
+            seen = capture if recording is None else replace(recording.capture, tick=recording.tick)
             shown = _Share(say, capture.id, k, len(captures), replicates)
             made = model_of(sensor, seen, total, seed, replicates, parallel, shown)
             checks += _level_checks(sensor, capture, total, made, levels)
@@ -208,6 +209,11 @@ def compare(
     nuisances, common = light_of(levels, captures)
     checks += common
     checks += _between_wavelengths(captures, checks, sensor.layout.columns)
+    if not checks:
+        raise InputError(
+            f"{measurement.source}: nothing here can be compared: of no capture are light and detections known. State "
+            "the light (irradiance or illuminance) of a capture, or name the file of one"
+        )
     checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
     # of means alone there are no statistics: their totals stand in
     squares = [x for x, _ in judged] or [c.misfit for c in checks if c.statistic == "rate"]
@@ -285,22 +291,23 @@ def _level_checks(
     levels: list[tuple[Capture, float, float, float]],
 ) -> list[Check]:
     """The total of a dark capture against the model's; that of a lit one becomes a light level."""
-    level, error, elasticity = made.level_of(max(total, 0.5))
-    if made.stated is None or elasticity <= LEAST_ELASTICITY:
+    if made.stated is None:
         return []
-    log = math.log(level / made.stated)
-    if not capture.light.dark:
-        levels.append((capture, log, error, elasticity))
+    lost = not capture.light.dark and made.drowned(total)
+    if not capture.light.dark and not lost:
+        level, error, elasticity = made.level_of(max(total, 0.5))
+        if elasticity > LEAST_ELASTICITY:
+            levels.append((capture, math.log(level / made.stated), error, elasticity))
         return []
-    # few detections are not normal: their score against the mean, wider by what they scatter more than chance has it
     mean = made.total_at(made.stated)
-    wider = max(1.0, error * elasticity * math.sqrt(max(mean, 1.0)))
-    z = float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider
+    light = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
+    z = made.score(total, light if lost else 0.0)
     per = sensor.layout.pixels * capture.conditions.exposure
     size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
     relative = (total - mean) / max(mean, 1.0)
     p = float(2 * stats.norm.sf(abs(z)))
-    return [Check("rate", capture.id, z * z, p, "all pixels, no light", size, relative)]
+    where = "all pixels, hardly any light" if lost else "all pixels, no light"
+    return [Check("rate", capture.id, z * z, p, where, size, relative)]
 
 
 def light_of(

@@ -97,7 +97,7 @@ def nuisances(bench: Bench, state: State) -> list[dict[str, Any]]:
         if seen.capture.light.dark or null.stated is None:
             continue
         level, error, elasticity = null.level_of(max(seen.total, 0.5))
-        if elasticity <= comparing.LEAST_ELASTICITY:
+        if elasticity <= comparing.LEAST_ELASTICITY or null.drowned(seen.total):
             continue  # no light level gives so few
         levels.append((seen.capture, math.log(level / null.stated), error, elasticity))
     found, _ = comparing.light_of(levels, [s.capture for s in bench.seen.values()])

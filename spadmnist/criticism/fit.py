@@ -18,7 +18,7 @@ from joblib import Parallel, delayed
 from scipy import ndimage
 
 from .. import twin
-from ..errors import SpadError
+from ..errors import EffectError, SpadError
 from ..heap import keep_freed_memory
 from ..measurement import Measurement
 from ..recording import Capture, Recording
@@ -44,6 +44,10 @@ _SURE_SQUARE = 30.0  # in variances, of what is never chance
 _BESIDE = 9  # powers beside one, of which most are no line
 FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
+
+
+class Fault(str):
+    """Why a model cannot be simulated: an effect's own code has failed."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class Seen:
             last = float(recording.events.times.max())
         waited = None if recording.waited is None else recording.waited[0]
         shortest = Shortest.of(recording)
-        return cls(recording.capture, float(counts.sum()), counts, summaries, last, waited, shortest)
+        capture = replace(recording.capture, tick=recording.tick)
+        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest)
 
 
 @dataclass
@@ -279,6 +284,8 @@ def _task(
                 sensor = recordings.InTheDark.of(sensor)
             for recording in recordings.simulated(sensor, capture, photons[some], numbers[some], seed):
                 take(recording)
+    except EffectError as error:
+        return Fault(error)
     except (SpadError, ValueError) as error:
         return str(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
@@ -519,6 +526,8 @@ class Bench:
         if self.seen[id].capture.light.dark:
             wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
             return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
+        if null.drowned(total):
+            return null.score(total)
         if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):
             return None
         scatter = null.scatter * math.sqrt(1 + 2 / len(null.totals))

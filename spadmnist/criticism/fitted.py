@@ -51,7 +51,7 @@ def fitted(
     with Parallel(n_jobs=jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = begun(bench)
-        start, before = course.state, course.misfit
+        start, before, wrong = course.state, course.misfit, bool(course.failed)
         say("settling " + ", ".join(title(change) for change in wanted))
         data = [measurement.recording(c.id, bench.start) for c in measurement.captures if c.mean is None]
         exact = likelihood.settled(bench.start, data, wanted) if len(data) == len(bench.seen) else "a mean alone"
@@ -61,11 +61,11 @@ def fitted(
         else:
             _by_likelihood(course, wanted, exact)
         widen(course)
-        left = course.failed
+        right = "explained" if wrong else "adequate"
         return Diagnosis(
             bench.start.name,
             measurement.name,
-            "partly_explained" if left else "explained",
+            "partly_explained" if course.failed else right,
             before,
             course.misfit,
             checks.usual_misfit(start),

@@ -18,10 +18,25 @@ from .candidates import Key
 Notes = Mapping[Key, str]
 
 
-def check_place(source: Path, out: Path) -> None:
-    """Raise InputError where the next sensor file would take the place of the one that it is made from."""
-    if out.exists() and source.exists() and out.samefile(source):
+_OURS = re.compile(r"# (.*; )?from .+, \d{4}-\d\d-\d\d(:|;|$)", re.MULTILINE)
+
+
+def check_place(source: Path, out: Path, ours: bool = False) -> None:
+    """Raise InputError where the next sensor file would take the place of one that was not made by `write`.
+
+    ours: is it known otherwise that what is there was?
+    """
+    if not out.exists():
+        return
+    if source.exists() and out.samefile(source):
         raise InputError(f"{out} is the sensor file itself, which stays as it is; name another folder or file with -o")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; name a file with -o, for example {out / 'next.yaml'}")
+    if not ours and not _OURS.search(disk.read_file(out, 1 << 24).decode(errors="replace")):
+        raise InputError(
+            f"{out} is there already and no sensor file that a fit or a diagnosis has written; it is left alone: name "
+            "another folder or file with -o"
+        )
 
 
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> Path:

@@ -25,13 +25,14 @@ from ..statistics import Statistic, Summary
 from ..streams import Streams
 from . import memory
 from .candidates import Key, with_values
-from .nulls import Null, learn
+from .nulls import Null, learn, poisson_scores
 
 REPLICATES = 96
 SPREAD = 3.0  # the light of the model's recordings varies by so many standard deviations of its uncertainty
 LEAST_SPREAD = 0.01
 _MUCH, _MOST_CHANCE = 0.05, 0.7  # of a logarithm, by which a level may seem another by chance
 _EVENTS_AT_ONCE = 4_000_000
+_DROWNED = 0.5  # of the elasticity at the stated level: where it is less, the light hardly shows
 _CLOSED = 5e-4  # relative error of the closed forms, at most
 
 
@@ -46,14 +47,16 @@ def simulated(
 ) -> Iterator[Recording]:
     """The capture as the model makes it, once for each of `numbers`, with so many photons/s (n,) on each pixel.
 
-    Yielded one by one; only a few of them are in memory together.
+    In the ticks of the measurement's file, whatever the sensor's own are, for all counting is in these. Yielded one by
+    one; only a few of them are in memory together.
     """
     expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
     step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
     for start in range(0, len(numbers), step):
         some = slice(start, start + step)
         streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
-        yield from twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
+        for one in twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True):
+            yield one if capture.tick is None else one.on_ticks(capture.tick)
 
 
 def whatever_phases(
@@ -134,10 +137,38 @@ class CaptureNull:
             middle = math.sqrt(low * high)
             low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
         found = math.sqrt(low * high)
+        elasticity = self.elasticity_at(found)
+        return found, self._scatter / max(elasticity, 1e-3), elasticity
+
+    def elasticity_at(self, level: float) -> float:
+        """By how many per cent the total rises where the level rises by one."""
         step = 1.01
-        elasticity = math.log(self.total_at(found * step) / self.total_at(found / step)) / (2 * math.log(step))
-        error = self.scatter * math.sqrt(1 + 2 / len(self.totals)) / max(elasticity, 1e-3)
-        return found, error, elasticity
+        return math.log(self.total_at(level * step) / self.total_at(level / step)) / (2 * math.log(step))
+
+    @property
+    def _scatter(self) -> float:
+        return self.scatter * math.sqrt(1 + 2 / len(self.totals))
+
+    def drowned(self, total: float) -> bool:
+        """Is the total so small that the light would hardly show in it, though it would at the level that is stated?
+
+        Then the level that gives as many says nothing: `score` does.
+        """
+        if self.stated is None or total >= self.total_at(self.stated):
+            return False
+        _, _, elasticity = self.level_of(max(total, 0.5))
+        return elasticity < _DROWNED * self.elasticity_at(self.stated)
+
+    def score(self, total: float, uncertainty: float = 0.0) -> float:
+        """Standard deviations between a total and the stated level's: few detections are not normal.
+
+        uncertainty: relative, of that level.
+        """
+        assert self.stated is not None
+        mean = self.total_at(self.stated)
+        level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
+        wider = max(1.0, math.hypot(self._scatter, level) * math.sqrt(max(mean, 1.0)))
+        return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider
 
 
 def law_of(totals: np.ndarray, told: np.ndarray) -> tuple[tuple[float, float], float]:
@@ -301,8 +332,8 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     level = stated if stated is not None else level_for(expected, total, None)
     mean = max(expected(level), 1e-9)
     share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
-    digits = total / sensor.layout.pixels
-    rounding = _last_digit(digits) / math.sqrt(12) / max(digits, 1e-9)
+    digits, usual = total / sensor.layout.pixels, mean / sensor.layout.pixels
+    rounding = _last_digit(digits) / math.sqrt(12) / max(digits, usual)
     scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)

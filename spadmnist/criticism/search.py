@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from .. import plugins
 from ..effects import Effect
-from ..errors import SpadError
+from ..errors import EffectError, SpadError
 from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
@@ -58,6 +59,28 @@ class Search:
         self.accepted: list[Change] = []
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[State, list[Line]] | None = None
+
+        self._untried: set[str] = set()
+        for name in Effect.registry:
+            plugged = plugins.is_from_file(Effect.registry.find(name)) and bench.start.effect(name) is None
+            if plugged and all(change.effect != name for change in changes(bench.start)):
+                self._not_tried(name, "none of its parameters says where to look for it; give one off= and search=")
+
+    def _not_tried(self, effect: str, why: str) -> None:
+        """Say of an effect, once, that it cannot be tried."""
+        if effect not in self._untried:
+            self._untried.add(effect)
+            self.say(f"not tried: {effect} ({why})")
+
+    @contextlib.contextmanager
+    def _if_possible(self, change: Change) -> Iterator[None]:
+        """Candidates that the sensor or the measurement does not allow are none; a fault of an effect is said."""
+        try:
+            yield
+        except EffectError as error:
+            self._not_tried(change.effect, str(error))
+        except SpadError:
+            pass
 
     # --- looking -------------------------------------------------------------------------------------------------
 
@@ -116,7 +139,7 @@ class Search:
         for change, tried in tries:
             if change.phases:
                 continue
-            with contextlib.suppress(SpadError):
+            with self._if_possible(change):
                 chips = change.kind == "add" and chancy(with_values(state.sensors.one, tried))
                 sensors = state.sensors.changed(tried, chips=chips)
                 still.append(Tried(change, tried, Moved({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
@@ -156,6 +179,9 @@ class Search:
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):
             other = downs.get(i)
             if isinstance(up, str) or isinstance(other, str):
+                for why in (up, other):
+                    if isinstance(why, fit.Fault):
+                        self._not_tried(one.change.effect, why)
                 continue
             one.moved = up if other is None else self.bench.both(state, up, other, few)
             out.append(one)
@@ -188,7 +214,7 @@ class Search:
         """Candidates by what the closed forms say of the totals: nothing else is wrong, nothing need be simulated."""
         out = []
         for change, tried in tries:
-            with contextlib.suppress(SpadError):
+            with self._if_possible(change):
                 one = Tried(change, tried, self.bench.told(state, state.sensors.changed(tried)), 0.0, 1.0)
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 out.append(self._by_exact_totals(state, one) if one.gain > _PROMISING else one)

@@ -6,6 +6,6 @@ page forbids the browser to fetch or run anything. The same answer gives the sam
 
 from ._comparison import comparison
 from ._diagnosis import diagnosis
-from ._frame import check_place
+from ._frame import FILES, check_place
 
-__all__ = ["check_place", "comparison", "diagnosis"]
+__all__ = ["FILES", "check_place", "comparison", "diagnosis"]
