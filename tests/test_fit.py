@@ -13,7 +13,7 @@ from joblib import Parallel
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
-from spadmnist.criticism import candidates, course, fit, fitted, likelihood, mapping, recordings, settling
+from spadmnist.criticism import answer, candidates, course, fit, fitted, likelihood, mapping, recordings, settling
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.recording import Capture, Light
@@ -303,6 +303,10 @@ def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     found = fitted.fitted(sensor, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0 and not found.values
     assert found.steps[0].significance == 0
+    # nothing was wrong, and nothing explained: it was settled
+    assert found.verdict == "adequate" and answer.sentence(found).endswith(
+        "No check failed before, and none fails now."
+    )
     blind = candidates.with_values(sensor, {("dead_time", "paralyzable"): True})
     found = fitted.fitted(blind, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0

@@ -16,6 +16,7 @@ import pytest
 import spadmnist
 from spadmnist import config, factory, plugins
 from spadmnist.effects import Effect
+from spadmnist.errors import EffectError
 from spadmnist.reconstruct import Method
 
 ROOT = Path(__file__).parents[1]
@@ -168,6 +169,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setattr(registry, "classes", dict(registry.classes))
     monkeypatch.setattr(plugins, "_loaded", dict(plugins._loaded))
     return tmp_path
+
+
+def test_a_file_that_defines_nothing_is_no_plugin(folder: Path) -> None:
+    (folder / "mine.py").write_text("x = 1\n")
+    for _ in range(2):
+        with pytest.raises(EffectError, match="defines no effect, statistic or method"):
+            plugins.load_file(folder / "mine.py")
 
 
 @pytest.mark.parametrize("name", EFFECTS)

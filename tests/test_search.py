@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken
 
+from spadmnist import plugins
 from spadmnist.criticism import chance, checks, recordings, refining, settling
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism.answer import Value
@@ -20,6 +21,7 @@ from spadmnist.criticism.fit import Bench, Moved, likelier
 from spadmnist.criticism.nulls import learn
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.tried import Tried
+from spadmnist.effects import Effect
 from spadmnist.recording import Capture, Light
 from spadmnist.statistics import Summary
 
@@ -369,6 +371,46 @@ def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     trace = {CELL: np.array([2.0]), OTHER: np.full(1000, 0.01)}
     assert likelier(now, there, trace) == pytest.approx(-8.0)  # type: ignore[arg-type]
     assert likelier(now, there) == pytest.approx(210.0 - 8.0)  # type: ignore[arg-type]
+
+
+BOOM = """from spadmnist import Effect, parameter
+
+
+class Boom(Effect, stage="light"):
+    "Fails."
+
+    share = parameter(0.1, "", "share", bounds=(0, 1), off=0.0, search=(0.01, 0.9))
+
+    def apply(self, rate, conditions):
+        raise ValueError("inside")
+
+
+class Nowhere(Effect, stage="light"):
+    "Nobody knows where to look."
+
+    share = parameter(0.1, "", "share", bounds=(0, 1), off=0.0)
+
+    def apply(self, rate, conditions):
+        return rate * (1 - self.share)
+"""
+
+
+def test_a_users_effect_that_cannot_be_tried_is_told(lab, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(Effect.registry, "classes", dict(Effect.registry.classes))
+    monkeypatch.setattr(plugins, "_loaded", dict(plugins._loaded))
+    file = tmp_path / "boom.py"
+    file.write_text(BOOM)
+    plugins.load_file(file)
+    bench = bench_of(lab())
+    state, said = bench.state({}), []
+    look = Search(bench, said.append)
+    assert said == ["not tried: nowhere (none of its parameters says where to look for it; give one off= and search=)"]
+    change = change_of(bench, "add boom")
+    for _ in range(2):
+        assert not look.looked_at(state, change, look.begun(state, change))
+    assert (
+        len(said) == 2 and said[1].startswith("not tried: boom (") and "boom.py:10: the effect boom failed" in said[1]
+    )
 
 
 def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> None:

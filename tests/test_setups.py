@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from spadmnist import config
+from spadmnist import cli, config
 from spadmnist import measurement as measurements
 from spadmnist.criticism import answer, compare, diagnose, next_sensor
 from spadmnist.errors import InputError
@@ -214,3 +215,33 @@ def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):
     with pytest.raises(InputError, match="stays as it is"):
         next_sensor.check_place(file, tmp_path / "." / "sensor.yaml")
     next_sensor.check_place(file, tmp_path / "next" / "sensor.yaml")
+
+
+def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
+    file = tmp_path / "sensor.yaml"
+    file.write_text(TR)
+    own = tmp_path / "own.yaml"
+    own.write_text(TR + "# my notes from the lab, 2024: 50 ns\n")
+    with pytest.raises(InputError, match="it is left alone"):
+        next_sensor.check_place(file, own)
+    next_sensor.check_place(file, own, ours=True)
+    with pytest.raises(InputError, match="is a folder"):
+        next_sensor.check_place(file, tmp_path)
+    key = ("dead_time", "duration")
+    made = next_sensor.write(file, tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"})
+    next_sensor.check_place(file, made)
+    next_sensor.check_place(file, tmp_path / "new.yaml")
+
+
+def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
+    data, answer = tmp_path / "flat.h5", tmp_path / "answer.json"
+    data.write_bytes(b"\x89HDF\r\n" * 100)
+    with pytest.raises(InputError, match="it is left alone"):
+        cli._check_answer(data)
+    with pytest.raises(InputError, match="is a folder"):
+        cli._check_answer(tmp_path)
+    answer.write_text('{\n "format": "spadmnist-diagnosis/1"}')
+    for free in (answer, tmp_path / "new.json", None):
+        cli._check_answer(free)
+    done = CliRunner().invoke(cli.cli, ["compare", str(tmp_path / "s.yaml"), str(tmp_path), "--json", str(data)])
+    assert done.exit_code != 0 and data.read_bytes().startswith(b"\x89HDF")
