@@ -236,18 +236,18 @@ def report(cases: list[Judged], made: int | None = None) -> str:
         "Z: the weakest hidden effect's expected significance for an oracle. "
         "Intervals: Wilson, 95 %. A case without an answer is no success, and none of the failures that a line counts.",
         "",
-        "| what | cases | share | 95 % | must | no answer |",
+        "| what | cases | share | 95 % | to reach | no answer |",
         "| --- | --- | --- | --- | --- | --- |",
-        line("nulls: false alarm (any verdict but adequate)", nulls, lambda c: c.detected, "<= 2.7 %", True),
+        line("nulls: false alarm (any verdict but adequate)", nulls, lambda c: c.detected, "<= 1 %", True),
     ]
     compared = [c for c in nulls if c.compared]
     alarms = sum(c.compared == "fails" for c in compared)
     out.append(row("nulls: false alarm of `compare`", alarms, len(compared), "1 %", len(nulls) - len(compared)))
     out.append(line("single, Z >= 10: detected", strong, lambda c: c.detected, ">= 98 %"))
-    out.append(line("single, Z >= 10: right effect first", strong, lambda c: c.first_right, ">= 90 %"))
+    out.append(line("single, Z >= 10: right effect first", strong, lambda c: c.first_right, ">= 97 %"))
     out.append(line("single, Z >= 10: right, or among at most 3 confused", strong, lambda c: c.class_right, ">= 98 %"))
-    bands = [("20 or more", 20, math.inf, ">= 90 %"), ("10-20", 10, 20, ">= 90 %"), ("6-10", 6, 10, ">= 80 %")]
-    bands += [("4-6", 4, 6, ">= 55 %"), ("3-4", 3, 4, ""), ("below 3", -1, 3, "")]
+    bands = [("20 or more", 20, math.inf, ">= 97 %"), ("10-20", 10, 20, ">= 97 %"), ("6-10", 6, 10, ">= 92 %")]
+    bands += [("4-6", 4, 6, ">= 75 %"), ("3-4", 3, 4, ""), ("below 3", -1, 3, "")]
     for name, low, high, must in bands:
         out.append(
             line(f"single, Z {name}: right effect first", of("single", low, high), lambda c: c.first_right, must)
@@ -265,13 +265,13 @@ def report(cases: list[Judged], made: int | None = None) -> str:
     limits = [above for c in of("single", -1, 3) for _, above in c.limits]
     out.append(row("single, Z below 3: upper limit above the truth", sum(limits), len(limits), ">= 93 %"))
     out.append(line("single: exact set of findings", singles, lambda c: c.exact, ""))
-    out.append(line("double: both found", doubles, lambda c: c.both, ">= 80 %"))
+    out.append(line("double: both found", doubles, lambda c: c.both, ">= 92 %"))
     out.append(line("double: exact set", doubles, lambda c: c.exact, ">= 65 %"))
-    out.append(line("outside the catalogue: flagged as unexplained", outside, lambda c: c.flagged, ">= 80 %"))
-    out.append(line("outside the catalogue: confidently wrong", outside, lambda c: c.confident_wrong, "<= 5 %", True))
-    out.append(line("set-up: said so, and where", setups, lambda c: c.setup_right, ">= 85 %"))
+    out.append(line("outside the catalogue: flagged as unexplained", outside, lambda c: c.flagged, ">= 95 %"))
+    out.append(line("outside the catalogue: confidently wrong", outside, lambda c: c.confident_wrong, "<= 1 %", True))
+    out.append(line("set-up: said so, and where", setups, lambda c: c.setup_right, ">= 95 %"))
     everything = [found for c in cases for found in c.found]
-    for exact, what, must in ((True, "by the catalogue's law", "90-98 %"), (False, "another law", "")):
+    for exact, what, must in ((True, "by the catalogue's law", "93-97 %"), (False, "another law", "")):
         covers = [found.covers for found in everything if found.exact is exact]
         out.append(row(f"95 % intervals that cover the truth, {what}", sum(covers), len(covers), must))
     compares = [c for c in cases if c.truth["class"] != "null" and c.z >= 10 and c.compared]
@@ -282,7 +282,7 @@ def report(cases: list[Judged], made: int | None = None) -> str:
         out.append(row(f"baseline, a rule sheet on `compare`: single, {name}: right effect", hits, len(ruled), ""))
     times = [c.seconds for c in cases if c.seconds is not None and c.verdict != "no answer"]
     if times:
-        out += ["", f"Time of `diagnose`: median {np.median(times):.0f} s, longest {max(times):.0f} s (must: 300 s)."]
+        out += ["", f"Time of `diagnose`: median {np.median(times):.0f} s, longest {max(times):.0f} s."]
 
     told, removed = unseen(nulls, strong, of("double"))
     out += ["", "## Error on unseen captures", "", *told]

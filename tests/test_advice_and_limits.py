@@ -70,7 +70,10 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     change = change_of(bench, f"add {name}")
     tried = look.looked_at(state, change, look.begun(state, change))
     assert tried and all(isinstance(t, Tried) for t in tried)
-    found, hidden = limits.upper_limits(look, state, tried)
+    found, hidden, others = limits.upper_limits(look, state, tried)
+    assert {"effect": "flicker"} in others and not {e["effect"] for e in others} & {
+        e["effect"] for e in [*found, *hidden]
+    }
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
     return limit, [chance.along(bench, state, t.moved).data for t in tried]
@@ -357,5 +360,5 @@ def test_of_several_strengths_the_clearest_tells_the_limit(lab, monkeypatch, ord
         return chance.Likeness(20.0 if moved is loud else 0.0, 0.0, np.zeros(16), 1.0, 15.0)
 
     monkeypatch.setattr(limits, "along", along)
-    (excluded,), hidden = limits.upper_limits(quiet(bench), state, tried[::order])
+    (excluded,), hidden, _ = limits.upper_limits(quiet(bench), state, tried[::order])
     assert not hidden and excluded["upper_limit_95"] == pytest.approx(1.645 / 20 * 5e-9, rel=1e-6)

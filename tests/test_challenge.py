@@ -365,7 +365,7 @@ def test_seals_detect_every_change(made: Path, capsys: pytest.CaptureFixture[str
     assert challenge.main(["score", str(made)]) == 0
     table = (made / "score.md").read_text()
     assert "0 of 8 cases, those asked so far" in table and "## No answer: 0" in table
-    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - | <= 2.7 % | 0 |" in table
+    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - | <= 1 % | 0 |" in table
 
 
 def truth_of(kind: str, name: str = "x", **more: Any) -> dict[str, Any]:
@@ -476,14 +476,14 @@ def test_the_table_counts_everything() -> None:
     text = scores.report(cases)
     for line in (
         "25 cases.",
-        "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % | <= 2.7 % | 0 |",
+        "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % | <= 1 % | 0 |",
         "| nulls: false alarm of `compare` | 1 of 20 | 5 % | 1-24 % | 1 % | 0 |",
         "| single, Z >= 10: detected | 1 of 1 | 100 % | 21-100 % | >= 98 % | 0 |",
-        "| single, Z 6-10: right effect first | 0 of 1 | 0 % | 0-79 % | >= 80 % | 0 |",
-        "| single, Z 4-6: right effect first | 0 of 1 | 0 % | 0-79 % | >= 55 % | 1 |",
+        "| single, Z 6-10: right effect first | 0 of 1 | 0 % | 0-79 % | >= 92 % | 0 |",
+        "| single, Z 4-6: right effect first | 0 of 1 | 0 % | 0-79 % | >= 75 % | 1 |",
         "| single, Z below 3: detected | 0 of 1 | 0 % | 0-79 % | <= 20 % | 0 |",
-        "| outside the catalogue: confidently wrong | 1 of 1 | 100 % | 21-100 % | <= 5 % | 0 |",
-        "| 95 % intervals that cover the truth, by the catalogue's law | 1 of 1 | 100 % | 21-100 % | 90-98 % | 0 |",
+        "| outside the catalogue: confidently wrong | 1 of 1 | 100 % | 21-100 % | <= 1 % | 0 |",
+        "| 95 % intervals that cover the truth, by the catalogue's law | 1 of 1 | 100 % | 21-100 % | 93-97 % | 0 |",
         "## Confident wrong answers: 3",
         "- null-x null-x (Z 0.0): explained, per_pixel detection.pdp; true: (null)",
         "## No answer: 1",

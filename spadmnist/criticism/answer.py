@@ -115,6 +115,7 @@ class Diagnosis:
     advice: list[dict[str, Any]]
     excluded: list[dict[str, Any]]
     invisible: list[dict[str, Any]] = field(default_factory=list)
+    unlimited: list[dict[str, Any]] = field(default_factory=list)  # effects of which neither is said
     traces: list[Trace] = field(default_factory=list, repr=False)
     values: dict[Key, Any] = field(default_factory=dict, repr=False)
     file: str | None = None
@@ -136,6 +137,7 @@ class Diagnosis:
             "advice": self.advice,
             "excluded": self.excluded,
             "not_identifiable": self.invisible,
+            "no_limit": self.unlimited,
             "sensor": self.file,
         }
 
@@ -221,6 +223,9 @@ def table(found: Diagnosis) -> str:
     if found.invisible:
         about = [e["effect"] for e in found.invisible]
         lines += textwrap.wrap(f"This measurement cannot show: {', '.join(about)}.", 100)
+    if found.unlimited:
+        about = [e["effect"] for e in found.unlimited]
+        lines += textwrap.wrap(f"Tried and not found, without a limit: {', '.join(about)}.", 100)
     return "\n".join(lines)
 
 

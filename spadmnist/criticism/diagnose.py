@@ -125,11 +125,12 @@ def _diagnosed(
         course.ladder.insert(1, beside.placebo)
     excluded: list[dict[str, Any]] = []
     invisible: list[dict[str, Any]] = []
+    unlimited: list[dict[str, Any]] = []
     if verdict == "adequate" or (verdict == "explained" and not quick):
         bench.say("what would have been seen")
         if beside.looked is not course.state:  # the last step was the last one allowed, or its numbers have moved
             beside.tried = course.search.scan(course.state, everywhere=True, known=beside.tried)
-        excluded, invisible = limits.upper_limits(course.search, course.state, beside.tried)
+        excluded, invisible, unlimited = limits.upper_limits(course.search, course.state, beside.tried)
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not course.steps)
     return Diagnosis(
         bench.start.name,
@@ -146,6 +147,7 @@ def _diagnosed(
         beside.advice,
         excluded,
         invisible,
+        unlimited,
         traces(bench, start, course.state),
         course.values,
         None,

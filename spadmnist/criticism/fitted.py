@@ -77,6 +77,7 @@ def fitted(
             [],
             [],
             [],
+            [],
             traces(bench, start, course.state),
             course.values,
             None,

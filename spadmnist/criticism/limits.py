@@ -8,6 +8,7 @@ from typing import Any
 
 from . import fit
 from .answer import plain
+from .candidates import changes
 from .chance import Likeness, along
 from .fit import Bench, Moved, State
 from .search import Search
@@ -23,8 +24,10 @@ _LOOKS = 5  # at other strengths, until that is found
 
 def upper_limits(
     search: Search, state: State, tried: Sequence[Tried]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here).
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
+    """(effects with the largest strength that may be there unseen, 95 %; effects that cannot be seen here; the others).
+
+    The others have directions or phases, and no limit is given for them.
 
     tried: every candidate as it was looked at in all captures. The weakest limit of its shapes: whatever the shape,
     more would have been seen. How the trace of each grows with its strength is simulated once more.
@@ -60,7 +63,8 @@ def upper_limits(
         else:
             far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
             excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
-    return excluded, [{"effect": name} for name in sorted(hidden)]
+    others = {one.effect for one in changes(state.sensors.one) if one.kind == "add"} - shapes.keys()
+    return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 
 def _seen_at(trace: Likeness) -> float:
