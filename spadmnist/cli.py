@@ -643,6 +643,8 @@ def compare(
             smallest = float(units.parse(tolerance, ""))
         except ValueError as error:
             raise InputError(f"--tolerance: {error}") from None
+        if not 0 < smallest < 1:
+            raise InputError(f'--tolerance: {tolerance} is not a share of more than 0 and less than 1, like "0.5 %"')
     model, data = configs.read_sensor(sensor), measurements.open(measurement)
     if output is not None:
         from . import pages

@@ -74,7 +74,7 @@ def read(path: Path) -> Document:
         with open(path, "rb") as file:
             raw = file.read(_MOST_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(f"{path}: no such file; name one that is there") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if len(raw) > _MOST_BYTES:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from joblib import Parallel
 from scipy import stats
 
+from ..effects import Effect
 from ..errors import InputError, did_you_mean
 from ..measurement import Measurement
 from ..sensor import Sensor
@@ -40,11 +41,10 @@ def fitted(
     Raises InputError where there is no such effect or parameter.
     """
     say = progress or (lambda what: None)
-    every = changes(sensor.settled())
     wanted = [
-        *(_named(every, "add", name, None) for name in add),
-        *(_named(every, "set", *_halves(name)) for name in free),
-        *(_named(every, "per_pixel", *_halves(name)) for name in per_pixel),
+        *(_named(sensor.settled(), "add", name, None) for name in add),
+        *(_named(sensor.settled(), "set", *_halves(name)) for name in free),
+        *(_named(sensor.settled(), "per_pixel", *_halves(name)) for name in per_pixel),
     ]
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
@@ -166,10 +166,15 @@ def _halves(name: str) -> tuple[str, str]:
     return effect, parameter
 
 
-def _named(every: Sequence[Change], kind: str, effect: str, parameter: str | None) -> Change:
+def _named(sensor: Sensor, kind: str, effect: str, parameter: str | None) -> Change:
+    every, listed = changes(sensor), sensor.effect(effect) is not None
     for change in every:
         if (change.kind, change.effect) == (kind, effect) and (kind == "add" or change.parameter == parameter):
             return change
     name = effect + (f".{parameter}" if parameter else "")
+    if kind == "add" and listed:
+        raise InputError(f"--add {name}: the sensor lists it already; settle its numbers, --free {effect}.PARAMETER")
+    if kind == "set" and not listed and effect in Effect.registry:
+        raise InputError(f"--free {name}: the sensor does not list {effect}; --add {effect} adds it and settles it")
     able = sorted({c.effect + (f".{c.parameter}" if c.parameter else "") for c in every if c.kind == kind})
     raise InputError(f"{name} cannot be settled here; those that can: {', '.join(able)}.{did_you_mean(name, able)}")
