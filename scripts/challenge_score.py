@@ -171,11 +171,18 @@ def judged(truth: dict[str, Any], told: dict[str, Any], seconds: float | None = 
                 found = (step.get("values") or {}).get(parameter)
                 if step["effect"] == effect and label(step) in right and found and found.get("low") is not None:
                     covers = found["low"] <= value <= found["high"]
-                    deviation = max((found["high"] - found["low"]) / (2 * 1.959964), 1e-300)
-                    case.found.append(Found(name, covers, (found["value"] - value) / deviation, exact))
+                    case.found.append(Found(name, covers, pull_of(found, value), exact))
             if effect in right and name in limits:
                 case.limits.append((name, abs(value) <= limits[name]))
     return case
+
+
+def pull_of(found: dict[str, Any], truth: float) -> float:
+    """(value - truth) / standard deviation; of a whole number of which no other is left, 0 or infinite."""
+    apart, deviation = found["value"] - truth, (found["high"] - found["low"]) / (2 * 1.959964)
+    if deviation > 0:
+        return float(apart / deviation)
+    return math.copysign(math.inf, apart) if apart else 0.0
 
 
 def errors(start: dict[str, Any], found: dict[str, Any] | None) -> tuple[float | None, float | None]:

@@ -460,6 +460,12 @@ def test_doubles_unknowns_and_set_up_are_judged() -> None:
     assert judge(truth_of("null", z=[]), answer("setup", setup=[])).confident_wrong
 
 
+def test_a_pull_of_a_number_of_which_no_other_is_left_is_no_long_figure() -> None:
+    wide, sure = {"value": 5.0, "low": 3.0, "high": 7.0}, {"value": 5.0, "low": 5.0, "high": 5.0}
+    assert scores.pull_of(wide, 4.0) == pytest.approx(0.98, abs=0.001)
+    assert [scores.pull_of(sure, x) for x in (4.0, 5.0, 6.0)] == [math.inf, 0.0, -math.inf]
+
+
 def test_the_table_counts_everything() -> None:
     single = truth_of("single", "single-a", truth=[CROSSTALK], parameters={"crosstalk.probability": 0.005})
     told = answer("explained", ADD)
