@@ -162,3 +162,8 @@ def show(value: float, unit: str, digits: int = 4) -> str:
         if abs(value) / factor >= 1 - 1e-9:
             best = (name, factor)
     return f"{value / best[1]:.{digits}g} {best[0]}"
+
+
+def factor(value: float) -> str:
+    """A factor for people: 1.0203, 0.00041."""
+    return f"{value:.4f}" if value == 0 or abs(value) >= 0.01 else f"{value:.2g}"

@@ -236,3 +236,7 @@ def test_show(value: float, unit: str, text: str) -> None:
 @given(st.sampled_from(DIMENSIONS), st.floats(1e-11, 1e9))
 def test_what_is_shown_can_be_read(unit: str, value: float) -> None:
     assert units.parse(units.show(value, unit, 17), unit) == pytest.approx(value, rel=1e-15)
+
+
+def test_a_factor_of_little_is_not_nothing() -> None:
+    assert [units.factor(x) for x in (1.02031, 0.0, 0.00041, 12.5)] == ["1.0203", "0.0000", "0.00041", "12.5000"]

@@ -191,8 +191,8 @@ def table(found: Diagnosis) -> str:
         where = entry["capture"] or "all"
         either = " (or)" if entry["confused"] else ""
         lines.append(
-            f"set-up{either}: {entry['quantity']} of {where} x {f['value']:.4f} "
-            f"(95 %: {f['low']:.4f} to {f['high']:.4f})"
+            f"set-up{either}: {entry['quantity']} of {where} x {units.factor(f['value'])} "
+            f"(95 %: {units.factor(f['low'])} to {units.factor(f['high'])})"
         )
     if found.steps or found.setup:
         lines.append("")

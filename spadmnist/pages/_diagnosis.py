@@ -411,8 +411,8 @@ in physical units.</p>
 <tbody>
 {% for entry in found.setup %}
 <tr><td>{{ entry.capture or "all" }}</td><td>{{ "or " if entry.confused }}{{ entry.quantity }}</td>\
-<td class="figure"><b>{{ "%.4f" | format(entry.factor.value) }}</b></td>\
-<td class="figure">{{ "%.4f" | format(entry.factor.low) }} to {{ "%.4f" | format(entry.factor.high) }}</td></tr>
+<td class="figure"><b>{{ entry.factor.value | factor }}</b></td>\
+<td class="figure">{{ entry.factor.low | factor }} to {{ entry.factor.high | factor }}</td></tr>
 {% endfor %}
 </tbody></table></div>
 {% if found.setup | selectattr("confused") | list %}

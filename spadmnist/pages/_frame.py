@@ -9,7 +9,7 @@ from typing import Any
 
 import jinja2
 
-from .. import dataset, disk
+from .. import dataset, disk, units
 from ..errors import SpadError
 from ..statistics import Statistic
 
@@ -40,7 +40,13 @@ def write(folder: Path, kind: str, template: str, words: dict[str, Any]) -> Path
         lstrip_blocks=True,
         loader=jinja2.DictLoader({"frame": _FRAME, "page": template}),
     )
-    environment.filters |= {"number": number, "p": p_value, "p_words": p_in_words, "percent": percent}
+    environment.filters |= {
+        "factor": units.factor,
+        "number": number,
+        "p": p_value,
+        "p_words": p_in_words,
+        "percent": percent,
+    }
     version = importlib.metadata.version("spadmnist")
     text = environment.get_template("page").render(mark=_mark(kind), version=version, **words)
     page = Path(folder) / FILES[kind]
