@@ -192,7 +192,7 @@ def on_setup(bench: Bench, state: State, entries: Sequence[Mapping[str, Any]]) -
     )
     other = others[-1] if others and capture.modality != "tr" else 4 * own
     name = "exposure" if capture.modality == "tr" else "frame time"
-    words = f"the light of {id} with another {name}, of {units.show(other, 's', 3)}"
+    words = f"the light of {id} with a different {name} of {units.show(other, 's', 3)}"
     # a light level is the same then; so much too long an exposure counts for less or for more
     then = log * abs(1 - own / other) / bench.level_error(state, id)
     return [_told(words, ["light", "exposure"], 0.0, then)]
