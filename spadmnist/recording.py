@@ -24,6 +24,10 @@ T = TypeVar("T")
 MODALITIES = ("tr", "str", "qis", "counts")
 _FEW_TICKS = 64  # between the first stamp and the last: a rate changes within one
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
+_BLOCKS = (16, 8, 4)  # of time, of which every other one makes half a capture: as many as lose no more than this
+_LOSS = 0.1
+# In ticks: after it every period of a converter's clock that is looked for begins anew.
+COMMON_PERIOD = 2**8 * 3 * 5**3 * 7
 
 
 @dataclass(frozen=True)
@@ -211,14 +215,82 @@ class Recording:
         whole = np.where(stamps == self.none, none, _whole(stamps * (self.tick / tick), none - 1))
         return replace(self, frames=whole.astype(unsigned_for(none, "time stamps")), tick=tick, _kept={})
 
+    def every_other(self, second: bool) -> Recording | None:
+        """Every other block of time, one after the other, as a capture half as long; None where it is too short.
+
+        Of up to 16 blocks the first and all odd ones, or (`second`) the even ones. A block has whole ticks, and whole
+        periods of the converter's clock where that does not leave much of the capture's end to neither.
+        """
+        c = self.conditions
+        if self.frames is not None:
+            blocks = min(_BLOCKS[0], self.n_frames) // 2 * 2
+            if not blocks:
+                return None
+            frames = _EveryOther(self.frames, self.n_frames // blocks, blocks // 2, second)
+            share = c.frames // self.n_frames * frames.shape[0]  # of which each count frame is a sum
+            half = replace(c, frames=share, exposure=share * c.frame_period)
+            return replace(self, capture=replace(self.capture, conditions=half), frames=frames, _kept={})
+        assert self.events is not None
+        stamps: np.ndarray = self.events.times if self.events.ticks is None else self.events.ticks
+        blocks, length = _BLOCKS[0], c.exposure / _BLOCKS[0]
+        if self.events.ticks is not None:
+            assert self.tick is not None
+            blocks, length = _in_ticks(c.exposure / self.tick)
+        if not length:
+            return None
+        block = stamps // length
+        kept = (block % 2 == second) & (block < blocks)
+        some = self.events.keep(kept)
+        number = block[kept] // 2
+        shift = ((number + second) * length).astype(stamps.dtype)
+        end = blocks // 2 * length * (1.0 if self.events.ticks is None else float(self.tick or 1.0))
+        moved = stamps[kept] - shift
+        if self.events.ticks is None:
+            events = Events(moved, some.offsets, self.pixels, end=end)
+        else:
+            events = Events(None, some.offsets, self.pixels, moved, self.tick, end=end)
+        half = replace(c, exposure=end, frame_time=end, frame_period=end)
+        return replace(self, capture=replace(self.capture, conditions=half), events=events, _kept={})
+
     def watched(self, read: Callable[[float], None]) -> Recording:
         """The same data; `read` is told which share of the frames is read, each time."""
         return self if self.frames is None else replace(self, frames=_Watched(self.frames, read))
 
 
+def _in_ticks(exposure: float) -> tuple[int, int]:
+    """(blocks, length of each, in ticks)."""
+    for blocks in _BLOCKS:
+        length = int(exposure / blocks) // COMMON_PERIOD * COMMON_PERIOD
+        if length * blocks > (1 - _LOSS) * exposure:
+            return blocks, length
+    return _BLOCKS[0], int(exposure / _BLOCKS[0])
+
+
 def _whole(stamps: np.ndarray, last: int) -> np.ndarray:
     """Stamps rounded down to whole ticks: what a product of two numbers lacks of one is none."""
     return np.minimum(np.floor(stamps + 1e-6), last)
+
+
+@dataclass(frozen=True)
+class _EveryOther:
+    """Of each two blocks of `length` frames one, `blocks` in all."""
+
+    frames: FrameSource
+    length: int
+    blocks: int
+    second: bool
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.length * self.blocks, *self.frames.shape[1:])
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        numbers = np.arange(*part.indices(self.shape[0]))
+        if not len(numbers):
+            return np.asarray(self.frames[0:0])
+        whole = numbers + (numbers // self.length + self.second) * self.length
+        first = int(whole.min())
+        return np.asarray(self.frames[first : int(whole.max()) + 1])[whole - first]
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
     course_of.drop_needless(course)
     assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
     assert [c.name for c in course.search.accepted] == ["add crosstalk"]
-    assert course.ladder[-1]["model"] == "- afterpulsing"
+    assert course.ladder[-1].model == "- afterpulsing"
 
 
 def test_a_step_that_is_needed_stays(lab):
@@ -137,7 +137,7 @@ def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, 
     wanted = ["per_pixel dark_counts.rate", "add crosstalk"]
     assert names(course) == (wanted if stays else wanted[1:]) and not course.failed
     assert [c.name for c in course.search.accepted] == names(course)
-    assert (course.ladder[-1]["model"] == "- dark_counts.rate per pixel") is not stays
+    assert (course.ladder[-1].model == "- dark_counts.rate per pixel") is not stays
 
 
 def with_residuals(state: fit.State, sizes: dict[str, float]) -> fit.State:

@@ -168,7 +168,7 @@ def test_the_misfit_is_that_of_a_diagnosis() -> None:
     bench = fit.Bench(sensor(), data, 0, Parallel(n_jobs=1), 48)
     state = bench.state({})
     of_checks = {(c.capture, c.statistic): c.misfit for c in found.checks}
-    said = checks.misfits(state, state.residuals)
+    said = checks.misfits(state.own, state.residuals)
     fanos = {cell for cell in said if cell[1].endswith("fano")}
     assert fanos <= of_checks.keys() and max(said[cell] for cell in fanos) > 3
     for cell in fanos:

@@ -137,7 +137,7 @@ def test_a_map_goes_unless_a_check_fails_without_it(lab, monkeypatch, without: i
     course_of.drop_needless(course)
     assert course.steps == ([map_, last] if kept else [last])
     assert course.search.accepted == [step.change for step in course.steps]
-    assert (course.ladder[-1]["model"] == "start") == kept
+    assert (course.ladder[-1].model == "start") == kept
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
 from spadmnist.criticism import answer, chance, diagnose, findings, fit, likelihood, mapping, settling
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism.answer import Step, plain
+from spadmnist.criticism.answer import Step
 from spadmnist.criticism.fit import RATES, Moved, State
 from spadmnist.criticism.lines import Line
 from spadmnist.criticism.search import gain_beside
@@ -389,7 +389,7 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     (step,), state = course.steps, course.state
     step.alternatives = [{"confused": rival}]
     course.rung("+ another dead time")
-    rows = list(course.ladder)
+    rows = [rung.row for rung in course.ladder]
     usual, settled = dict(step.values), course.values[DURATION]
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(course_of.Course, "failed", property(lambda self: [] if self.state is state else [check]))
@@ -400,5 +400,5 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     assert (step.values == usual) == rival
     assert course.values[DURATION] == (settled if rival else 50e-9) and settled != 50e-9
     course.last_rung()  # and the ladder ends with the model as it is now
-    assert (course.ladder == rows) == rival and len(course.ladder) == len(rows)
-    assert course.ladder[-1]["model"] == "+ another dead time" and course.ladder[-1]["misfit"] == plain(course.misfit)
+    assert ([rung.row for rung in course.ladder] == rows) == rival and len(course.ladder) == len(rows)
+    assert course.ladder[-1].model == "+ another dead time" and course.ladder[-1].misfit == course.misfit

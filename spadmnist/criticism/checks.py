@@ -12,27 +12,30 @@ from . import compare as comparing
 from .fit import RATES, Bench, Cell, State
 
 
-def misfits(state: State, residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
-    """Mean squared residual of each block, 1 being the model's own."""
+def misfits(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+    """Mean squared residual of each block, 1 being the model's own. own: (recordings, cells) residuals of these."""
     return {
-        cell: float(np.mean(z**2)) / max(float(np.mean(state.own[cell] ** 2)), 0.05)
+        cell: float(np.mean(z**2)) / max(float(np.mean(own[cell] ** 2)), 0.05)
         for cell, z in residuals.items()
         if cell != RATES and len(z)
     }
 
 
-def misfit(state: State, residuals: Mapping[Cell, np.ndarray]) -> float:
+def misfit(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
     """Mean over the blocks; where only means were measured, of their totals."""
-    all_ = list(misfits(state, residuals).values())
+    all_ = list(misfits(own, residuals).values())
     if not all_ and len(residuals[RATES]):
         return float(np.mean(residuals[RATES] ** 2))
     return float(np.mean(all_)) if all_ else 1.0
 
 
-def usual_misfit(state: State) -> float:
-    """Below it are 95 % of the model's own recordings."""
-    own = [np.mean(z**2, axis=1) for cell, z in state.own.items() if cell != RATES]
-    return float(np.quantile(np.mean([o / max(o.mean(), 1e-30) for o in own], axis=0), 0.95)) if own else 1.2
+def usual_misfit(own: Mapping[Cell, np.ndarray]) -> float:
+    """Below it are 95 % of the model's own recordings: of as many as there are of every capture."""
+    squares = [np.mean(z**2, axis=1) for cell, z in own.items() if cell != RATES]
+    if not squares:
+        return 1.2
+    n = min(map(len, squares))
+    return float(np.quantile(np.mean([x[:n] / max(x[:n].mean(), 1e-30) for x in squares], axis=0), 0.95))
 
 
 @dataclass(frozen=True)

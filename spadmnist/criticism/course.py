@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
 from .fit import RATES, Bench, Cell, Sensors, State, square
-from .ladder import errors_of, row
+from .ladder import Mapped, Rung, errors_of
 from .refining import EXCLUDED, UNSEEN
 from .search import Search
 from .settling import Settled
@@ -47,7 +47,7 @@ class Course:
     state: State
     values: dict[Key, Any]
     steps: list[Step]
-    ladder: list[dict[str, Any]]
+    ladder: list[Rung]
     settled: Settled | None = None  # the numbers of all steps, with how the cells follow them
 
     @property
@@ -65,7 +65,7 @@ class Course:
     @property
     def misfit(self) -> float:
         """On captures that the numbers were not settled with, as far as there are any; 1 is noise."""
-        return checks.misfit(self.state, self.judged)
+        return checks.misfit(self.state.own, self.judged)
 
     def kept(self) -> tuple[Any, ...]:
         """All that a step changes."""
@@ -77,14 +77,20 @@ class Course:
         self.state, self.values, self.steps, self.ladder, self.settled = kept[:5]
         self.search.accepted, self.search.phases = kept[5:]
 
-    def rung(self, name: str) -> None:
-        """A row more in the ladder of errors: the model as it is now."""
-        errors = errors_of(self.bench, self.state, self.judged)
-        self.ladder.append(row(name, self.misfit, errors))
+    def rung(self, name: str, steps: Sequence[Step] = ()) -> None:
+        """A row more in the ladder of errors: the model as it is now. steps: those that it adds."""
+        left = self.judged
+        errors = errors_of(self.bench, self.state, left)
+        misfit = checks.misfit(self.state.own, left)
+        held = [c for c in self.search.accepted if c.carrier]
+        chips = any(step.chips for step in self.steps)
+        maps = Mapped(dict(self.values), held, dict(self.search.phases), chips) if held else None
+        self.ladder.append(Rung(name, self.state, misfit, errors, left, self.settled, list(steps), maps))
 
     def last_rung(self) -> None:
         """The last row anew: a closer look or the likelihood may have changed what it says."""
-        self.rung(self.ladder.pop()["model"])
+        last = self.ladder.pop()
+        self.rung(last.model, last.steps)
 
 
 def begun(bench: Bench) -> Course:
@@ -131,9 +137,7 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
     # a model that has been simulated has the earlier numbers where they were simulated, a last step short of settled
     course.values = {**(course.values if known is None else before.values), **best.values}
     settle_all(course, best.settled, known)
-    for step in new:
-        step.misfit = course.misfit
-    course.rung("+ " + " + ".join(title(step.change) for step in new))
+    course.rung("+ " + " + ".join(title(step.change) for step in new), new)
     return new
 
 
@@ -458,7 +462,7 @@ def drop_mimics(course: Course, start: State, totals: bool) -> None:
         # what one step leaves another one cannot explain: the worst goes first, and the others are looked at again
         left = {id(s): _left_of_own(s, course.state, totals) for s in course.steps}
         worst = max(course.steps, key=lambda s: left[id(s)])
-        now, then = (checks.misfit(state, state.residuals) for state in (course.state, start))
+        now, then = (checks.misfit(state.own, state.residuals) for state in (course.state, start))
         mostly = len(course.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
         kept = [s for s in course.steps if s is not worst or left[id(s)] < 1 or mostly]
         if now > then:

@@ -18,7 +18,7 @@ from joblib import Parallel
 from ..effects import Mimic
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import advice, chance, checks, limits, recordings, setups
+from . import advice, blocks, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
 from .course import (
@@ -35,7 +35,7 @@ from .course import (
 )
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State, square
-from .ladder import placebo_row
+from .ladder import Rung, placebo_of
 from .refining import refine, state_of
 from .search import alike, gain_beside
 from .tried import Tried, at_end
@@ -85,7 +85,7 @@ class _Beside:
     bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Tried | None = None
-    placebo: dict[str, Any] | None = None
+    placebo: Rung | None = None
     tried: list[Tried] = field(default_factory=list)
     looked: State | None = None
 
@@ -113,6 +113,9 @@ def _diagnosed(
     if not course.steps:
         course.state, course.settled, course.values = start, None, {}
         course.ladder = course.ladder[:1] if verdict != "unexplained" else course.ladder
+    rungs = [course.ladder[0], *([beside.placebo] if beside.placebo else []), *course.ladder[1:]]
+    usual = blocks.measure(bench, rungs)
+    after = (course.ladder[-1] if course.steps else course.ladder[0]).misfit
     if verdict == "explained":
         verdict = _or_confused(course, beside)
     if beside.rival is not None:
@@ -121,8 +124,6 @@ def _diagnosed(
         for other in step.alternatives:
             other.pop("confused", None)
             other.pop("tried", None)
-    if beside.placebo:
-        course.ladder.insert(1, beside.placebo)
     excluded: list[dict[str, Any]] = []
     invisible: list[dict[str, Any]] = []
     unlimited: list[dict[str, Any]] = []
@@ -136,14 +137,14 @@ def _diagnosed(
         bench.start.name,
         measurement.name,
         verdict,
-        checks.misfit(start, start.residuals),
-        course.misfit,
-        checks.usual_misfit(start),
+        rungs[0].misfit,
+        after,
+        usual,
         nuisances(bench, course.state),
         course.steps,
         beside.setup,
         remainder(bench, course.state, course.state.residuals) if remains else [],
-        course.ladder,
+        [rung.row for rung in rungs],
         beside.advice,
         excluded,
         invisible,
@@ -234,7 +235,7 @@ def _added(
         refined, second = refined + unseen, second + unseen
     new[0].alternatives = _alternatives(bench, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
-    beside.placebo = beside.placebo or placebo_row(bench, before, beside.tried, best, named)
+    beside.placebo = beside.placebo or placebo_of(bench, before, beside.tried, best, named)
     if not failed and course.failed and _few(course):
         course.state = _closer(course)  # as close as the model without it was looked at
     if not failed and course.failed:
@@ -299,7 +300,7 @@ def _or_confused(course: Course, beside: _Beside) -> str:
         unlisted = mimicked(step)
         if unlisted is not None:
             verdict = "confused"
-            step.alternatives.insert(0, _outside(unlisted, course.misfit))
+            step.alternatives.insert(0, _outside(unlisted, course.ladder[-1].misfit))
             beside.advice.append(advice.on_mimic(step, unlisted))
     return verdict
 
@@ -345,7 +346,7 @@ def _rival_step(course: Course, rival: Tried) -> Step:
     dial = rival.change.strengths[0]
     low, high = rival.intervals.get(dial.key, (None, None))
     value = Value(float(rival.values[dial.key]), low, high, dial.unit)
-    left = checks.misfit(course.state, rival.residuals or course.state.residuals)
+    left = checks.misfit(course.state.own, rival.residuals or course.state.residuals)
     return Step(rival.change, {dial.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike")
 
 
@@ -379,7 +380,7 @@ def _alternatives(
                 "change": one.change.kind,
                 "effect": one.change.effect,
                 "parameter": one.change.parameter,
-                "misfit": plain(checks.misfit(state, residuals)),
+                "misfit": plain(checks.misfit(state.own, residuals)),
                 "confused": as_good,
                 "tried": one,
             }

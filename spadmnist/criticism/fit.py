@@ -7,6 +7,7 @@ scatter, and what is left of it is added to that of the cells.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -46,6 +47,11 @@ FEW = 4  # recordings that tell the difference between two models
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
 
+def halves_of(id: str) -> tuple[str, str]:
+    """What the halves of a capture are called (`Bench.halves`)."""
+    return f"{id}, odd blocks", f"{id}, even blocks"
+
+
 class Fault(str):
     """Why a model cannot be simulated: an effect's own code has failed."""
 
@@ -55,7 +61,8 @@ class Seen:
     """A capture as it was measured: its detections, of each pixel, and its summaries.
 
     counts: None where the mean alone is known. last: s, of the last detection that has a stamp of its own. waited:
-    (pixels,) of first stamps, frames' worth of time before them. shortest: of time stamps.
+    (pixels,) of first stamps, frames' worth of time before them. shortest: of time stamps. half_of: the capture that
+    this is every other block of time of, and is it the second ones? None where it is all of one.
     """
 
     capture: Capture
@@ -65,6 +72,7 @@ class Seen:
     last: float | None = None
     waited: np.ndarray | None = None
     shortest: Shortest | None = None
+    half_of: tuple[Capture, bool] | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Seen:
@@ -227,6 +235,16 @@ class Sensors:
         """One sensor for every recording of every capture."""
         return Sensors(lambda capture, number: sensor, sensor)
 
+    def under(self, name_of: Callable[[str], str]) -> Sensors:
+        """The same sensors for captures that have other names. name_of: other name -> capture."""
+        typical = self.typical
+        return Sensors(
+            lambda capture, number: self.of(name_of(capture), number),
+            self.one,
+            self.alike,
+            None if typical is None else lambda capture: typical(name_of(capture)),
+        )
+
     def changed(
         self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None, chips: bool = False
     ) -> Sensors:
@@ -258,10 +276,11 @@ def _task(
     seed: int,
     dead: float,
     hasty: bool = False,
+    second: bool | None = None,
 ) -> Made | str:
     """Recordings of one capture, reduced: the task of a worker. models: one for all, or one for each.
 
-    hasty: without statistics that cost much.
+    hasty: without statistics that cost much. second: of every other block of time alone, of the second ones or not.
     """
     keep_freed_memory()
     totals: list[int] = []
@@ -269,6 +288,10 @@ def _task(
     known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
 
     def take(recording: Recording) -> None:
+        if second is not None:
+            half = recording.every_other(second)
+            assert half is not None  # for the measurement's is there
+            recording = half
         recording = recording.beside(dead)
         totals.append(int(recording.totals.sum()))
         for statistic in known:
@@ -318,17 +341,38 @@ class Bench:
         self.start = sensor.settled()
         self.seed, self.parallel, self.replicates, self.say = seed, parallel, replicates, say
         self.dead = self.start.nominal_dead_time
+        self.measurement, self.exposures = measurement, dict(exposures or {})
         self.seen: dict[str, Seen] = {}
         self.simulations = 0
         for capture in measurement.captures:
             if capture.mean is not None:
                 self.seen[capture.id] = Seen(capture, capture.mean * sensor.layout.pixels, None, {})
-                continue
-            recording = measurement.recording(capture.id, self.start)
-            if exposures and capture.id in exposures:
-                conditions = replace(recording.conditions, exposure=exposures[capture.id])
-                recording = replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
-            self.seen[capture.id] = Seen.of(recording)
+            else:
+                self.seen[capture.id] = Seen.of(self.recording(capture.id))
+
+    def recording(self, id: str) -> Recording:
+        """The data of a capture, as long as they are."""
+        recording = self.measurement.recording(id, self.start)
+        if id not in self.exposures:
+            return recording
+        conditions = replace(recording.conditions, exposure=self.exposures[id])
+        return replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
+
+    def halves(self, ids: Collection[str]) -> Bench:
+        """Some captures alone, each as two: its first, third, ... block of time and its second, fourth, ... one.
+
+        Their names are those of `halves_of`. Captures that are too short are not among them.
+        """
+        other = copy.copy(self)
+        other.seen = {}
+        for id in (id for id in self.seen if id in ids and self.seen[id].counts is not None):
+            whole = self.recording(id)
+            parts = [whole.every_other(second) for second in (False, True)]
+            for name, part, second in zip(halves_of(id), parts, (False, True), strict=True):
+                if part is not None:
+                    seen = Seen.of(part)
+                    other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
+        return other
 
     @property
     def dark(self) -> list[str]:
@@ -352,7 +396,8 @@ class Bench:
                     models = [recordings.Packed.of(sensors.of(id, 0))]
                 else:
                     models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
-                tasks.append((models, self.seen[id].capture, photons[part], numbers[part], self.seed, self.dead, hasty))
+                capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
+                tasks.append((models, capture, photons[part], numbers[part], self.seed, self.dead, hasty, second))
         self.simulations += sum(len(n) for _, _, _, n in wanted)
         results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
         out: list[Made | str] = []

@@ -13,7 +13,7 @@ from ..effects import Effect
 from ..errors import InputError, did_you_mean
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import checks, fit, likelihood, mapping, recordings, settling
+from . import blocks, fit, likelihood, mapping, recordings, settling
 from .answer import Diagnosis, Step, Value, title
 from .candidates import Change, Key, changes
 from .chance import LEAST_P, of_map
@@ -51,7 +51,7 @@ def fitted(
     with Parallel(n_jobs=jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = begun(bench)
-        start, before, wrong = course.state, course.misfit, bool(course.failed)
+        start, wrong = course.state, bool(course.failed)
         say("settling " + ", ".join(title(change) for change in wanted))
         data = [measurement.recording(c.id, bench.start) for c in measurement.captures if c.mean is None]
         exact = likelihood.settled(bench.start, data, wanted) if len(data) == len(bench.seen) else "a mean alone"
@@ -61,19 +61,20 @@ def fitted(
         else:
             _by_likelihood(course, wanted, exact)
         widen(course)
+        usual = blocks.measure(bench, course.ladder)
         right = "explained" if wrong else "adequate"
         return Diagnosis(
             bench.start.name,
             measurement.name,
             "partly_explained" if course.failed else right,
-            before,
-            course.misfit,
-            checks.usual_misfit(start),
+            course.ladder[0].misfit,
+            course.ladder[-1].misfit,
+            usual,
             nuisances(bench, course.state),
             course.steps,
             [],
             remainder(bench, course.state, course.state.residuals),
-            course.ladder,
+            [rung.row for rung in course.ladder],
             [],
             [],
             [],
@@ -101,9 +102,8 @@ def _by_likelihood(course: Course, wanted: Sequence[Change], exact: likelihood.E
     course.values = {**course.values, **exact.values}
     settle_all(course)
     for step in course.steps:
-        step.misfit = course.misfit
         step.values = {name: replace(v, method="likelihood") for name, v in step.values.items()}
-    course.rung("+ " + " + ".join(title(change) for change in wanted))
+    course.rung("+ " + " + ".join(title(change) for change in wanted), course.steps)
 
 
 def _by_simulation(course: Course, wanted: Sequence[Change]) -> None:
@@ -148,7 +148,7 @@ def _kept(course: Course, change: Change) -> None:
     for (effect, name), _ in change.fixed:
         told[name] = Value(float(getattr(course.bench.start.effect(effect), name)), None, None)
     course.steps.append(Step(change, told, course.misfit, 0.0, "mean rate +0.00%"))
-    course.rung(f"{title(change)} as it was")
+    course.rung(f"{title(change)} as it was", course.steps[-1:])
 
 
 def _started(course: Course, change: Change) -> Tried:

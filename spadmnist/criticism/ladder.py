@@ -4,21 +4,53 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from . import checks
-from .answer import plain, title
+from .answer import Step, plain, title
+from .candidates import Change, Key
 from .fit import RATES, Bench, Cell, Moved, State
-from .tried import Tried
+from .settling import Settled
+from .tried import Phases, Tried
 
 _CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model
 
 
-def row(model: str, misfit: float, errors: dict[str, float], placebo: bool = False) -> dict[str, Any]:
-    """As `formats` has it."""
-    return {"model": model, "misfit": plain(misfit), "errors": errors, "placebo": placebo}
+@dataclass(frozen=True)
+class Mapped:
+    """What maps of pixels are settled from, beside what data there are: see `mapping.sensors_with`."""
+
+    values: dict[Key, Any]
+    held: list[Change]
+    phases: Phases
+    chips: bool
+
+
+@dataclass
+class Rung:
+    """A model of the ladder. left: the residuals by which it is judged; settled: its numbers, where it has any.
+
+    steps: those that it adds. placebo: of an effect that has nothing to do with it, what it sets beside `state`.
+    """
+
+    model: str
+    state: State = field(repr=False)
+    misfit: float
+    errors: dict[str, float]
+    left: dict[Cell, np.ndarray] = field(repr=False)
+    settled: Settled | None = field(default=None, repr=False)
+    steps: list[Step] = field(default_factory=list, repr=False)
+    maps: Mapped | None = None
+    placebo: dict[Key, Any] | None = None
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """As `formats` has it."""
+        placebo = self.placebo is not None
+        return {"model": self.model, "misfit": plain(self.misfit), "errors": self.errors, "placebo": placebo}
 
 
 def errors_of(
@@ -68,9 +100,7 @@ def errors_of(
     return {k: plain(v) for k, v in whole.items()}
 
 
-def placebo_row(
-    bench: Bench, state: State, tried: Sequence[Tried], best: Tried, named: set[str]
-) -> dict[str, Any] | None:
+def placebo_of(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, named: set[str]) -> Rung | None:
     """What an effect does that has nothing to do with it: as many numbers as the best one, at its best strength.
 
     named: effects that were found, or are as likely; of the others, the one in the middle of the ranking.
@@ -85,4 +115,6 @@ def placebo_row(
     times = one.times if one.gain > 0 else 0.0
     residuals = bench.residuals(state, one.moved, times)
     errors = errors_of(bench, state, residuals, one.moved.at(times))
-    return row(f"placebo: {title(one.change)}", checks.misfit(state, residuals), errors, True)
+    values = {**one.scaled(), **dict(one.change.fixed)} if times else {}
+    misfit = checks.misfit(state.own, residuals)
+    return Rung(f"placebo: {title(one.change)}", state, misfit, errors, residuals, placebo=values)

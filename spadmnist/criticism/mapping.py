@@ -536,6 +536,13 @@ def information(bench: Bench, values: Values, change: Change, levels: dict[str, 
     return out
 
 
+def alone(bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float]) -> set[str]:
+    """Captures without which one of the maps is hardly told."""
+    needed = [information(bench, values, change, levels) for change in wanted]
+    shares = [{id: one / np.maximum(sum(told.values()), 1e-12) for id, one in told.items()} for told in needed]
+    return {id for id in bench.seen if any(float(np.mean(share[id])) > _ALONE for share in shares)}
+
+
 def sensors_with(
     bench: Bench, values: Values, wanted: Sequence[Change], levels: dict[str, float], unseen: bool = True
 ) -> tuple[Sensors, dict[Key, Map], dict[Key, Any]]:
@@ -546,11 +553,10 @@ def sensors_with(
     """
     whole = settle_maps(bench, values, wanted, levels)
     final = {**values, **{key: m.values() for key, m in whole.items()}}
-    needed = [information(bench, final, change, levels) for change in wanted]
+    needed = alone(bench, final, wanted, levels)
     maps: dict[str, dict[Key, Map]] = {}
     for id, seen in bench.seen.items():
-        alone = any(float(np.mean(told[id] / np.maximum(sum(told.values()), 1e-12))) > _ALONE for told in needed)
-        if seen.counts is None or alone or not unseen or len(bench.seen) < 2:
+        if seen.counts is None or id in needed or not unseen or len(bench.seen) < 2:
             maps[id] = whole
         else:
             others = [i for i in bench.seen if i != id]

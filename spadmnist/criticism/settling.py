@@ -308,6 +308,25 @@ def profiled(
     return {settled.dials[i].key: settled.dials[i].interval(out[2 * k], out[2 * k + 1]) for k, i in enumerate(told)}
 
 
+_TOLD_BY_OTHERS = 0.3  # of the information on a number, at least, for a capture to be judged by the others
+
+
+def alone(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray]) -> set[str]:
+    """Captures without which some number is hardly told."""
+    keys = _alike(residuals, slopes)
+    normal = {key: np.einsum("ij,ij->j", slopes[key], slopes[key]) for key in keys}
+    whole = sum(normal.values(), np.zeros(1))
+    return {
+        id
+        for id in {key[0] for key in keys} - {""}
+        if np.any(whole - sum(x for key, x in normal.items() if key[0] == id) < _TOLD_BY_OTHERS * whole)
+    }
+
+
+def _alike(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray]) -> list[Cell]:
+    return [k for k in slopes if k in residuals and len(residuals[k]) == len(slopes[k])]
+
+
 def unseen(
     residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray], cells: bool = True
 ) -> dict[Cell, np.ndarray]:
@@ -315,7 +334,7 @@ def unseen(
 
     cells: where one capture alone tells a number, is each of its cells judged by what the others of them say?
     """
-    keys = [k for k in slopes if k in residuals and len(residuals[k]) == len(slopes[k])]
+    keys, without = _alike(residuals, slopes), alone(residuals, slopes)
     z, slope = stacked(residuals, keys), np.concatenate([slopes[k] for k in keys])
     normal = slope.T @ slope
     out = dict(residuals)
@@ -323,11 +342,10 @@ def unseen(
     for id in {k[0] for k in keys}:
         mine = np.concatenate([np.full(len(residuals[k]), k[0] == id) for k in keys])
         rest = normal - slope[mine].T @ slope[mine]
-        alone = bool(np.any(np.diag(rest) < 0.3 * np.diag(normal)))
-        if alone and not cells:
+        if id in without and not cells:
             continue
         start = 0
-        if alone:
+        if id in without:
             hat = np.einsum("ij,jk,ik->i", slope, np.linalg.pinv(normal + ridge), slope)
         else:
             shift = -np.linalg.pinv(rest + ridge) @ (slope[~mine].T @ z[~mine])  # 0 where nothing follows any number
@@ -336,7 +354,8 @@ def unseen(
             part = slice(start, start + size)
             start += size
             if key[0] == id and key != RATES:
-                out[key] = z[part] / (1 - np.minimum(hat[part], 0.9)) if alone else z[part] + slope[part] @ shift
+                own = z[part] + slope[part] @ shift if id not in without else z[part] / (1 - np.minimum(hat[part], 0.9))
+                out[key] = own
     return out
 
 

@@ -8,12 +8,13 @@ import numpy as np
 
 from .. import units
 from ..kernels import jit
+from ..recording import COMMON_PERIOD
 from . import Recording, Statistic, Summary
 from ._counting import of_detections, per_cent
 from ._frames import first_stamps
 
 # All periods below divide it: a histogram of stamps modulo this number holds those of all of them.
-_COMMON = 2**8 * 3 * 5**3 * 7
+_COMMON = COMMON_PERIOD
 _SHOWN = (256, 140, 100)
 _FOLDS = tuple(p for p in range(2, 1001) if _COMMON % p == 0)
 # (from, to): each period from the shortest that is folded before, so that little is added up. Every one of them divides
