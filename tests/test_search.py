@@ -511,11 +511,48 @@ def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> 
         square = 1000.0 + 40.0 * math.log(queue / truth) ** 2 * truth
         return settling.Settled((), np.zeros(0), np.zeros((0, 0)), {}, {}, square, dict(values))
 
-    found, (low, high) = refining._counted(settled({dial.key: float(first)}), dial, settled)
+    found, ends = refining._counted(settled({dial.key: float(first)}), dial, settled)
+    low, high = ends[dial.key]
     assert low <= truth <= high and abs(math.log(found.values[dial.key] / truth)) < 0.15
     assert low >= 1 and (low, high) == (round(low), round(high))
     if truth < 10:
         assert found.values[dial.key] == truth
+
+
+@pytest.mark.parametrize(("dependent", "reach", "alone"), [(1.0, 0.45, True), (9.0, 0.8, False)])
+def test_a_whole_number_that_was_settled_from_afar_is_settled_again(
+    dependent: float, reach: float, alone: bool
+) -> None:
+    """The time that suits 4 places is far from the one that suits 8; what is settled in one go does not get there.
+
+    Then 4 is known to be it, and the time with it; or where cells depend on each other 3 and 5 are not excluded, and
+    what the time is with these is not either.
+    """
+    places = Dial("bus", "queue", "", 1.0, 256.0, None, whole=True)
+    time = Dial("bus", "time", "s", 1e-9, 1e-6, None)
+
+    def best(queue: float) -> float:
+        return 2.0 * math.log(queue)
+
+    def settled(values: dict[Any, Any]) -> settling.Settled:
+        queue = float(values[places.key])
+        to = best(queue) - math.log(values[time.key] / 1e-8)
+        point = math.log(values[time.key]) + max(-reach, min(reach, to))
+        left = best(queue) - (point - math.log(1e-8))
+        square = 1000.0 + 500.0 * math.log(queue / 4) ** 2 + 400.0 * left**2
+        slopes = {("flat", "cells"): np.full((1, 1), 50.0)}
+        covariance = np.full((1, 1), dependent / 2500)
+        new = {**values, time.key: math.exp(point)}
+        return settling.Settled((time,), np.array([point]), covariance, {}, slopes, square, new)
+
+    first = settled({places.key: 8.0, time.key: 1e-8 * math.exp(best(8))})
+    found, ends = refining._counted(first, places, settled)
+    assert found.values[places.key] == 4 and found.values[time.key] == pytest.approx(1e-8 * math.exp(best(4)), rel=0.05)
+    assert ends[places.key] == ((4, 4) if alone else (3, 5)) and (time.key in ends) != alone
+    if not alone:
+        low, high = ends[time.key]
+        assert low < 1e-8 * math.exp(best(3)) < 1e-8 * math.exp(best(5)) < high
+        assert low > 1e-8 * math.exp(best(3) - 0.3) and high < 1e-8 * math.exp(best(5) + 0.3)
 
 
 def test_a_template_of_another_strength_does_not_hide_one_that_promises(lab) -> None:

@@ -61,7 +61,8 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
         return one
     for dial in one.change.dials:
         if dial.whole and dial.key in given:
-            found, one.intervals[dial.key] = _counted(found, dial, lambda v: settled(v, 2))
+            found, intervals = _counted(found, dial, lambda v: settled(v, 2))
+            one.intervals |= intervals
     if boost == 1 and _fails_its_own(bench, state, one, found):
         found = _probed(bench, state, one, found, some)
     one.faint = boost > 1
@@ -214,39 +215,69 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
 
 def _counted(
     found: Settled, dial: Dial, settled: Callable[[Mapping[Key, Any]], Settled | str]
-) -> tuple[Settled, tuple[float, float]]:
-    """(the best with a whole number settled beside the others, which of its values the data do not exclude).
+) -> tuple[Settled, dict[Key, tuple[float, float]]]:
+    """(the best with a whole number settled beside the others, intervals).
 
+    Of the whole number they are the values that the data do not exclude; of the others what holds beside any of these.
     No slope leads from one to the next: from its neighbours, ever nearer ones, all else being settled at each.
     """
-    squares, step = {found.values[dial.key]: found.square}, _NEXT[0]
+    best = {float(found.values[dial.key]): found}
+    squares = {value: one.square for value, one in best.items()}
+    begun: dict[float, float] = {}  # from which other one each was settled last
 
-    def there(value: float) -> Settled | None:
-        one = settled({**found.values, dial.key: value})
-        squares[value] = math.inf if isinstance(one, str) else one.square
-        return None if isinstance(one, str) else one
+    def there(value: float, start: Settled) -> None:
+        begun[value] = float(start.values[dial.key])
+        one = settled({**start.values, dial.key: value})
+        if not isinstance(one, str) and one.square < squares.get(value, math.inf):
+            best[value], squares[value] = one, one.square
+        squares.setdefault(value, math.inf)
 
-    while step > _NEXT[1]:
+    step = _NEXT[0]
+    while True:
         here = float(found.values[dial.key])
-        near = {_beside(dial, here, x) for x in (-step, step)} - squares.keys()
-        best = min((one for x in sorted(near) if (one := there(x))), key=lambda one: one.square, default=found)
-        if best.square < found.square - _BETTER:
-            found = best
-        else:
+        near = {_beside(dial, here, x) for x in (-step, step)} - {here}
+        # what was settled from afar may not have come to where it is best
+        last = step <= 2 * _NEXT[1]
+        for x in sorted(x for x in near if x not in squares or (last and begun.get(x) != here)):
+            there(x, found)
+        ahead = min(best.values(), key=lambda one: one.square)
+        if ahead.square < found.square - _BETTER:
+            found = ahead
+        elif step > _NEXT[1]:
             step /= 2
+        else:
+            break
     here = float(found.values[dial.key])
+    excluded = found.square + EXCLUDED * _dependent(found)
     for side in (-1, 1):  # on to where they do
         step = _NEXT[0]
-        while all(side * (x - here) <= 0 or squares[x] <= found.square + EXCLUDED for x in squares):
-            far = max(squares, key=lambda x, side=side: side * x)  # type: ignore[misc]
-            if (further := _beside(dial, far, side * step)) == far:
+        while all(side * (x - here) <= 0 or squares[x] <= excluded for x in squares):
+            far = max(best, key=lambda x, side=side: side * x)  # type: ignore[misc]
+            if (further := _beside(dial, far, side * step)) in squares:
                 break
-            there(further)
+            there(further, best[far])
             step *= 2
-    out = [x for x, square in squares.items() if square > found.square + EXCLUDED]
+    out = [x for x, square in squares.items() if square > excluded]
     low = max((x + 1 for x in out if x < here), default=dial.low)
     high = min((x - 1 for x in out if x > here), default=dial.high)
-    return found, (low, high)
+    ends = {dial.key: (low, high)}
+    for i, other in enumerate(found.dials):
+        told = [one.interval(i)[1:] for x, one in best.items() if low <= x <= high and one.dials == found.dials]
+        if len(told) > 1:
+            ends[other.key] = min(a for a, _ in told), max(b for _, b in told)
+    return found, ends
+
+
+def _dependent(settled: Settled) -> float:
+    """By how much the squares of cells that depend on each other rise more than those of independent ones; at least 1.
+
+    As `settling.profiled` has it of one number, in the mean of all that are settled.
+    """
+    slopes = np.concatenate([np.zeros((0, len(settled.dials))), *settled.slopes.values()])
+    naive = np.diag(np.linalg.pinv(slopes.T @ slopes, rcond=1e-10))
+    wider = np.divide(np.diag(settled.covariance), naive, out=np.ones_like(naive), where=naive > 0)
+    wider = wider[np.isfinite(wider)]
+    return max(float(np.mean(wider)) if wider.size else 1.0, 1.0)
 
 
 def _beside(dial: Dial, value: float, step: float) -> float:
