@@ -25,6 +25,7 @@ from .effects import Conditions
 from .errors import ConfigError, InputError, SpadError, did_you_mean
 from .events import Events, Layout
 from .images import Uniform
+from .plugins import ByWavelength
 from .readout import Recorded
 from .recording import MODALITIES, Capture, Light, Recording
 from .sensor import Sensor
@@ -95,6 +96,19 @@ class Measurement:
             raise InputError(f"{self.place(id)}: of {id} only the mean is known, there are no data; name its file")
         found, self.notes[id] = self._read(self._index(id), layout, dead_time)
         return found
+
+    def check_sensor(self, sensor: Sensor) -> None:
+        """Raise InputError where a sensor has other pixels, or says nothing of a capture's wavelength."""
+        self.check_layout(sensor.layout)
+        every = {(e.name, name): getattr(e, name) for e in sensor.effects for name in e.parameters}
+        tables = {key: value for key, value in every.items() if isinstance(value, ByWavelength)}
+        for capture in self.captures:
+            for (effect, name), table in tables.items():
+                try:
+                    if capture.light.wavelength is not None:
+                        table.at(capture.light.wavelength)
+                except InputError as error:
+                    raise InputError(f"{self.place(capture.id)}: {effect}.{name}: {error}") from None
 
     def check_layout(self, layout: Layout) -> None:
         """Raise InputError where a sensor has other pixels."""

@@ -469,7 +469,12 @@ def load_file(path: str | Path) -> None:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise EffectError(f"{path}: the plug-in cannot be read ({error})") from None
+        if not file.exists():
+            raise EffectError(
+                f"{path}: no such file; name the plug-in's, or begin one: spadmnist effects --new NAME"
+            ) from None
+        why = error.strerror if isinstance(error, OSError) else "it is no text in UTF-8"
+        raise EffectError(f"{path}: the plug-in cannot be read ({why}); name a Python file") from None
     digest = hashlib.sha256(text.encode()).hexdigest()
     name = f"{_MODULE}{file.stem}_{digest[:12]}"
     spec = importlib.util.spec_from_file_location(name, file)

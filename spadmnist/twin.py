@@ -179,7 +179,7 @@ def twin(
     InputError before the first one where the sensor has other pixels or a light level is free.
     """
     sensor = sensor.settled()
-    measurement.check_layout(sensor.layout)
+    measurement.check_sensor(sensor)
     fluxes = []
     for capture in measurement.captures:
         flux = photons_at(capture, sensor.layout)

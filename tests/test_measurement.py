@@ -24,6 +24,7 @@ import spadmnist
 import spadmnist.cli as command_line
 from spadmnist import capture_files, config, document, factory, measurement, report, twin
 from spadmnist.cli import cli, main
+from spadmnist.criticism import compare
 from spadmnist.effects import Conditions
 from spadmnist.effects.dark_counts import DarkCounts
 from spadmnist.effects.dead_time import DeadTime
@@ -34,6 +35,7 @@ from spadmnist.effects.tdc import Tdc
 from spadmnist.errors import ConfigError, InputError, SpadError
 from spadmnist.events import Layout
 from spadmnist.measurement import Measurement
+from spadmnist.plugins import ByWavelength
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
 from spadmnist.streams import Streams
@@ -1037,6 +1039,20 @@ def test_a_twin_needs_the_same_pixels_and_a_level(tmp_path: Path) -> None:
     text = refused(lambda: twin.twin(device(rows=3), opened), "level of a is free", "irradiance: 120 nW/cm^2")
     assert "measurement.yaml:5: captures[0]" in text
     refused(lambda: twin.twin(device(), opened), "3 x 10", "4 x 10")
+
+
+def test_a_wavelength_that_the_sensor_says_nothing_of_is_told_with_its_capture(tmp_path: Path) -> None:
+    """The sensor's table ends before it, the second capture's light does not."""
+    light = (
+        "{{id: {}, mean: 2, modality: qis, light: {{kind: flat, wavelength: {} nm}}, frames: 20, frame_time: 10 us}}"
+    )
+    opened = measurement.open(described(tmp_path, light.format("a", 500), light.format("b", 900)))
+    table = ByWavelength((400e-9, 800e-9), (0.4, 0.1))
+    sensor = Sensor(Layout(3, 10, 25e-12, 1.0), [Detection(pdp=table)], "device", name="test")
+    for judge in (lambda: opened.check_sensor(sensor), lambda: compare.compare(sensor, opened, jobs=1)):
+        text = refused(judge, "detection.pdp: the wavelength 900 nm lies outside the table", "400 nm to 800 nm")
+        assert "measurement.yaml:6: captures[1]" in text
+    measurement.open(described(tmp_path, light.format("a", 500))).check_sensor(sensor)
 
 
 def test_a_mean_becomes_a_simulated_mean(tmp_path: Path) -> None:

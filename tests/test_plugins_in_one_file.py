@@ -171,6 +171,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_a_file_that_is_not_there_or_no_text_is_no_plugin(folder: Path) -> None:
+    (folder / "picture.py").write_bytes(b"\x89PNG\xff")
+    (folder / "folder.py").mkdir()
+    for name, why in (
+        ("mine.py", "no such file.*effects --new NAME"),
+        ("picture.py", "no text in UTF-8"),
+        ("folder.py", r"cannot be read \(Is a directory\)"),
+    ):
+        with pytest.raises(EffectError, match=f"{name}: .*{why}") as said:
+            plugins.load_file(folder / name)
+        assert "Errno" not in str(said.value)
+
+
 def test_a_file_that_defines_nothing_is_no_plugin(folder: Path) -> None:
     (folder / "mine.py").write_text("x = 1\n")
     for _ in range(2):

@@ -155,7 +155,7 @@ def compare(
     Raises InputError where sensor and measurement do not belong together.
     """
     sensor = sensor.settled()
-    measurement.check_layout(sensor.layout)
+    measurement.check_sensor(sensor)
     say = progress or (lambda what, share: None)
     checks: list[Check] = []
     judged: list[tuple[float, Null]] = []  # misfit, null of independent cells

@@ -337,7 +337,7 @@ class Bench:
         exposures: Mapping[str, float] | None = None,
     ):
         """exposures: s, of captures that were not as long as the measurement states."""
-        measurement.check_layout(sensor.layout)
+        measurement.check_sensor(sensor)
         self.start = sensor.settled()
         self.seed, self.parallel, self.replicates, self.say = seed, parallel, replicates, say
         self.dead = self.start.nominal_dead_time
