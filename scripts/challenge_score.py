@@ -40,6 +40,8 @@ RULES = {
     "rate": "background_light",
     "light": "(setup)",
 }
+# Where a parameter's effect vanishes, if not at 0.
+OFF = {"short_gate.fraction": 1.0}
 RULES_IN_THE_DARK = {
     **dict.fromkeys(("pixel_map", "outliers", "spread", "tails"), "per_pixel dark_counts.rate"),
     "rate": "set dark_counts.rate",
@@ -173,7 +175,8 @@ def judged(truth: dict[str, Any], told: dict[str, Any], seconds: float | None = 
                     covers = found["low"] <= value <= found["high"]
                     case.found.append(Found(name, covers, pull_of(found, value), exact))
             if effect in right and name in limits:
-                case.limits.append((name, abs(value) <= limits[name]))
+                off = OFF.get(name, 0.0)
+                case.limits.append((name, abs(value - off) <= abs(limits[name] - off)))
     return case
 
 

@@ -223,9 +223,10 @@ class Recording:
         """
         c = self.conditions
         if self.frames is not None:
-            blocks = min(_BLOCKS[0], self.n_frames) // 2 * 2
-            if not blocks:
+            n = self.n_frames
+            if n < 2:
                 return None
+            blocks = next((b for b in (*_BLOCKS, 2) if n // b * b > (1 - _LOSS) * n), min(_BLOCKS[0], n) // 2 * 2)
             frames = _EveryOther(self.frames, self.n_frames // blocks, blocks // 2, second)
             share = c.frames // self.n_frames * frames.shape[0]  # of which each count frame is a sum
             half = replace(c, frames=share, exposure=share * c.frame_period)
@@ -268,7 +269,7 @@ def _in_ticks(exposure: float) -> tuple[int, int]:
 
 def _whole(stamps: np.ndarray, last: int) -> np.ndarray:
     """Stamps rounded down to whole ticks: what a product of two numbers lacks of one is none."""
-    return np.minimum(np.floor(stamps + 1e-6), last)
+    return np.minimum(np.floor(stamps + np.maximum(1e-6, 4 * np.spacing(stamps))), last)
 
 
 @dataclass(frozen=True)

@@ -70,10 +70,10 @@ def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
     change = change_of(bench, f"add {name}")
     tried = look.looked_at(state, change, look.begun(state, change))
     assert tried and all(isinstance(t, Tried) for t in tried)
-    found, hidden, others = limits.upper_limits(look, state, tried)
-    assert {"effect": "flicker"} in others and not {e["effect"] for e in others} & {
-        e["effect"] for e in [*found, *hidden]
-    }
+    swings = change_of(bench, "add flicker")
+    line = Tried(swings, look.begun(state, swings)[0], Moved({}, {}, {}), 0.0, 1.0)
+    found, hidden, others = limits.upper_limits(look, state, [*tried, line])
+    assert others == [{"effect": "flicker"}]  # of what was not tried nothing is said
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
     return limit, [chance.along(bench, state, t.moved).data for t in tried]

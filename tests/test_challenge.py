@@ -516,6 +516,12 @@ def test_upper_limits_of_faint_effects() -> None:
         cases.append(judge(faint, told))
     assert [case.limits for case in cases] == [[("crosstalk.probability", True)], [("crosstalk.probability", False)]]
     assert "| single, Z below 3: upper limit above the truth | 1 of 2 | 50 % |" in scores.report(cases)
+    gate = {"change": "add", "effect": "short_gate", "parameter": None}
+    for limit, above in ((0.96, True), (0.99, False)):  # a gate of 98 %: it is where it is whole that there is none
+        told = answer("adequate")
+        told["excluded"] = [{"effect": "short_gate", "parameter": "fraction", "upper_limit_95": limit}]
+        case = judge(truth_of("single", truth=[gate], z=[2.0], parameters={"short_gate.fraction": 0.98}), told)
+        assert case.limits == [("short_gate.fraction", above)]
 
 
 def test_parameters_have_a_table() -> None:

@@ -221,6 +221,7 @@ def test_a_lamp_that_was_off_is_no_light_level() -> None:
     )
     assert [made.drowned(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
     assert made.score(18.0) < -40 and made.score(18.0, 0.05) < -15
+    assert abs(made.score(18.0, mean=18.0)) < 0.2 and made.score(30.0, mean=18.0) == pytest.approx(2.5, abs=0.4)
     # Poisson's own where the dark is most of it: 25 expected, 17 found
     dim = replace(made, level=1250.0, stated=1250.0, totals=np.full(48, 25.0), scatter=0.2)
     assert dim.drowned(17.0) and dim.score(17.0) == pytest.approx(-1.7, abs=0.1)
@@ -274,6 +275,11 @@ def test_stamps_in_other_ticks_are_rounded_down() -> None:
     assert coarse.events is not None and coarse.tick == 1e-8
     assert coarse.events.ticks is not None and coarse.events.ticks.tolist() == [0, 2, 3, 99]
     assert coarse.on_ticks(1e-8 * (1 + 1e-12)) is coarse
+    late = np.arange(0, 3_000_000_000, 1_234_567, dtype=np.uint64) * np.uint64(40)  # up to 1.2e11 ticks
+    events = Events(None, np.array([0, len(late)]), 1, late, 1e-11, end=2.0)
+    seconds = replace(one.capture, conditions=Conditions(2.0, 1, 2.0, 2.0, None))
+    told = Recording(seconds, Layout(1, 1, 1e-10, 1.0), events, None, 1e-11).on_ticks(2e-11).events
+    assert told is not None and np.array_equal(told.ticks, late // np.uint64(2))
     fine = coarse.on_ticks(1e-9)
     assert fine.events is not None and fine.events.ticks is not None and fine.events.ticks.tolist() == [0, 20, 30, 990]
     # STR: 50 ticks of 10 ns in a frame, 50 means none; in ticks of 30 ns 17 does

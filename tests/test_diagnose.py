@@ -117,6 +117,25 @@ def test_the_next_sensor_is_the_users_own_file(tmp_path):
     assert read.effect("detection").relative == pytest.approx(np.linspace(0.9, 1.1, 64))
 
 
+def test_the_next_of_the_next_sensor_leaves_its_maps_alone(tmp_path):
+    """Both lie in one folder; the second has the first line once, whichever way it was written."""
+    first, second = tmp_path / "next.yaml", tmp_path / "next2.yaml"
+    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    key = ("detection", "relative")
+    next_sensor.write(tmp_path / "sensor.yaml", first, {key: np.linspace(0.9, 1.1, 64)}, {})
+    next_sensor.write(first, second, {key: np.linspace(0.5, 1.5, 64)}, {})
+    for file, low in ((first, 0.9), (second, 0.5)):
+        assert config.read_sensor(file).effect("detection").relative[0] == pytest.approx(low)
+        assert file.read_text().count("Written by spadmnist") == 1
+        next_sensor.check_place(tmp_path / "sensor.yaml", file)
+    lines = SENSOR.replace(
+        "dead_time: {duration: 50 ns}", "dead_time:\n      duration:\n        normal: {mean: 50 ns, sigma: 1 ns}"
+    )
+    (tmp_path / "lines.yaml").write_text(lines)
+    out = next_sensor.write(tmp_path / "lines.yaml", tmp_path / "third.yaml", {("dead_time", "duration"): 55e-9}, {})
+    next_sensor.check_place(tmp_path / "lines.yaml", out)
+
+
 def test_a_users_own_effect_is_a_candidate(tmp_path):
     plugin = tmp_path / "echo.py"
     plugin.write_text(ECHO)

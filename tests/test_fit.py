@@ -177,7 +177,57 @@ def test_what_is_unseen_is_what_numbers_settled_without_it_leave():
     rest = np.concatenate([noise["a", "x"][keep], *(noise[k] for k in cells if k[0] != "a")])
     alone = noise["a", "x"][worst] - slopes["a", "x"][worst] @ np.linalg.lstsq(left, rest, rcond=None)[0]
     assert settling.unseen(z, slopes)["a", "x"][worst] == pytest.approx(alone, rel=1e-6)
-    assert settling.unseen(z, slopes, cells=False)["a", "x"] is z["a", "x"]
+
+
+def test_numbers_that_are_not_where_the_squares_are_least_gain_nothing_by_that() -> None:
+    """At a bound, or settled half way: what they lack there they lack on captures that are not seen, too."""
+    rng = np.random.default_rng(14)
+    slopes = {(id, "x"): rng.standard_normal((50, 2)) for id in "abc"}
+    noise = {cell: rng.standard_normal(50) for cell in slopes}
+    keys = list(slopes)
+    best = np.linalg.lstsq(np.concatenate([slopes[k] for k in keys]), -fit.stacked(noise, keys), rcond=None)[0]
+    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    found = {}
+    for lacks in (0.0, 2.0):
+        z = {cell: noise[cell] + slopes[cell] @ (best - lacks) for cell in keys}
+        settled = settling.Settled(dials, best, np.eye(2), z, slopes, fit.square(z), {})
+        found[lacks] = settling.unseen(z, slopes)
+        assert fit.square(found[lacks]) > fit.square(z) - 1e-9 or lacks
+        assert 0 <= settling.optimism(z, settled) < 60
+        assert lacks == 0 or fit.square(z) > 500
+    for cell in keys:
+        assert found[2.0][cell] - found[0.0][cell] == pytest.approx(-2.0 * slopes[cell].sum(axis=1), rel=1e-6)
+    slopes["a", "x"] = 9.0 * slopes["a", "x"]  # it alone tells them, cell by cell
+    moved = {lacks: {c: noise[c] + slopes[c] @ (best - lacks) for c in keys} for lacks in (0.0, 2.0)}
+    one, other = (settling.unseen(moved[lacks], slopes)["a", "x"] for lacks in (0.0, 2.0))
+    assert other - one == pytest.approx(-2.0 * slopes["a", "x"].sum(axis=1), rel=1e-6)
+
+
+def test_what_two_numbers_have_in_common_may_be_told_by_one_capture() -> None:
+    """They do nearly the same in one capture, and another one tells them apart: without it nobody would know either."""
+    rng = np.random.default_rng(15)
+    shape = rng.standard_normal(200)
+    near = shape + 0.02 * rng.standard_normal(200)
+    apart = np.stack([rng.standard_normal(200), rng.standard_normal(200)], axis=1)
+    slopes = {("a", "x"): np.stack([shape, near], axis=1), ("b", "x"): 0.3 * apart}
+    z = {cell: rng.standard_normal(200) for cell in slopes}
+    assert settling.alone(z, slopes) == {"a", "b"}  # a the sum of both, b their difference
+    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    best = np.linalg.lstsq(np.concatenate(list(slopes.values())), -fit.stacked(z, list(z)), rcond=None)[0]
+    z = {cell: z[cell] + slopes[cell] @ best for cell in z}
+    settled = settling.Settled(dials, best, np.eye(2), z, slopes, fit.square(z), {})
+    assert settling.optimism(z, settled) == pytest.approx(4.0, rel=1e-6)  # 1,000 and more if each judged the other
+    assert settling.alone(z, {cell: np.zeros((200, 2)) for cell in z}) == settling.alone(z, {}) == set()
+
+
+def test_numbers_of_one_capture_and_of_totals_cost_as_many() -> None:
+    rng = np.random.default_rng(16)
+    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "abc")
+    for cell in (("a", "x"), fit.RATES):
+        slopes = {cell: rng.standard_normal((30, 3))}
+        z = {cell: rng.standard_normal(30)}
+        settled = settling.Settled(dials, np.zeros(3), np.eye(3), z, slopes, fit.square(z), {})
+        assert settling.optimism(z, settled) == pytest.approx(6.0, rel=1e-6)
 
 
 def test_numbers_cost_what_chance_lets_them_gain():
@@ -217,7 +267,15 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     ("ends", "bounds", "off", "reach", "expected"),
     [
         ((1e-9, 1e-6), (0, None), 0.0, (math.log(0.9e-9), math.log(1.2e-9)), (0.9e-9, 1.2e-9)),
-        ((1e-9, 1e-6), (0, None), 0.0, (-math.inf, 800.0), (1e-9, 1e-6)),  # nothing tells it
+        (
+            (1e-9, 1e-6),
+            (0, None),
+            0.0,
+            (-math.inf, 800.0),
+            (1e-9 / math.exp(0.3), 1e-6 * math.exp(0.3)),
+        ),  # nothing tells it
+        ((1e-2, 1.0), (0, None), 0.0, (math.log(0.5), math.log(1.2)), (0.5, 1.2)),
+        ((1e-2, 1.0), (0, None), 0.0, (math.log(0.5), math.log(1.6)), (0.5, math.exp(0.3))),  # no less than that
         ((-0.3, 5.0), (-0.35, None), 0.0, (-0.4, 5.5), (-0.35, 5.5)),
         ((0.1, 1.0), (0, 1), 1.0, (math.log(1e-9), math.log(0.92)), (0.08, 1.0)),  # what lacks
     ],

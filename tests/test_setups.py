@@ -221,7 +221,7 @@ def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text(TR)
     own = tmp_path / "own.yaml"
-    own.write_text(TR + "# my notes from the lab, 2024: 50 ns\n")
+    own.write_text(TR + "# typical; from data sheet, 2024-05-01\n")
     with pytest.raises(InputError, match="it is left alone"):
         next_sensor.check_place(file, own)
     next_sensor.check_place(file, own, ours=True)
@@ -230,6 +230,9 @@ def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
     key = ("dead_time", "duration")
     made = next_sensor.write(file, tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"})
     next_sensor.check_place(file, made)
+    made.write_text(made.read_text().partition("\n")[2])  # the line that says so
+    with pytest.raises(InputError, match="it is left alone"):
+        next_sensor.check_place(file, made)
     next_sensor.check_place(file, tmp_path / "new.yaml")
 
 

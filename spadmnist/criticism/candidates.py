@@ -83,8 +83,8 @@ class Dial:
         beyond = _BEYOND if self.log else _BEYOND * (self.high - self.low)
         ends = []
         for u in (low, high):
-            near = self.ends[0] - beyond <= u <= self.ends[1] + beyond
-            ends.append(min(max(self._anywhere(u), least), most) if near else self.value(u))
+            near = min(max(u, self.ends[0] - beyond), self.ends[1] + beyond)
+            ends.append(min(max(self._anywhere(near), least), most))
         return min(ends), max(ends)
 
     def _anywhere(self, coordinate: float) -> float:

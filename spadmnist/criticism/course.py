@@ -219,7 +219,9 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
             unit = next(d.unit for d in step.change.dials if d.key == (effect, name))
             own = step.values.get(name) if any(d.key == (effect, name) for d in step.dials) else None
             if own is not None and own.low is not None and own.high is not None:
-                low, high = min(low, own.low), max(high, own.high)  # wherever a whole number beside it may be
+                # wherever a whole number beside it may be; if later steps have moved it, that is of no use
+                inside = low <= own.value <= high
+                low, high = (min(low, own.low), max(high, own.high)) if inside else (own.low, own.high)
             step.values[name] = Value(float(course.values[effect, name]), low, high, unit)
         for (_, name), value in step.change.fixed:
             if name not in step.values and isinstance(value, (bool, int, float)):

@@ -572,7 +572,7 @@ class Bench:
             wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
             return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
         if null.drowned(total):
-            return null.score(total)
+            return null.score(total, mean=expected)
         if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):
             return None
         scatter = null.scatter * math.sqrt(1 + 2 / len(null.totals))

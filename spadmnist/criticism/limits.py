@@ -63,7 +63,8 @@ def upper_limits(
         else:
             far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
             excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
-    others = {one.effect for one in changes(state.sensors.one) if one.kind == "add"} - shapes.keys()
+    looked = {one.change.effect for one in tried}  # what cannot be tried is told where it fails
+    others = {one.effect for one in changes(state.sensors.one) if one.kind == "add"} & looked - shapes.keys()
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 

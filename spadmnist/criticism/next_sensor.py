@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Mapping
@@ -17,8 +18,8 @@ from .candidates import Key
 
 Notes = Mapping[Key, str]
 
-
-_OURS = re.compile(r"# (.*; )?from .+, \d{4}-\d\d-\d\d(:|;|$)", re.MULTILINE)
+# The first line of every file that is written here: without it, a file is the user's own.
+_OURS = "# Written by spadmnist, which writes it anew when asked to; without this line it is left alone."
 
 
 def check_place(source: Path, out: Path, ours: bool = False) -> None:
@@ -32,11 +33,15 @@ def check_place(source: Path, out: Path, ours: bool = False) -> None:
         raise InputError(f"{out} is the sensor file itself, which stays as it is; name another folder or file with -o")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with -o, for example {out / 'next.yaml'}")
-    if not ours and not _OURS.search(disk.read_file(out, 1 << 24).decode(errors="replace")):
+    if not ours and not _is_ours(out):
         raise InputError(
             f"{out} is there already and no sensor file that a fit or a diagnosis has written; it is left alone: name "
             "another folder or file with -o"
         )
+
+
+def _is_ours(file: Path) -> bool:
+    return disk.read_file(file, 1 << 24).decode(errors="replace").startswith(_OURS)
 
 
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> Path:
@@ -50,8 +55,11 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> P
     written: dict[Key, str] = {}
     for (effect, parameter), value in values.items():
         if isinstance(value, np.ndarray):
-            name = f"{effect}.{parameter}.npy"
-            np.save(out.parent / name, value.reshape(shape) if value.size == shape[0] * shape[1] else value)
+            # with the file's own name, lest it takes the place of a map that another sensor beside it has
+            name = f"{out.stem}.{effect}.{parameter}.npy"
+            map_ = io.BytesIO()
+            np.save(map_, value.reshape(shape) if value.size == shape[0] * shape[1] else value)
+            disk.commit_file(out.parent / name, map_.getvalue(), out.parent)
             written[effect, parameter] = f"{{file: {name}}}"
         elif isinstance(value, bool):
             written[effect, parameter] = "true" if value else "false"
@@ -60,14 +68,18 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> P
             written[effect, parameter] = units.show(float(value), unit, 6) if unit else f"{float(value):.6g}"
     text = _moved_files(text, source.parent, out.parent)
     try:
-        new = _edited(text, written, notes)
+        new = _headed(_edited(text, written, notes))
         disk.commit_file(out, new.encode(), out.parent)
         config.read_sensor(out)
     except (SpadError, ValueError):
         # a file written in another way: its contents, without its comments
-        disk.commit_file(out, _dumped(text, written).encode(), out.parent)
+        disk.commit_file(out, _headed(_dumped(text, written)).encode(), out.parent)
         config.read_sensor(out)
     return out
+
+
+def _headed(text: str) -> str:
+    return text if text.startswith(_OURS) else f"{_OURS}\n{text}"
 
 
 def _moved_files(text: str, before: Path, after: Path) -> str:

@@ -159,13 +159,13 @@ class CaptureNull:
         _, _, elasticity = self.level_of(max(total, 0.5))
         return elasticity < _DROWNED * self.elasticity_at(self.stated)
 
-    def score(self, total: float, uncertainty: float = 0.0) -> float:
+    def score(self, total: float, uncertainty: float = 0.0, mean: float | None = None) -> float:
         """Standard deviations between a total and the stated level's: few detections are not normal.
 
-        uncertainty: relative, of that level.
+        uncertainty: relative, of that level. mean: what is expected in place of that level's.
         """
         assert self.stated is not None
-        mean = self.total_at(self.stated)
+        mean = self.total_at(self.stated) if mean is None else mean
         level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
         wider = max(1.0, math.hypot(self._scatter, level) * math.sqrt(max(mean, 1.0)))
         return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider

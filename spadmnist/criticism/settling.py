@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .candidates import Dial, Key
-from .fit import FEW, RATES, Bench, Cell, Sensors, State, square, stacked
+from .fit import FEW, RATES, Bench, Cell, Sensors, State, stacked
 
 _ASIDE = 0.2  # of a logarithm, to both sides, for a slope
 _CLOSE = 0.02  # and no nearer
@@ -23,6 +23,7 @@ _SAME = 0.35  # of a logarithm, or of where a number is looked for: so far slope
 _PROMISING = 0.1  # of the root of what was gained: far less than what tells two candidates apart
 _VAIN = 2  # steps in a row, the second one shorter, that gain nothing: what is left is chance
 _BLIND = 0.05  # squared slope of a number that nothing tells
+_TOLD_BY_OTHERS = 0.3  # of the information on a number, at least, for a capture to be judged by the others
 
 
 @dataclass
@@ -308,63 +309,76 @@ def profiled(
     return {settled.dials[i].key: settled.dials[i].interval(out[2 * k], out[2 * k + 1]) for k, i in enumerate(told)}
 
 
-_TOLD_BY_OTHERS = 0.3  # of the information on a number, at least, for a capture to be judged by the others
-
-
 def alone(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray]) -> set[str]:
-    """Captures without which some number is hardly told."""
+    """Captures without which some number, or what several of them have in common, is hardly told."""
     keys = _alike(residuals, slopes)
-    normal = {key: np.einsum("ij,ij->j", slopes[key], slopes[key]) for key in keys}
-    whole = sum(normal.values(), np.zeros(1))
-    return {
-        id
-        for id in {key[0] for key in keys} - {""}
-        if np.any(whole - sum(x for key, x in normal.items() if key[0] == id) < _TOLD_BY_OTHERS * whole)
-    }
+    parts = {key: slopes[key].T @ slopes[key] for key in keys}
+    if not parts:
+        return set()
+    values, vectors = np.linalg.eigh(sum(parts.values()))
+    told = values > 1e-9 * max(float(values.max()), 1e-300)
+    root = vectors[:, told] / np.sqrt(values[told])
+    out = set()
+    for id in {key[0] for key in keys} - {""}:
+        own = sum(part for key, part in parts.items() if key[0] == id)
+        share = np.linalg.eigvalsh(root.T @ own @ root)  # of what is known of each direction
+        if share.size and 1 - float(share.max()) < _TOLD_BY_OTHERS:
+            out.add(id)
+    return out
 
 
 def _alike(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray]) -> list[Cell]:
     return [k for k in slopes if k in residuals and len(residuals[k]) == len(slopes[k])]
 
 
-def unseen(
-    residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray], cells: bool = True
-) -> dict[Cell, np.ndarray]:
+def unseen(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray]) -> dict[Cell, np.ndarray]:
     """Residuals of each capture, the numbers being settled without it (to first order).
 
-    cells: where one capture alone tells a number, is each of its cells judged by what the others of them say?
+    Where one capture alone tells a number, each of its cells is judged by what the others of them say. What the numbers
+    lack of where the squares are least, a bound say, they lack all the same.
     """
     keys, without = _alike(residuals, slopes), alone(residuals, slopes)
     z, slope = stacked(residuals, keys), np.concatenate([slopes[k] for k in keys])
     normal = slope.T @ slope
     out = dict(residuals)
     ridge = 1e-9 * np.trace(normal) * np.eye(len(normal))
-    for id in {k[0] for k in keys}:
+    inverse = np.linalg.pinv(normal + ridge)
+    lacking = -inverse @ (slope.T @ z)
+    for id in {k[0] for k in keys} - {""}:
         mine = np.concatenate([np.full(len(residuals[k]), k[0] == id) for k in keys])
-        rest = normal - slope[mine].T @ slope[mine]
-        if id in without and not cells:
-            continue
-        start = 0
+        own = slope[mine]
         if id in without:
-            hat = np.einsum("ij,jk,ik->i", slope, np.linalg.pinv(normal + ridge), slope)
+            hat = np.minimum(np.einsum("ij,jk,ik->i", own, inverse, own), 0.9)
+            beyond = (z[mine] + own @ lacking) * hat / (1 - hat)
         else:
-            shift = -np.linalg.pinv(rest + ridge) @ (slope[~mine].T @ z[~mine])  # 0 where nothing follows any number
-        for key in keys:
+            # 0 where nothing follows any number
+            rest = -np.linalg.pinv(normal - own.T @ own + ridge) @ (slope[~mine].T @ z[~mine])
+            beyond = own @ (rest - lacking)
+        start = 0
+        for key in (k for k in keys if k[0] == id):
             size = len(residuals[key])
-            part = slice(start, start + size)
+            out[key] = residuals[key] + beyond[start : start + size]
             start += size
-            if key[0] == id and key != RATES:
-                own = z[part] + slope[part] @ shift if id not in without else z[part] / (1 - np.minimum(hat[part], 0.9))
-                out[key] = own
     return out
 
 
 def optimism(residuals: Mapping[Cell, np.ndarray], settled: Settled) -> float:
-    """By how much the squares are smaller than on captures that the numbers are not settled with.
+    """By how much the squares are smaller than on captures that the numbers are not settled with; at least 0.
 
-    Of a capture that alone tells a number nothing can be said.
+    Of the totals, and of a capture that alone tells a number, it is what chance lets as many numbers gain there: two
+    for each (Mallows, Technometrics 15 (1973) 661).
     """
-    return square(unseen(residuals, settled.slopes, cells=False)) - square(residuals)
+    keys, without = _alike(residuals, settled.slopes), alone(residuals, settled.slopes)
+    apart = unseen(residuals, settled.slopes)
+    slope = np.concatenate([settled.slopes[k] for k in keys])
+    inverse = np.linalg.pinv(slope.T @ slope, rcond=1e-10)
+    found = 0.0
+    for key in keys:
+        if key == RATES or key[0] in without:
+            found += 2 * float(np.trace(inverse @ settled.slopes[key].T @ settled.slopes[key]))
+        else:
+            found += float(apart[key] @ apart[key] - residuals[key] @ residuals[key])
+    return max(found, 0.0)
 
 
 def covariance_of(slopes: np.ndarray, own: np.ndarray) -> np.ndarray:
