@@ -222,6 +222,14 @@ def test_a_lamp_that_was_off_is_no_light_level() -> None:
     assert [made.drowned(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
     assert made.score(18.0) < -40 and made.score(18.0, 0.05) < -15
     assert abs(made.score(18.0, mean=18.0)) < 0.2 and made.score(30.0, mean=18.0) == pytest.approx(2.5, abs=0.4)
+    # and a recording of the model's own, made where there are as few, is none that stands out
+    bench = object.__new__(fit.Bench)
+    bench.seen = {
+        "flat": fit.Seen(Capture("flat", "tr", Light(500e-9), Conditions(1.0, 1, 1.0, 1.0, 5e-7)), 18.0, None, {})
+    }
+    state = fit.State({}, None, {}, {}, {"flat": made}, {}, {}, {}, [])  # type: ignore[arg-type]
+    own, data = (bench._score(state, "flat", 18.0, expected) for expected in (19.0, made.total_at(made.stated or 1.0)))
+    assert own is not None and abs(own) < 1 and data == made.score(18.0)
     # Poisson's own where the dark is most of it: 25 expected, 17 found
     dim = replace(made, level=1250.0, stated=1250.0, totals=np.full(48, 25.0), scatter=0.2)
     assert dim.drowned(17.0) and dim.score(17.0) == pytest.approx(-1.7, abs=0.1)
