@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_maps_of_pixels import CAPTURES, SENSOR, SIDE
 from tinylab import CROSSTALK, Lab, bench_of, labs, taken
 
 from spadmnist import config, recording, twin
@@ -172,28 +173,10 @@ def test_cells_that_look_elsewhere_follow_nothing() -> None:
         assert not len(blocks._same_places(a, b)[0])
 
 
-SIDE = 20
-DARK = f"""format: spadmnist-measurement/1
-name: lab
-layout: {{rows: {SIDE}, columns: {SIDE}}}
-captures:
-  - {{id: dark, file: dark.h5, modality: qis, light: {{kind: dark}}, frames: 60000, frame_time: 1 us,
-     frame_period: 1 us}}
-"""
-SENSOR = f"""sensor:
-  name: array
-  rules: device
-  layout: {{rows: {SIDE}, columns: {SIDE}, pixel_area: 100 um^2, fill_factor: 1.0}}
-  effects:
-    detection: {{pdp: 0.42}}
-    dark_counts: {{rate: 2 kHz}}
-"""
-
-
 def mapped(tmp_path: Path) -> tuple[Course, Rung]:
     """A map of dark count rates, of the one dark capture that there is; (the course, its last rung)."""
-    (tmp_path / "plan.yaml").write_text(DARK)
-    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    (tmp_path / "plan.yaml").write_text(CAPTURES)
+    (tmp_path / "sensor.yaml").write_text(SENSOR.replace("200 Hz", "2 kHz"))
     sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
     rates = 2000 * np.exp(0.3 * np.random.default_rng(4).standard_normal(SIDE**2))
     truth = with_values(sensor, {("dark_counts", "rate"): rates})

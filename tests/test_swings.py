@@ -66,7 +66,7 @@ def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> Non
     assert abs(off) < 6 * error / amplitude + math.radians(2)
     assert found.times == 1 and found.scaled() == found.values  # what it does is what it does at these values
     again = bench.residuals(state, found.moved)
-    assert fit.square(state.residuals) - fit.square(again) == pytest.approx(found.gain + refining.optimism(found))
+    assert fit.square(state.residuals) - fit.square(again) == pytest.approx(found.gain + 2 * len(found.phases) + 2)
     assert found.settled is not None
     _, low, high = found.settled.interval(0)
     assert low < found.values[AMPLITUDE] < high and high - low < 12 * error
