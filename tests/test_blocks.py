@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_maps_of_pixels import CAPTURES, SENSOR, SIDE
-from tinylab import CROSSTALK, Lab, bench_of, labs, taken
+from tinylab import CROSSTALK, Lab, bench_of, change_of, labs, taken
 
 from spadmnist import config, recording, twin
 from spadmnist import measurement as measurements
@@ -18,7 +18,7 @@ from spadmnist.criticism import course as course_of
 from spadmnist.criticism.candidates import with_values
 from spadmnist.criticism.course import Course
 from spadmnist.criticism.fit import Moved, halves_of
-from spadmnist.criticism.ladder import Rung
+from spadmnist.criticism.ladder import Rung, placebo_of
 from spadmnist.criticism.tried import Tried
 from spadmnist.effects import Conditions
 from spadmnist.events import Events, Layout
@@ -217,6 +217,25 @@ def test_captures_that_others_judge_stay_as_they_are(lab) -> None:
     assert settling.alone(z, alike) == set()
     assert settling.alone(z, {**alike, ("a", "x"): np.full((9, 1), 3.0)}) == {"a"}
     assert settling.alone(z, {cell: np.zeros((9, 1)) for cell in z}) == set()
+
+
+def test_a_placebo_is_as_strong_in_halves_as_in_the_whole(lab) -> None:
+    """Of directions side by side, too: the one that was tried is not set back to none."""
+    bench = bench_of(lab(side=4))
+    state = bench.state({})
+    gradient, crosstalk = (change_of(bench, f"add {name}") for name in ("illumination_gradient", "crosstalk"))
+    x, other = ("illumination_gradient", "x"), ("illumination_gradient", "y")
+    values = {**dict(gradient.fixed), x: 0.1}
+    (moved,) = bench.moved(state, [state.sensors.changed(values)])
+    assert isinstance(moved, Moved)
+    tried = Tried(gradient, values, moved, 5.0, 0.5)
+    best = Tried(crosstalk, {CROSSTALK: 0.01}, moved, 9.0, 1.0)
+    rung = placebo_of(bench, state, [tried], best, {"crosstalk"})
+    assert rung is not None and rung.placebo is not None and rung.row["placebo"]
+    assert rung.placebo[x] == pytest.approx(0.05) and rung.placebo[other] == 0
+    tried.gain = -1.0  # what only makes it worse is added with no strength at all
+    idle = placebo_of(bench, state, [tried], best, {"crosstalk"})
+    assert idle is not None and idle.placebo == {} and idle.row["placebo"]
 
 
 def test_the_ladder_of_a_number_that_one_capture_tells(lab) -> None:

@@ -115,6 +115,6 @@ def placebo_of(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, 
     times = one.times if one.gain > 0 else 0.0
     residuals = bench.residuals(state, one.moved, times)
     errors = errors_of(bench, state, residuals, one.moved.at(times))
-    values = {**one.scaled(), **dict(one.change.fixed)} if times else {}
+    values = one.scaled() if times else {}
     misfit = checks.misfit(state.own, residuals)
     return Rung(f"placebo: {title(one.change)}", state, misfit, errors, residuals, placebo=values)
