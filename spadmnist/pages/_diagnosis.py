@@ -361,7 +361,8 @@ beside this page: <b>{{ next }}</b>{% endif %}\
 <p class="small">The misfit is the mean squared difference between data and model in units of the model's own scatter,
 on data that the model was not settled by: each capture is judged by what the others settle, and where one alone tells
 a number or a map, it is cut into alternating blocks of time, and each half is judged by what the other settles (a
-misfit of half as many detections is about half as large). It can hardly fall below 1. A bar that reaches the dashed
+misfit of half as many detections is about half as large); what was tried in its place below is judged by whole
+captures. It can hardly fall below 1. A bar that reaches the dashed
 line is as good as a right model.{% for row in ladder if row.placebo %} The placebo is an effect that has nothing to do
 with it, at the strength that suits it best: that much falls whatever is added.{% endfor %} The columns say what is
 still wrong, in physical units.</p>
