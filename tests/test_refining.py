@@ -120,6 +120,13 @@ def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numb
     assert look.structured(state, [rows, gradient, map_]) == [rows, map_]
     other = Tried(change_of(bench, "add crosstalk"), {}, NOTHING, 1000.0, 1.0)
     assert look.structured(state, [other, rows, map_]) == [other, rows, map_]
+    # what one map in a thousand has of rows is none where the map itself is far beyond chance: a few odd pixels
+    told[rows.change.name], map_.chance = (9e-4, 40.0), 6e-10
+    assert look.structured(state, [rows, gradient, map_]) == [map_]
+    map_.chance = 1e-4  # a map that rows make is no more likely than they
+    assert look.structured(state, [rows, gradient, map_]) == [rows, map_]
+    told[rows.change.name], map_.chance = (1e-5, 40.0), 1e-30  # pixels that differ, and rows
+    assert look.structured(state, [rows, gradient, map_]) == [rows, map_]
 
 
 @pytest.mark.parametrize(("without", "kept"), [(0, False), (1, False), (2, True)])

@@ -48,6 +48,8 @@ _ALIKE, _BLURRED = 8.0, 0.3  # in chi square, between candidates of which neithe
 _MOSTLY = 0.5  # of the squares of a trace
 _LIKE = 0.4  # of a cosine between traces: others do not look alike
 _MOVED = 0.3  # standard deviations, by which a cell is moved
+_STANDS_OUT, _NO_DOUBT = 1e-3, 1e-4  # p-values of a pattern in a map, and of one beside which the map's is no matter
+_MAYBE = 100.0  # times as likely by chance as the map: a pattern still
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05  # of a map that is tried: its width, and that beside its noise
 
 
@@ -429,7 +431,10 @@ class Search:
         return [c for c in changes(state.sensors.one) if c.carrier and c.carrier not in settled]
 
     def structured(self, state: State, tried: list[Tried]) -> list[Tried]:
-        """Patterns before maps, but only those that stand out of the map's own scatter."""
+        """Patterns before maps, but only those that stand out of the map's own scatter.
+
+        Chance may put a few odd pixels into a row, if seldom: none, where it makes the whole map much more seldom.
+        """
         maps = [
             t
             for t in tried
@@ -440,6 +445,8 @@ class Search:
             return tried
         assert maps[0].maps is not None
         free = maps[0].maps[maps[0].change.carrier]  # type: ignore[index]
+        chance = 1.0 if maps[0].chance is None else maps[0].chance
+        doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
         layout = state.sensors.one.layout
         place = layout.centred.T
         radius = (place**2).sum(axis=0)
@@ -452,7 +459,7 @@ class Search:
             else:
                 designs[one.change.name] = np.stack([*place, radius], axis=1)
         found = mapping.patterned(free, designs)
-        real = [t for t in patterns if found[t.change.name][0] < 1e-3]
+        real = [t for t in patterns if found[t.change.name][0] < doubtful]
         dropped = [t for t in patterns if t not in real]
         rest = [t for t in tried if t not in dropped]
         if real and (rest[0] in maps or rest[0] in real):
