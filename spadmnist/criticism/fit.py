@@ -40,10 +40,12 @@ _LEAST_TOTAL, _NEVER = 5.0, 0.5  # detections that say something; fewer than the
 _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
 _SEEN = 1.0  # variance of chance, of what a trace has in a statistic
-_WIDEST = 2.3  # of the logarithm of two scatters
+_WIDEST, _WIDER = 2.3, 0.5  # of the logarithm of two scatters: no more is believed, and so much is no chance
+_FLUCTUATES = 3.0  # times the model's own scatter of totals, which another one's exceeds
 _SURE_SQUARE = 30.0  # in variances, of what is never chance
 _BESIDE = 9  # powers beside one, of which most are no line
 FEW = 4  # recordings that tell the difference between two models
+_SURELY = 8  # the same of two whose totals do not differ as the closed form has it
 Kept = Literal["sure", "likely", "all"]  # of what a few recordings show
 
 
@@ -152,7 +154,7 @@ class Moved:
     """What another model does: by how much each cell's expectation shifts, in proportion to its strength.
 
     nothing: it does nothing at all in these captures, whatever its strength. even: what grows with the square of it,
-    and so is the same for both signs.
+    and so is the same for both signs. fluctuates: are the totals of recordings far less alike than the model's own?
     """
 
     shifts: dict[Cell, np.ndarray]
@@ -160,6 +162,7 @@ class Moved:
     logs: dict[str, float]  # of the light that gives as many detections
     nothing: bool = False
     even: Moved | None = None
+    fluctuates: bool = False
 
     def only(self, ids: Collection[str]) -> Moved:
         """The same, seen in some captures alone; of the others, the totals."""
@@ -630,7 +633,7 @@ class Bench:
             for id in ids:
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = iter(self.simulate(wanted, hasty=hasty))
+        results = iter(self._more_of_doubtful(state, wanted, self.simulate(wanted, hasty=hasty), hasty))
         out: list[Moved | str] = []
         for sensors, ids in zip(models, ids_of, strict=True):
             made = {id: next(results) for id in ids}
@@ -638,25 +641,70 @@ class Bench:
             out.append(wrong[0] if wrong else self._moved(state, sensors, made, kept))  # type: ignore[arg-type]
         return out
 
+    def _more_of_doubtful(
+        self,
+        state: State,
+        wanted: Sequence[tuple[Sensors, str, np.ndarray, np.ndarray]],
+        made: list[Made | str],
+        hasty: bool,
+    ) -> list[Made | str]:
+        """Recordings, and more where the totals of a few are others than the closed form has.
+
+        Light that fluctuates gives other totals in every recording, and two of them may go the same way.
+        """
+        doubtful, again = [], []
+        for k, ((sensors, id, _, numbers), one) in enumerate(zip(wanted, made, strict=True)):
+            if isinstance(one, Made) and len(numbers) < _SURELY and self._beyond_closed_form(state, sensors, id, one):
+                doubtful.append(k)
+        for k in doubtful:
+            sensors, id, photons, numbers = wanted[k]
+            more = np.arange(len(numbers), min(_SURELY, len(state.factors[id])), dtype=np.uint64)
+            level = photons[0] / state.factors[id][0]
+            again.append((sensors, id, level * state.factors[id][more.astype(int)], more))
+        out = list(made)
+        for k, more_of in zip(doubtful, self.simulate(again, hasty=hasty) if again else [], strict=True):
+            first = out[k]
+            out[k] = _joined([first, more_of]) if isinstance(first, Made) and isinstance(more_of, Made) else more_of
+        return out
+
+    def _beyond_closed_form(self, state: State, sensors: Sensors, id: str, made: Made) -> float:
+        """By how much the log of a capture's totals is larger than by the closed form; 0 where it may be chance.
+
+        The closed form has no scatter: where the recordings do not contradict it, it serves.
+        """
+        if sensors.typical is not None:
+            return 0.0
+        apart, usual = self._apart(state, sensors, id, made), state.rates[id]
+        own = float(np.std(apart)) if len(apart) > 2 else math.inf
+        # a few that have gone the same way by chance lie closer together than others would
+        alike = own if len(apart) >= _SURELY else min(own, 1.5 * usual.scatter)
+        beyond = float(np.mean(apart))
+        return beyond if abs(beyond) > 3.5 * alike / math.sqrt(len(apart)) else 0.0
+
+    def _apart(self, state: State, sensors: Sensors, id: str, made: Made) -> np.ndarray:
+        """(recordings,) by how much the logs of a capture's totals are larger than by the closed form."""
+        base, some = state.made[id], made.numbers.astype(int)
+        apart = np.log(np.maximum(made.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
+        if abs(math.log(self.matched(state, sensors.usual(id), id))) < 1e-12:
+            apart += self.needed(state, sensors.usual(id), id)  # no other level gave as many
+        return np.asarray(apart)
+
     def _moved(self, state: State, sensors: Sensors, made: dict[str, Made], kept: Kept) -> Moved | str:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
-        nothing = True
+        nothing, fluctuates = True, False
         for id in state.rates.keys() - made.keys():  # not simulated: of a capture's total the closed form tells enough
             logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
             base, some = state.made[id], other.numbers.astype(int)
             assert some[-1] == len(some) - 1  # the model's first ones, beside its own first ones
-            apart = np.log(np.maximum(other.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
-            # the closed form has no scatter: where the recordings do not contradict it, it serves
             usual = state.rates[id]
             logs[id] = self.needed(state, sensors.usual(id), id)
-            if abs(math.log(self.matched(state, sensors.usual(id), id))) < 1e-12:
-                apart += logs[id]  # no other level gave as many
-            beyond = float(np.mean(apart))
-            alike = min(float(np.std(apart)) if len(apart) > 2 else math.inf, 1.5 * usual.scatter)
-            if sensors.typical is None and abs(beyond) > 3.5 * alike / math.sqrt(len(apart)):
+            scatter = float(np.std(self._apart(state, sensors, id, other)))
+            fluctuates = fluctuates or scatter > _FLUCTUATES * usual.scatter
+            beyond = self._beyond_closed_form(state, sensors, id, other)
+            if beyond:
                 logs[id] -= beyond / max(usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2], 0.05)
             for name, values in other.values.items():
                 cell = id, name
@@ -678,7 +726,7 @@ class Bench:
                     shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
-        return Moved(shifts, noise, logs, nothing)
+        return Moved(shifts, noise, logs, nothing, fluctuates=fluctuates and sensors.typical is None)
 
     def both(self, state: State, up: Moved, down: Moved, few: int) -> Moved:
         """`Moved.both` of what so many recordings of a strength and of its opposite show at this state."""
@@ -786,29 +834,44 @@ def square(residuals: Mapping[Cell, np.ndarray]) -> float:
     return sum(float(z @ z) for z in residuals.values())
 
 
-def likelier(state: State, other: State, trace: Mapping[Cell, np.ndarray] | None = None) -> float:
+def likelier(
+    state: State, other: State, trace: Mapping[Cell, np.ndarray] | None = None, fluctuates: bool = False
+) -> float:
     """By how much twice the log likelihood of another model is larger, each cell judged by that model's own scatter.
 
     A model whose cells scatter more has smaller squares whatever is true: the logarithm of the scatter counts. trace:
     of the other model (`Bench.template`); of thousands of cells in which it has none, chance alone would decide.
+    fluctuates: is what it does another in every recording? Then cells count that scatter more, and the totals.
     """
     out = 0.0
     for cell in other.residuals.keys() & state.residuals.keys():
-        if trace is not None and not float(trace[cell] @ trace[cell]) > _SEEN:
-            continue
         z, there = state.residuals[cell], other.residuals[cell]
+        if cell == RATES and fluctuates:
+            out += float(z @ z - there @ there) + 2 * (_narrowness(other) - _narrowness(state))
+            continue
+        seen = trace is None or float(trace[cell] @ trace[cell]) > _SEEN
+        if not (seen or fluctuates):
+            continue
         if cell not in other.nulls or cell not in state.nulls:
             out += float(z @ z - there @ there)
             continue
         null, new = state.nulls[cell], other.nulls[cell]
         if null.law == "exponential":  # a power scatters as its mean does
             powers, relative = powers_of(z * null.factor), powers_of(there * new.factor)
-            fall, wider = 2 * float(np.sum(powers - relative)), np.log(powers / relative)
+            fall, wider = 2 * (powers - relative), np.log(powers / relative)
         else:
-            fall, wider = float(z @ z - there @ there), np.log(new.breadth / null.breadth)
+            fall, wider = z**2 - there**2, np.log(new.breadth / null.breadth)
         # a cell that never moved has no scatter to compare with
-        out += fall - 2 * float(np.sum(np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)))
+        gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
+        if fluctuates and trace is not None:
+            gain = gain[(seen & (trace[cell] != 0)) | np.broadcast_to(wider > _WIDER, z.shape)]
+        out += float(np.sum(gain))
     return out
+
+
+def _narrowness(state: State) -> float:
+    """Log of how narrow the totals' law is."""
+    return float(np.linalg.slogdet(state.space[2])[1]) if state.space is not None else 0.0
 
 
 def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:

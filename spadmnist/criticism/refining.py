@@ -28,6 +28,7 @@ _LINE = 0.25  # of the square of a trace, in one cell of a spectrum
 _LEAST_BOOST = 1.5  # worth it
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
+_EACH = 2.0  # in chi square, of a number that is settled
 _BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 
 
@@ -76,7 +77,10 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     one.gain = square(state.residuals) - found.square
     if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
         one.gain = likelier(state, state_of(bench, one), trace)
-    one.gain -= optimism(one)
+    if (one.there or one.moved).fluctuates:  # and so is light that is another in every recording
+        one.gain = likelier(state, state_of(bench, one), trace, fluctuates=True) - _EACH * len(dials)
+    else:
+        one.gain -= optimism(one)
     return one
 
 
