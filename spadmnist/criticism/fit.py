@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from .. import twin
 from ..errors import EffectError, SpadError
@@ -41,7 +41,8 @@ _SOME = 0.3  # standard deviations: less says nothing of the size of one
 _FAINT = 1e-6  # of the light: none
 _SEEN = 1.0  # variance of chance, of what a trace has in a statistic
 _WIDEST, _WIDER = 2.3, 0.5  # of the logarithm of two scatters: no more is believed, and so much is no chance
-_FLUCTUATES = 3.0  # times the model's own scatter of totals, which another one's exceeds
+_ALIKE, _FLUCTUATES = 1.5, 3.0  # times the model's own scatter of totals: as wide is another's; one that is far wider
+_CHANCE = 2.3e-4  # p-value, to one side, of totals beside the closed form
 _SURE_SQUARE = 30.0  # in variances, of what is never chance
 _BESIDE = 9  # powers beside one, of which most are no line
 FEW = 4  # recordings that tell the difference between two models
@@ -633,7 +634,10 @@ class Bench:
             for id in ids:
                 level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
                 wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
-        results = iter(self._more_of_doubtful(state, wanted, self.simulate(wanted, hasty=hasty), hasty))
+        simulated = self.simulate(wanted, hasty=hasty)
+        if kept == "sure":  # a slope is a difference of the same few recordings
+            simulated = self._more_of_doubtful(state, wanted, simulated, hasty)
+        results = iter(simulated)
         out: list[Moved | str] = []
         for sensors, ids in zip(models, ids_of, strict=True):
             made = {id: next(results) for id in ids}
@@ -654,7 +658,8 @@ class Bench:
         """
         doubtful, again = [], []
         for k, ((sensors, id, _, numbers), one) in enumerate(zip(wanted, made, strict=True)):
-            if isinstance(one, Made) and len(numbers) < _SURELY and self._beyond_closed_form(state, sensors, id, one):
+            few = len(numbers) < min(_SURELY, len(state.factors[id])) and sensors.typical is None
+            if few and isinstance(one, Made) and _shared(self._apart(state, sensors, id, one), state.rates[id].scatter):
                 doubtful.append(k)
         for k in doubtful:
             sensors, id, photons, numbers = wanted[k]
@@ -666,20 +671,6 @@ class Bench:
             first = out[k]
             out[k] = _joined([first, more_of]) if isinstance(first, Made) and isinstance(more_of, Made) else more_of
         return out
-
-    def _beyond_closed_form(self, state: State, sensors: Sensors, id: str, made: Made) -> float:
-        """By how much the log of a capture's totals is larger than by the closed form; 0 where it may be chance.
-
-        The closed form has no scatter: where the recordings do not contradict it, it serves.
-        """
-        if sensors.typical is not None:
-            return 0.0
-        apart, usual = self._apart(state, sensors, id, made), state.rates[id]
-        own = float(np.std(apart)) if len(apart) > 2 else math.inf
-        # a few that have gone the same way by chance lie closer together than others would
-        alike = own if len(apart) >= _SURELY else min(own, 1.5 * usual.scatter)
-        beyond = float(np.mean(apart))
-        return beyond if abs(beyond) > 3.5 * alike / math.sqrt(len(apart)) else 0.0
 
     def _apart(self, state: State, sensors: Sensors, id: str, made: Made) -> np.ndarray:
         """(recordings,) by how much the logs of a capture's totals are larger than by the closed form."""
@@ -701,11 +692,11 @@ class Bench:
             assert some[-1] == len(some) - 1  # the model's first ones, beside its own first ones
             usual = state.rates[id]
             logs[id] = self.needed(state, sensors.usual(id), id)
-            scatter = float(np.std(self._apart(state, sensors, id, other)))
-            fluctuates = fluctuates or scatter > _FLUCTUATES * usual.scatter
-            beyond = self._beyond_closed_form(state, sensors, id, other)
-            if beyond:
-                logs[id] -= beyond / max(usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2], 0.05)
+            if sensors.typical is None:
+                apart = self._apart(state, sensors, id, other)
+                fluctuates = fluctuates or float(np.std(apart)) > _FLUCTUATES * usual.scatter
+                slope = usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2]
+                logs[id] -= _shared(apart, usual.scatter) / max(slope, 0.05)
             for name, values in other.values.items():
                 cell = id, name
                 if cell not in state.residuals:
@@ -726,7 +717,7 @@ class Bench:
                     shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
-        return Moved(shifts, noise, logs, nothing, fluctuates=fluctuates and sensors.typical is None)
+        return Moved(shifts, noise, logs, nothing, fluctuates=fluctuates)
 
     def both(self, state: State, up: Moved, down: Moved, few: int) -> Moved:
         """`Moved.both` of what so many recordings of a strength and of its opposite show at this state."""
@@ -792,6 +783,20 @@ class Bench:
             else:
                 out[cell] = shift / np.maximum(scale, 0.5 if null.law == "poisson" else 1e-30)
         return out
+
+
+def _shared(apart: np.ndarray, scatter: float) -> float:
+    """Mean of some logs of totals beside the closed form, 0 where it may be chance. scatter: of the model's own.
+
+    The closed form has no scatter: where the recordings do not contradict it, it serves.
+    """
+    n, mean = len(apart), float(np.mean(apart))
+    own = float(np.std(apart)) if n > 2 else 0.0
+    if own > _ALIKE * scatter and (n >= _SURELY or own > _FLUCTUATES * scatter):
+        likely = float(stats.t.isf(_CHANCE, n - 1)) * own / math.sqrt(n - 1)
+    else:  # a few that have gone the same way by chance lie closer together than others would
+        likely = float(stats.norm.isf(_CHANCE)) * min(own or math.inf, _ALIKE * scatter) / math.sqrt(n)
+    return mean if abs(mean) > likely else 0.0
 
 
 def _joined(parts: Sequence[Made]) -> Made:
