@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tinylab import bench_of, change_of
 
+from spadmnist.criticism import course as course_of
 from spadmnist.criticism import refining
 from spadmnist.criticism.fit import RATES, Moved, likelier
 from spadmnist.criticism.tried import Tried
@@ -75,3 +76,12 @@ def test_a_lamp_that_drifts_about_for_long_is_found_by_its_totals(lab) -> None:
     squares = sum(float(z @ z) for z in state.residuals.values())
     fall = squares - sum(float(z @ z) for z in (one.residuals or {}).values())
     assert one.gain > fall + 8.0
+
+
+def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_all_recordings(lab) -> None:
+    """Of any other model a few recordings tell how the cells follow its numbers: they are the same in each."""
+    bench = bench_of(lab(light=1000))
+    course = course_of.begun(bench)
+    assert course_of._recordings(course, course.state) == 8
+    noisy = bench.state({CONTRAST: 0.2, COHERENCE: 20e-3})
+    assert course_of._recordings(course, noisy) == bench.replicates == 16

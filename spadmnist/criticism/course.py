@@ -170,7 +170,8 @@ def _followed(
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
-        closer = settling.follow(bench, state, dials, here, state.sensors.changed, 2 * fit.FEW, errors, slopes, near)
+        few = _recordings(course, state)
+        closer = settling.follow(bench, state, dials, here, state.sensors.changed, few, errors, slopes, near)
         if isinstance(closer, str):
             break
         settled = closer
@@ -189,11 +190,19 @@ def _followed(
     return settled, state, maps
 
 
+def _recordings(course: Course, state: State) -> int:
+    """How many recordings tell how the cells follow the numbers: a lamp that fluctuates is another one in each."""
+    start = course.ladder[0].state.rates
+    if any(fit.fluctuates(rates.scatter, start[id].scatter) for id, rates in state.rates.items()):
+        return len(state.own[RATES])
+    return 2 * fit.FEW
+
+
 def _held(course: Course, settled: Settled) -> Settled:
     """The last step of all was not simulated: it is not taken where it loses a line or an edge, as no slope knows."""
     bench, state, dials = course.bench, course.state, settled.dials
     there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
-    (moved,) = bench.moved(state, [state.sensors.changed(there)], 2 * fit.FEW)
+    (moved,) = bench.moved(state, [state.sensors.changed(there)], _recordings(course, state))
     now = square(state.residuals)
     if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
         return replace(settled, point=settling.point_of(dials, course.values), residuals=state.residuals)

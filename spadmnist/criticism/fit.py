@@ -684,7 +684,7 @@ class Bench:
         shifts: dict[Cell, np.ndarray] = {}
         noise: dict[Cell, float] = {}
         logs = {}
-        nothing, fluctuates = True, False
+        nothing, scattered = True, False
         for id in state.rates.keys() - made.keys():  # not simulated: of a capture's total the closed form tells enough
             logs[id] = self.needed(state, sensors.usual(id), id)
         for id, other in made.items():
@@ -694,7 +694,7 @@ class Bench:
             logs[id] = self.needed(state, sensors.usual(id), id)
             if sensors.typical is None:
                 apart = self._apart(state, sensors, id, other)
-                fluctuates = fluctuates or float(np.std(apart)) > _FLUCTUATES * usual.scatter
+                scattered = scattered or fluctuates(float(np.std(apart)), usual.scatter)
                 slope = usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2]
                 logs[id] -= _shared(apart, usual.scatter) / max(slope, 0.05)
             for name, values in other.values.items():
@@ -717,7 +717,7 @@ class Bench:
                     shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
                 if shift.any():
                     shifts[cell], noise[cell] = shift, left
-        return Moved(shifts, noise, logs, nothing, fluctuates=fluctuates)
+        return Moved(shifts, noise, logs, nothing, fluctuates=scattered)
 
     def both(self, state: State, up: Moved, down: Moved, few: int) -> Moved:
         """`Moved.both` of what so many recordings of a strength and of its opposite show at this state."""
@@ -785,6 +785,11 @@ class Bench:
         return out
 
 
+def fluctuates(scatter: float, usual: float) -> bool:
+    """Are totals that scatter so much those of light that is another in every recording? usual: without it."""
+    return scatter > _FLUCTUATES * usual
+
+
 def _shared(apart: np.ndarray, scatter: float) -> float:
     """Mean of some logs of totals beside the closed form, 0 where it may be chance. scatter: of the model's own.
 
@@ -792,7 +797,7 @@ def _shared(apart: np.ndarray, scatter: float) -> float:
     """
     n, mean = len(apart), float(np.mean(apart))
     own = float(np.std(apart)) if n > 2 else 0.0
-    if own > _ALIKE * scatter and (n >= _SURELY or own > _FLUCTUATES * scatter):
+    if own > _ALIKE * scatter and (n >= _SURELY or fluctuates(own, scatter)):
         likely = float(stats.t.isf(_CHANCE, n - 1)) * own / math.sqrt(n - 1)
     else:  # a few that have gone the same way by chance lie closer together than others would
         likely = float(stats.norm.isf(_CHANCE)) * min(own or math.inf, _ALIKE * scatter) / math.sqrt(n)
