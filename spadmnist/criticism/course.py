@@ -33,6 +33,7 @@ _LEFT = 0.15  # of the squared residuals of its own cells, a step leaves less
 _HALF = 1.96  # standard deviations: half of an interval of 95 %
 _MOVED = 0.5  # standard deviations, beyond which a model is another one
 _LOST = 30.0  # in chi square: what costs so much is no step to the better
+_MANY = 32  # recordings that are not alike, of which slopes are made
 _STEP = 0.01  # of a coordinate, for how the pixels' light follows it
 _VAIN = 2  # steps that only look like what is there
 _NEEDLESS = 9.0  # a step whose loss costs less is dropped
@@ -191,10 +192,10 @@ def _followed(
 
 
 def _recordings(course: Course, state: State) -> int:
-    """How many recordings tell how the cells follow the numbers: a lamp that fluctuates is another one in each."""
+    """How many recordings tell how the cells follow the numbers: many of a lamp that is another one in each."""
     start = course.ladder[0].state.rates
     if any(fit.fluctuates(rates.scatter, start[id].scatter) for id, rates in state.rates.items()):
-        return len(state.own[RATES])
+        return min(len(state.own[RATES]), _MANY)
     return 2 * fit.FEW
 
 
