@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import bench_of, change_of
+from tinylab import CROSSTALK, bench_of, change_of, names, quiet, taken
 
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import refining
+from spadmnist.criticism import fit, refining
+from spadmnist.criticism.candidates import with_values
 from spadmnist.criticism.fit import RATES, Moved, likelier
 from spadmnist.criticism.tried import Tried
 
@@ -39,6 +41,33 @@ def test_totals_that_go_the_same_way_in_two_recordings_are_chance(lab) -> None:
     assert not moved.fluctuates
 
 
+@pytest.mark.parametrize(
+    ("apart", "believed"),
+    [
+        ([0.03, 0.035], False),  # two: their mean scatters by 0.007 as the model's own do; 1.5 times as much is alike
+        ([0.04, 0.045], True),
+        ([0.04, 0.05, 0.06, 0.05], True),  # as alike as the model's own, and far from 0
+        ([0.00, 0.10, 0.02, 0.08], False),  # the mean is 0.05 as well, but of light that is another one in each
+        ([0.05, 0.10, 0.02, 0.08, 0.07, 0.04, 0.01, 0.09], False),  # 5.5 standard errors: of eight 1 in 1000
+        ([0.25, 0.30, 0.22, 0.28, 0.27, 0.24, 0.21, 0.29], True),  # it fluctuates, and there is more of it
+    ],
+)
+def test_what_a_few_totals_share(apart: list[float], believed: bool) -> None:
+    """Their scatter in the model's own recordings: 1 %."""
+    shared = fit._shared(np.array(apart), 0.01)
+    assert shared == (pytest.approx(np.mean(apart)) if believed else 0.0)
+
+
+def test_a_lamp_is_seen_to_fluctuate_beside_a_chip_that_is_not_known_exactly(lab) -> None:
+    bench = bench_of(lab(light=1000))
+    sensors = bench.state({}).sensors.changed({}, chips=True)
+    state = bench.state({}, sensors)
+    for contrast in (0.1, 1e-4):
+        (moved,) = bench.moved(state, [sensors.changed({CONTRAST: contrast, COHERENCE: 3e-3})], 4)
+        assert isinstance(moved, Moved)
+        assert moved.fluctuates == (contrast > 0.01)
+
+
 def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     """Six numbers and three totals that are three times as wide: -2 log 3 for each, if they are as wide as stated.
 
@@ -63,8 +92,11 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     assert likelier(quiet_now, quiet_there, trace, fluctuates=True) == pytest.approx(9 * (8 / 9 - 2 * math.log(3)))
 
 
-def test_a_lamp_that_drifts_about_for_long_is_found_by_its_totals(lab) -> None:
-    """Its coherence time is the exposure: all that one recording has of it is another total, which no trace has."""
+def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> None:
+    """Its coherence time is the exposure: most that one recording has of it is another total, which no trace has.
+
+    Nor is it weighed against others by squares, for they fall whatever makes the totals wider.
+    """
     noise = "    source_noise: {contrast: 0.2, coherence_time: 40 ms}\n"
     bench = bench_of(lab(noise, light=1000, seed=3))
     state = bench.state({})
@@ -76,12 +108,51 @@ def test_a_lamp_that_drifts_about_for_long_is_found_by_its_totals(lab) -> None:
     squares = sum(float(z @ z) for z in state.residuals.values())
     fall = squares - sum(float(z @ z) for z in (one.residuals or {}).values())
     assert one.gain > fall + 8.0
+    assert one.fluctuates
+    assert one.scatters
+    rivals = [Tried(change_of(bench, "add crosstalk"), {}, moved, one.gain - 1.0, 1.0) for _ in range(2)]
+    for rival in rivals:
+        rival.moved, rival.residuals, rival.state = replace(moved, fluctuates=False), state.residuals, state
+    before = one.gain
+    quiet(bench).weigh(state, [one, *rivals])
+    assert [t.gain for t in (one, *rivals)] == [before, before - 1.0, before - 1.0]
 
 
-def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_all_recordings(lab) -> None:
-    """Of any other model a few recordings tell how the cells follow its numbers: they are the same in each."""
-    bench = bench_of(lab(light=1000))
-    course = course_of.begun(bench)
-    assert course_of._recordings(course, course.state) == 8
-    noisy = bench.state({CONTRAST: 0.2, COHERENCE: 20e-3})
-    assert course_of._recordings(course, noisy) == bench.replicates == 16
+@pytest.mark.parametrize("contrast", [0.05, 0.0])
+def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -> None:
+    """Beside later steps: judged by how wide it makes them itself, nothing would ever be missed without it."""
+    noise = f"    source_noise: {{contrast: {contrast}, coherence_time: 2 s}}\n" if contrast else ""
+    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=3)))
+    taken(course, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, settle=False)
+    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    course_of.drop_needless(course)
+    assert names(course) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]
+
+
+def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, monkeypatch) -> None:
+    """Of any other model a few recordings tell how the cells follow its numbers: they are the same in each.
+
+    Whether the sensor has such a lamp from the start or was given it is no matter.
+    """
+    many: list[int] = []
+    follow, moved = course_of.settling.follow, fit.Bench.moved
+    monkeypatch.setattr(course_of.settling, "follow", lambda *a: many.append(a[5]) or follow(*a))
+    for noise, lamp, replicates in [(False, False, 40), (False, True, 40), (False, True, 16), (True, True, 40)]:
+        stated = f"    source_noise: {{contrast: {0.2 if lamp else 0.0}, coherence_time: 20 ms}}\n"
+        sensor, data = lab(stated if lamp else "", light=1000)
+        if noise:
+            sensor = with_values(sensor, {CONTRAST: 0.2, COHERENCE: 20e-3})
+        course = course_of.begun(bench_of((sensor, data), replicates))
+        if lamp and not noise:
+            course.state = course.bench.state({CONTRAST: 0.2, COHERENCE: 20e-3})
+        held: list[int] = []
+        with monkeypatch.context() as patch:
+            patch.setattr(fit.Bench, "moved", lambda *a, **k: held.append(a[3]) or moved(*a, **k))  # noqa: B023
+            dials = tuple(change_of(course.bench, "add crosstalk").dials[:1])
+            course.values[CROSSTALK] = 0.01
+            found, _, _ = course_of._followed(course, course.state, {}, dials, {})
+            assert found is not None
+            held.clear()
+            course_of._held(course, found)
+        wanted = min(replicates, 32) if lamp else 8
+        assert many[-1] == held[0] == wanted

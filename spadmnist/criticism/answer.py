@@ -61,6 +61,7 @@ class Step:
     dials: tuple[Dial, ...] = ()
     phased: bool = False
     chips: bool = False
+    fluctuates: bool = False
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)

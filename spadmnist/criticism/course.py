@@ -15,7 +15,7 @@ from ..measurement import Measurement
 from . import checks, fit, likelihood, mapping, recordings, settling
 from .answer import Step, Value, title
 from .candidates import Change, Dial, Key, with_values
-from .fit import RATES, Bench, Cell, Sensors, State, square
+from .fit import RATES, Bench, Cell, Sensors, State, likelier, square
 from .ladder import Mapped, Rung, errors_of
 from .refining import EXCLUDED, UNSEEN
 from .search import Search
@@ -127,6 +127,7 @@ def accept(course: Course, best: Tried, significance: float) -> list[Step]:
             before=dict(before.residuals),
             phased=bool(best.phases),
             chips=best.chips,
+            fluctuates=best.fluctuates,
             intervals=dict(best.intervals),
         )
         for change in best.changes
@@ -171,8 +172,9 @@ def _followed(
     near: Settled | None = None
     for turn in range(_AGAIN + 1):
         here = {d.key: course.values[d.key] for d in dials}
-        few = _recordings(course, state)
-        closer = settling.follow(bench, state, dials, here, state.sensors.changed, few, errors, slopes, near)
+        closer = settling.follow(
+            bench, state, dials, here, state.sensors.changed, _recordings(state), errors, slopes, near
+        )
         if isinstance(closer, str):
             break
         settled = closer
@@ -191,19 +193,16 @@ def _followed(
     return settled, state, maps
 
 
-def _recordings(course: Course, state: State) -> int:
+def _recordings(state: State) -> int:
     """How many recordings tell how the cells follow the numbers: many of a lamp that is another one in each."""
-    start = course.ladder[0].state.rates
-    if any(fit.fluctuates(rates.scatter, start[id].scatter) for id, rates in state.rates.items()):
-        return min(len(state.own[RATES]), _MANY)
-    return 2 * fit.FEW
+    return min(len(state.own[RATES]), _MANY) if state.fluctuates else 2 * fit.FEW
 
 
 def _held(course: Course, settled: Settled) -> Settled:
     """The last step of all was not simulated: it is not taken where it loses a line or an edge, as no slope knows."""
     bench, state, dials = course.bench, course.state, settled.dials
     there = {d.key: d.value(float(x)) for d, x in zip(dials, settled.point, strict=True)}
-    (moved,) = bench.moved(state, [state.sensors.changed(there)], _recordings(course, state))
+    (moved,) = bench.moved(state, [state.sensors.changed(there)], _recordings(state))
     now = square(state.residuals)
     if isinstance(moved, str) or square(bench.residuals(state, moved)) > now + _LOST:
         return replace(settled, point=settling.point_of(dials, course.values), residuals=state.residuals)
@@ -419,7 +418,10 @@ def drop_needless(course: Course) -> None:
             continue
         if step.change.carrier:
             if not course.steps[-1].change.carrier:  # which may be what makes the pixels differ
-                _drop_map(course, step)
+                _drop_unless_missed(course, step)
+            continue
+        if step.fluctuates:  # squares of residuals that are as wide as with it do not miss it
+            _drop_unless_missed(course, step)
             continue
         rest = {k: v for k, v in course.values.items() if k not in _keys_of(step.change, course)}
         sensors = Sensors.same(bench.start).changed(rest, course.search.phases)
@@ -446,8 +448,11 @@ def drop_needless(course: Course) -> None:
             course.rung(f"- {title(step.change)}")
 
 
-def _drop_map(course: Course, step: Step) -> None:
-    """Take a map out again, unless some check fails without it that does not with it."""
+def _drop_unless_missed(course: Course, step: Step) -> None:
+    """Take a step out again, unless some check fails without it that does not with it.
+
+    Light that fluctuates stays where it is likelier, too: if no check failed, its trace is all that has told it.
+    """
     before, failed = course.kept(), len(course.failed)
     course.bench.say(f"is {title(step.change)} still needed?")
     course.steps = [s for s in course.steps if s is not step]
@@ -455,7 +460,11 @@ def _drop_map(course: Course, step: Step) -> None:
     kept = set().union(*(_keys_of(s.change, course) for s in course.steps))
     course.values = {k: x for k, x in course.values.items() if k in kept}
     settle_all(course)
-    if len(course.failed) > failed:
+    missed = len(course.failed) > failed
+    if step.fluctuates and not missed:
+        trace = {cell: step.template.get(cell, np.zeros_like(z)) for cell, z in before[0].residuals.items()}
+        missed = likelier(course.state, before[0], trace, fluctuates=True) > _NEEDLESS
+    if missed:
         course.back_to(before)
     else:
         course.rung(f"- {title(step.change)}")

@@ -36,7 +36,7 @@ from .course import (
 from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State, square
 from .ladder import Rung, placebo_of
-from .refining import refine, state_of
+from .refining import refine
 from .search import alike, gain_beside
 from .tried import Tried, at_end
 
@@ -364,14 +364,12 @@ def _alternatives(
         if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
             continue
         residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
-        # where chance makes pixels odd, the model's own recordings scatter otherwise
         judged, left = state, residuals
-        if one.chips and one.residuals is not None:
-            judged = state_of(bench, one)
-            left = judged.residuals
+        if one.scatters and one.state is not None:
+            judged, left = one.state, one.state.residuals
         failed = checks.failing(checks.blocks(bench, judged, left))
         most, gain = gain_beside(best, one), gain_beside(one, best)
-        if judged is not state:  # a few odd pixels do not follow the law of scatter by which it may gain little
+        if one.chips and judged is not state:  # by the law of scatter a few odd pixels may gain little
             gain = max(gain, square(state.residuals) - square(residuals))
         near = most - gain < alike(most) or (at_end(best) and gain > _ALMOST * most)
         as_good = one.residuals is not None and near and not failed

@@ -134,6 +134,12 @@ class State:
 
         return self.once(("before", cell, few), make)
 
+    @property
+    def fluctuates(self) -> bool:
+        """Is the light another one in every recording: are their totals far less alike than chance alone has them?"""
+        simulated = (self.rates[id] for id in self.made)
+        return any(far_wider(r.scatter, 1 / math.sqrt(max(r.expected(r.level), 1.0))) for r in simulated)
+
     def usual(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
         """What a statistic's null expects of so many detections, see `Null.expected`."""
         return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
@@ -218,7 +224,8 @@ class Moved:
             usual = ndimage.median_filter(powers[cell], _BESIDE)  # type: ignore[index]  # a line's own has a sign
             chance = 2 * usual * np.abs(even.shifts[cell]) / few  # variance of what grows in proportion
             odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
-        return Moved(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even)
+        scatters = up.fluctuates or down.fluctuates
+        return Moved(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even, scatters)
 
 
 @dataclass(frozen=True)
@@ -692,9 +699,9 @@ class Bench:
             assert some[-1] == len(some) - 1  # the model's first ones, beside its own first ones
             usual = state.rates[id]
             logs[id] = self.needed(state, sensors.usual(id), id)
+            apart = self._apart(state, sensors, id, other)
+            scattered = scattered or far_wider(float(np.std(apart)), usual.scatter)
             if sensors.typical is None:
-                apart = self._apart(state, sensors, id, other)
-                scattered = scattered or fluctuates(float(np.std(apart)), usual.scatter)
                 slope = usual.level_of(math.exp(math.log(usual.expected(usual.level))))[2]
                 logs[id] -= _shared(apart, usual.scatter) / max(slope, 0.05)
             for name, values in other.values.items():
@@ -785,7 +792,7 @@ class Bench:
         return out
 
 
-def fluctuates(scatter: float, usual: float) -> bool:
+def far_wider(scatter: float, usual: float) -> bool:
     """Are totals that scatter so much those of light that is another in every recording? usual: without it."""
     return scatter > _FLUCTUATES * usual
 
@@ -793,11 +800,12 @@ def fluctuates(scatter: float, usual: float) -> bool:
 def _shared(apart: np.ndarray, scatter: float) -> float:
     """Mean of some logs of totals beside the closed form, 0 where it may be chance. scatter: of the model's own.
 
-    The closed form has no scatter: where the recordings do not contradict it, it serves.
+    The closed form has no scatter: where the recordings do not contradict it, it serves. Of few that are about as alike
+    as the model's own it is a rule of thumb: some that lie close together by chance are believed, for they are near it.
     """
     n, mean = len(apart), float(np.mean(apart))
     own = float(np.std(apart)) if n > 2 else 0.0
-    if own > _ALIKE * scatter and (n >= _SURELY or fluctuates(own, scatter)):
+    if own > _ALIKE * scatter and (n >= _SURELY or far_wider(own, scatter)):
         likely = float(stats.t.isf(_CHANCE, n - 1)) * own / math.sqrt(n - 1)
     else:  # a few that have gone the same way by chance lie closer together than others would
         likely = float(stats.norm.isf(_CHANCE)) * min(own or math.inf, _ALIKE * scatter) / math.sqrt(n)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import SpadError
 from . import checks, fit, settling
 from .candidates import Dial, Key
 from .fit import RATES, Bench, State, likelier, square, stacked
@@ -75,12 +77,10 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
             found = replace(found, residuals=residuals, square=square(residuals))
     one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.gain = square(state.residuals) - found.square
-    if one.chips:  # pixels may then differ as they do: that is a matter of how they scatter, not of their mean
-        one.gain = likelier(state, state_of(bench, one), trace)
-    if (one.there or one.moved).fluctuates:  # and so is light that is another in every recording
-        one.gain = likelier(state, state_of(bench, one), trace, fluctuates=True) - _EACH * len(dials)
-    else:
-        one.gain -= optimism(one)
+    if one.scatters:  # pixels, or recordings, may then differ as they do: no matter of their mean
+        with contextlib.suppress(SpadError):  # what cannot be simulated everywhere is judged by its mean
+            one.gain = likelier(state, state_of(bench, one), trace, one.fluctuates)
+    one.gain -= _EACH * len(dials) if one.fluctuates else optimism(one)
     return one
 
 

@@ -531,9 +531,10 @@ class Search:
     def weigh(self, state: State, refined: Sequence[Tried]) -> None:
         """Those that may be best get states of their own: differences of a few recordings blur an edge.
 
-        Compared by the cells that either of them moves, lest chance in all others decide.
+        Compared by the cells that either of them moves, lest chance in all others decide; by squares, and so without
+        those whose own scatter is wider.
         """
-        known = [t for t in refined if t.maps is None and t.residuals is not None and not t.chips]
+        known = [t for t in refined if t.maps is None and t.residuals is not None and not t.scatters]
         most = max((t.gain for t in known), default=0.0)
         near = [t for t in known if most - t.gain < alike(most)]
         if len(near) < 2:

@@ -55,6 +55,16 @@ class Tried:
     def changes(self) -> list[Change]:
         return [self.change, *self.more]
 
+    @property
+    def fluctuates(self) -> bool:
+        """Is what it does another in every recording?"""
+        return self.maps is None and not self.chips and (self.there or self.moved).fluctuates
+
+    @property
+    def scatters(self) -> bool:
+        """Do its recordings scatter otherwise than the model's own, so that squares of residuals do not judge it?"""
+        return self.chips or self.fluctuates
+
     def cost(self, state: State) -> float:
         """What it leaves of the totals, and what a number costs."""
         left = (self.residuals or state.residuals)[RATES]
