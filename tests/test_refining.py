@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, bench_of, change_of, given, quiet
 
+from spadmnist.criticism import candidates, fit, refining, search, settling
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import fit, refining, search, settling
 from spadmnist.criticism.answer import Step
+from spadmnist.criticism.candidates import with_values
 from spadmnist.criticism.fit import RATES, Moved
 from spadmnist.criticism.search import Search
 from spadmnist.criticism.showing import captures_showing
@@ -253,3 +254,27 @@ def test_what_is_settled_is_looked_at_everywhere(lab, monkeypatch) -> None:
         np.testing.assert_array_equal(one.residuals[cell], z)
     assert one.settled.square == pytest.approx(fit.square(again))
     assert one.gain == pytest.approx(fit.square(state.residuals) - fit.square(again) - 2.0)  # of one number
+
+
+@pytest.mark.parametrize(("stated", "tried"), [(4, [2.0, 6.0]), (2, [1.0, 3.0]), (1, [2.0])])
+def test_a_stated_whole_number_is_tried_at_other_whole_numbers(lab, stated: int, tried: list[float]) -> None:
+    key = ("readout_loss", "queue")
+    sensor, _ = lab()
+    values = {("readout_loss", "service_time"): 1e-7, key: stated}
+    change = next(c for c in candidates.changes(with_values(sensor, values)) if c.name == "set readout_loss.queue")
+    assert [template[key] for template in candidates.templates(change)] == tried
+    (dial,) = change.dials
+    assert dial.whole
+    assert all(dial.scaled(tried[-1], x) == round(dial.scaled(tried[-1], x)) for x in (0.2, 0.7, 1.6))
+
+
+def test_a_stated_queue_that_is_another_one_is_found(lab) -> None:
+    """It has no slope, and there is no other number beside it."""
+    sensor, data = lab("    readout_loss: {service_time: 100 ns, queue: 2}\n", light=1000)
+    stated = with_values(sensor, {("readout_loss", "service_time"): 1e-7, ("readout_loss", "queue"): 4})
+    course = course_of.begun(bench_of((stated, data)))
+    one = given(course, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, settle=True)
+    assert one.values == {("readout_loss", "queue"): 2.0}
+    assert one.gain > 100
+    course_of.accept(course, one, 10.0)
+    assert course.steps[0].values["queue"].value == 2

@@ -70,3 +70,26 @@ def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> Non
     assert found.settled is not None
     _, low, high = found.settled.interval(0)
     assert low < found.values[AMPLITUDE] < high and high - low < 12 * error
+
+
+def test_the_other_phase_with_the_same_total() -> None:
+    """Of sin(p) it is pi - p; where it is the largest there is no other."""
+    swing = Swing({}, {}, {"flat": np.array([0.0, 1.0, 0.0, 0.0, 0.0])})
+    for phase in (0.5, 2.0, 3.5, 5.9):
+        apart = (swing.mirrored("flat", phase, 0.3) - (math.pi - phase)) % (2 * math.pi)
+        assert min(apart, 2 * math.pi - apart) < 2 * math.pi / 360
+    assert swing.mirrored("flat", math.pi / 2, 0.3) == math.pi / 2
+
+
+@pytest.mark.parametrize("phase", [0.3, math.pi - 0.3])
+def test_a_capture_shorter_than_a_swing_rises_or_falls(lab, phase: float) -> None:
+    """A tenth of a period: its total is the same for both phases, and no single cell of a few recordings tells."""
+    values = {("flicker", "amplitude"): 0.2, ("flicker", "frequency"): 5.0}
+    truth = f"    flicker: {{amplitude: 0.2, frequency: 5 Hz, phase: {phase} rad}}\n"
+    bench = bench_of(lab(truth, light=1000))
+    state = bench.state({})
+    one = Tried(change_of(bench, "add flicker"), values, Moved({}, {}, {}), 0.0, 1.0)
+    right, wrong = {"dark": 0.0, "flat": phase}, {"dark": 0.0, "flat": math.pi - phase}
+    for first, other in ((right, wrong), (wrong, right)):
+        assert refining._rising_or_falling(bench, state, one, first, other) == right
+    assert refining._rising_or_falling(bench, state, one, right, right) == right

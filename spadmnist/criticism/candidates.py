@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,8 @@ class Dial:
     def scaled(self, value: float, factor: float) -> float:
         """The value whose distance from `off` is so many times that of `value`."""
         off = self.off or 0.0
-        return min(max(off + (value - off) * factor, self.low), self.high)
+        found = off + (value - off) * factor
+        return min(max(float(round(found)) if self.whole else found, self.low), self.high)
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,7 @@ def _settings(effect: Effect) -> Iterator[Change]:
             continue  # a line that stands elsewhere is another one
         low, high = declared.search  # type: ignore[misc]
         low, high = min(low, value) if value > 0 else low, max(high, value)
-        dial = Dial(effect.name, name, declared.unit, float(low), float(high), float(value), bounds=declared.bounds)
+        dial = replace(_dial(effect.name, declared, float(value)), low=float(low), high=float(high))
         yield Change("set", effect.name, name, (dial,))
 
 
@@ -286,6 +287,9 @@ def first_strengths(dial: Dial) -> list[float]:
     if dial.low < 0:
         return [off + 0.1 * whole]
     if dial.low <= off <= dial.high and off > 0:
+        if dial.whole:  # each is another one, and no slope leads there
+            near = (dial.value(dial.coordinate(x)) for x in (0.5 * off, max(1.5 * off, off + 1)))
+            return [x for x in near if x != off]
         # an edge that has moved is not found by a longer move
         edge = dial.unit == "s" and getattr(Effect.registry.find(dial.effect), "stage", "") == "dead_time"
         moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if edge else (0.1,)

@@ -117,6 +117,8 @@ def settle(
             damping, vain = max(3 * damping, 1.0), vain + 1
             if vain == _VAIN:
                 break
+        if not dials:  # whole numbers alone, say, of which each is another model
+            break
         cost, u0, z = best
         normal = slopes.T @ slopes
         step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (slopes.T @ z)
@@ -316,7 +318,7 @@ def alone(residuals: Mapping[Cell, np.ndarray], slopes: Mapping[Cell, np.ndarray
     if not parts:
         return set()
     values, vectors = np.linalg.eigh(sum(parts.values()))
-    told = values > 1e-9 * max(float(values.max()), 1e-300)
+    told = values > 1e-9 * max(float(values.max(initial=0.0)), 1e-300)
     root = vectors[:, told] / np.sqrt(values[told])
     out = set()
     for id in {key[0] for key in keys} - {""}:

@@ -17,6 +17,7 @@ TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _NEARER = (0.92, 0.96, 1.04, 1.08)
 _PHASES = 24  # that are looked at
+_FINELY = 360  # a whole turn, for the other phase that has the same total
 _TURNS = 8  # of them, that are simulated
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step from one to the next
 
@@ -55,6 +56,13 @@ class Swing:
             waves = _waves(1.0, phases[id])
             odd.logs[id], even.logs[id] = float(waves[:2] @ log[:2]), float(waves[2:] @ log[2:])
         return Moved(odd.shifts, odd.noise, odd.logs, even=even)
+
+    def mirrored(self, id: str, phase: float, times: float) -> float:
+        """The other phase at which a capture has as many detections: it falls where it rose. The same, if none."""
+        every = 2 * math.pi * np.arange(_FINELY + 1) / _FINELY + phase
+        more = np.array([_waves(times, p) @ self.logs[id] for p in every])
+        crossed = np.flatnonzero(np.diff(np.sign(more - more[0])[1:-1])) + 1
+        return float(every[crossed[0]]) % (2 * math.pi) if len(crossed) else phase
 
     def suited(
         self, bench: Bench, state: State, times: Sequence[float] = TIMES

@@ -1,4 +1,4 @@
-"""A walk through the detections of the whole array in the order of time: spacings, clusters, pairs.
+"""A walk through the detections of the whole array in the order of time: spacings, crowds, clusters, pairs.
 
 Everything that several statistics need of it is counted in one go, and kept with the recording.
 """
@@ -20,6 +20,8 @@ from ._frames import first_stamps
 
 REACH = 3  # pitches
 SIZES = ((2, 2), (3, 3), (4, 4), (5, 8), (9, 16), (17, 0))  # detections in a cluster; 0: any number
+RANKS = (2, 4, 8, 16, 32)  # detections that a crowd has after its first one
+_SELDOM = (1e-4, 1e-3, 1e-2, 1e-1)  # of all detections: crowds that steady light has so seldom, or more so
 _LAGS = (1e-9, 3e-9, 10e-9, 30e-9, 100e-9)  # s
 _LATER = 30e-9  # s: up to here one neighbour is asked to fire after the other
 _GAPS = (1e-9, 10e-9)  # s
@@ -111,12 +113,14 @@ def _near(rows: int, columns: int, places: bytes | None) -> Near:
 class Walk:
     """What was counted.
 
-    spacings: (edges + 1,), the first those of 0; clusters: (gaps, sizes); pairs: (bins,) of the whole array by lag;
-    near: (classes, bins) the same of near pixels; same: (bins,) of the same pixel; later: (classes,) near pairs of
-    which the second pixel is later.
+    spacings: (edges + 1,), the first those of 0; crowds: (ranks, bins) detections by how lately the one came that
+    stands so many places before them, see `crowd_edges`; clusters: (gaps, sizes); pairs: (bins,) of the
+    whole array by lag; near: (classes, bins) the same of near pixels; same: (bins,) of the same pixel; later:
+    (classes,) near pairs of which the second pixel is later.
     """
 
     spacings: np.ndarray
+    crowds: np.ndarray
     clusters: np.ndarray
     pairs: np.ndarray
     near: np.ndarray
@@ -129,6 +133,22 @@ def spacing_edges(recording: Recording) -> np.ndarray:
     tick = tick_of(recording)
     longest = exposure_in(recording, tick) if recording.modality == "tr" else recording.none
     return logarithmic(1, longest, _PER_DECADE)
+
+
+def crowd_edges(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """((ranks, bins) ticks, (ranks, bins) crowds by chance).
+
+    A crowd belongs to the first bin whose edge it does not reach. The edges belong to the rate that the array has
+    itself: no light level is needed, and none changes them beside it. Detections of steady light take a time of a gamma
+    law for so many; below an edge in whole ticks they are half a tick below it in the mean.
+    """
+    from scipy import special
+
+    ranks, tick, total = np.array(RANKS)[:, None], tick_of(recording), float(recording.totals.sum())
+    rate = max(total, 1.0) / exposure_in(recording, tick)  # of the array, per tick
+    edges = np.maximum(np.rint(special.gammaincinv(ranks, np.array(_SELDOM)) / rate), 1.0)
+    share = np.diff(special.gammainc(ranks, (edges - 0.5) * rate), axis=1, prepend=0.0)
+    return edges.astype(np.int64), np.maximum(total - ranks, 0.0) * share
 
 
 def lag_edges(tick: float) -> np.ndarray:
@@ -159,6 +179,7 @@ def _through(recording: Recording) -> Walk:
     edges, start = guide(spacing_edges(recording))
     lags, near_by = lag_edges(tick), near(recording.layout)
     spacings = np.zeros(edges.size, np.int64)
+    crowds = np.zeros((len(RANKS), len(_SELDOM)), np.int64)
     clusters = np.zeros((len(_GAPS), len(SIZES)), np.int64)
     upto = np.zeros(lags.size, np.int64)
     kinds = np.array([low for low, _ in SIZES])
@@ -174,10 +195,11 @@ def _through(recording: Recording) -> Walk:
         offsets, end = recording.events.offsets, exposure_in(recording, tick)
         spot, stride, first, step, kind, second = around(recording.layout, near_by)
         _through_exposure(
-            stamps, offsets, end, edges, start, gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])),
-            spot, stride, first, step, kind, second, spacings, clusters, upto, found, later,
+            stamps, offsets, end, edges, start, np.array(RANKS), crowd_edges(recording)[0], gaps(tick), kinds,
+            lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
+            spacings, crowds, clusters, upto, found, later,
         )  # fmt: skip
-    return Walk(spacings, clusters, np.diff(upto, prepend=0), found[:-1], found[-1], later[:-1])
+    return Walk(spacings, crowds, clusters, np.diff(upto, prepend=0), found[:-1], found[-1], later[:-1])
 
 
 def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -210,14 +232,14 @@ def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, 
 
 @jit
 def _through_exposure(
-    stamps, offsets, end, edges, start, gaps, kinds, lags, latest, spot, stride, first, step, kind, second,
-    spacings, clusters, upto, found, later,
+    stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
+    spot, stride, first, step, kind, second, spacings, crowds, clusters, upto, found, later,
 ):  # fmt: skip
     """Walk through all rows' stamps in the order of time, a slab of time after the other.
 
-    edges, start: of spacings, see `guide`; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
-    `around`. Adds to spacings, clusters, upto (bins,) pairs of the array that are nearer than each of `lags`, found
-    (classes, bins) pairs of near pixels, later (classes,).
+    edges, start: of spacings, see `guide`; ranks, crowded: of crowds, with their edges; gaps, kinds: of clusters; lags:
+    (bins,) ticks; spot, ..., second: see `around`. Adds to spacings, crowds, clusters, upto (bins,) pairs of the array
+    that are nearer than each of `lags`, found (classes, bins) pairs of near pixels, later (classes,).
     """
     rows = offsets.size - 1
     total = offsets[rows]
@@ -255,6 +277,7 @@ def _through_exposure(
     tail = 0  # of them, those that stand before the sorted ones
     runs = np.ones(gaps.size, np.int64)
     last = np.int64(-1)
+    past = np.full(ranks[ranks.size - 1], _NEVER)  # the last stamps before a slab
     for slab in range(slabs):
         stop = (slab + 1) * width if slab < slabs - 1 else top
         before = position.copy()
@@ -285,6 +308,7 @@ def _through_exposure(
             times[held + i] = ordered[tail + i] >> bits
         last = _follow(times, held, held + count, last, edges, start, gaps, kinds, runs, spacings, clusters)
         whole = held + count
+        _crowds(times[held:whole], past, ranks, crowded, crowds)
         for k in range(lags.size):
             upto[k] += _pairs(times, held, whole, lags[k], np.float64(total) * lags[k] / end)
         oldest = _since(times, 0, whole, stop - longest)
@@ -497,6 +521,24 @@ def _follow(times, begin, end, last, edges, start, gaps, kinds, runs, spacings, 
                     runs[g] = 1
         last = now
     return last
+
+
+@jit
+def _crowds(times, past, ranks, crowded, crowds):
+    """Count crowds of times in order by how long they last. past: (most,) the times before them, brought up to date."""
+    most = past.size
+    for i in range(times.size):
+        for r in range(ranks.size):
+            k = i - ranks[r]
+            apart = times[i] - (times[k] if k >= 0 else past[most + k])
+            bin = crowded.shape[1]
+            while bin > 0 and apart < crowded[r, bin - 1]:
+                bin -= 1
+            if bin < crowded.shape[1]:
+                crowds[r, bin] += 1
+    some = min(times.size, most)
+    past[: most - some] = past[some:].copy()
+    past[most - some :] = times[times.size - some :]
 
 
 @jit

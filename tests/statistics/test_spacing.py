@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import laws
 import null_laws
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from simple_sensor import grid, many, one_of_each, reduced, sigmas, stamped, str
 from spadmnist import recording as recordings
 from spadmnist.recording import Recording
 from spadmnist.statistics._counting import guide, logarithmic, place, sort_ticks
-from spadmnist.statistics._walk import walk
-from spadmnist.statistics.spacing import Multiplicity, Spacing
+from spadmnist.statistics._walk import crowd_edges, walk
+from spadmnist.statistics.spacing import Crowds, Multiplicity, Spacing
 
 SIZES = (2, 3, 4, 5, 9, 17)
 
@@ -68,6 +69,12 @@ def test_a_small_recording(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
             (np.arange(len(t)) - np.searchsorted(t, t - lag, side="right")).sum() for t in frames for lag in lags(tick)
         ]
         assert np.cumsum(walk(recording).pairs).tolist() == pairs
+        (times,) = frames
+        edges, chance = crowd_edges(recording)
+        for rank, upto, number in zip((2, 4, 8, 16, 32), edges, walk(recording).crowds, strict=True):
+            assert number.tolist() == np.histogram(times[rank:] - times[:-rank], [0, *(upto - 0.5)])[0].tolist()
+        if kind == "tr":
+            assert np.sum(chance, axis=1) == pytest.approx(0.1 * recording.totals.sum(), rel=0.05)
     if kind == "tr":
         text = "clusters of 5 to 8 detections of the whole array, each within 10 ns of the next"
         assert found.where(9) == text and found.size(9, 2.0, 1.0)[1] == 5 / recording.totals.sum()
@@ -79,6 +86,11 @@ def lags(tick: float) -> list[int]:
 
 def test_nothing_to_say() -> None:
     assert Spacing().reduce(tr(1, grid(1, 1), 1e5, 1e-3)) is None
+    for number in range(5):  # fewer than any crowd has, or just as many as the smallest
+        few = tr_of([np.arange(number) * 1e-8, np.zeros(0)], grid(1, 2), 1e-3, 1e-10)
+        assert walk(few).crowds.sum() == max(0, number - 2) + max(0, number - 4)
+        assert np.abs(reduced(Crowds, few).values).max() < (6 if number else 4)
+    assert Crowds().reduce(tr(1, grid(1, 1), 1e5, 1e-3)) is None
     for empty in (tr(1, grid(2, 2), 0.0, 1e-3), str_of(np.full((50, 2, 2), 1000))):
         assert reduced(Spacing, empty).values.sum() == 0 and reduced(Multiplicity, empty).values.sum() == 0
 
@@ -116,6 +128,43 @@ STEADY = {
 def test_laws_of_steady_light(kind: str) -> None:
     null_laws.poisson(many(Spacing, STEADY[kind], 120), 0.6)
     null_laws.poisson(many(Multiplicity, STEADY[kind], 120), 0.7)
+    if kind != "str":
+        scores = many(Crowds, STEADY[kind], 120)
+        null_laws.normal(scores, spread=None)
+        assert scores.std(axis=0).max() < 3.5
+        assert scores.std(axis=0)[[0, 1, 4, 5]].max() < 1.5  # where crowds are few they hardly overlap
+        if kind != "tr":  # nor has their mean another reason than chance without a dead time
+            assert np.abs(scores.mean(axis=0)).max() < laws.z_bound(laws.FALSE_ALARM / 20) * 3.5 / np.sqrt(120)
+
+
+def behind_a_bus(seed: int, service: float, places: int) -> Recording:
+    """What is left of steady light where one event is served at a time, and those that find no place are lost."""
+    whole = STEADY["tr, bright"](seed)
+    assert whole.events is not None
+    rows = [whole.events.row(p) for p in range(30)]
+    order = sorted((t, p) for p, row in enumerate(rows) for t in row)
+    left: list[list[float]] = [[] for _ in rows]
+    served: list[float] = []
+    for t, p in order:
+        served = [end for end in served if end > t]
+        if len(served) < places:
+            served.append((served[-1] if served else t) + service)
+            left[p].append(t)
+    return tr_of([np.array(row) for row in left], grid(5, 6), 1e-4, whole.tick)
+
+
+def test_a_queue_that_is_full_is_seen() -> None:
+    """300 million events/s, each 1.5 ns on the bus, four places: of 30,000 detections one in 200 is lost."""
+    queued = partial(behind_a_bus, service=1.5e-9, places=4)
+    lost = 1 - queued(0).totals.sum() / STEADY["tr, bright"](0).totals.sum()
+    assert 0.003 < lost < 0.01
+    assert np.abs(sigmas(Spacing, queued(0), STEADY["tr, bright"])).max() < 4.5
+    crowds = sigmas(Crowds, queued(0), STEADY["tr, bright"])
+    summary = reduced(Crowds, queued(0))
+    worst = int(np.argmin(crowds))
+    assert crowds[worst] < -4.5
+    assert summary.where(worst).startswith(("5 successive", "9 successive"))
+    assert summary.size(worst, summary.values[worst], 0.0)[1] < 0
 
 
 def bursts(seed: int, number: int = 3) -> Recording:
