@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from tinylab import bench_of, change_of
 
+from spadmnist.criticism import course as course_of
 from spadmnist.criticism import fit, refining, swings
+from spadmnist.criticism.candidates import with_values
 from spadmnist.criticism.fit import Moved
 from spadmnist.criticism.swings import Swing
 from spadmnist.criticism.tried import Tried
@@ -82,14 +84,21 @@ def test_the_other_phase_with_the_same_total() -> None:
 
 
 @pytest.mark.parametrize("phase", [0.3, math.pi - 0.3])
-def test_a_capture_shorter_than_a_swing_rises_or_falls(lab, phase: float) -> None:
+def test_a_capture_shorter_than_a_swing_rises_or_falls(lab, monkeypatch, phase: float) -> None:
     """A tenth of a period: its total is the same for both phases, and no single cell of a few recordings tells."""
     values = {("flicker", "amplitude"): 0.2, ("flicker", "frequency"): 5.0}
     truth = f"    flicker: {{amplitude: 0.2, frequency: 5 Hz, phase: {phase} rad}}\n"
-    bench = bench_of(lab(truth, light=1000))
+    sensor, measured = lab(truth, light=1000)
+    bench = bench_of((sensor, measured))
     state = bench.state({})
-    one = Tried(change_of(bench, "add flicker"), values, Moved({}, {}, {}), 0.0, 1.0)
     right, wrong = {"dark": 0.0, "flat": phase}, {"dark": 0.0, "flat": math.pi - phase}
     for first, other in ((right, wrong), (wrong, right)):
-        assert refining._rising_or_falling(bench, state, one, first, other) == right
-    assert refining._rising_or_falling(bench, state, one, right, right) == right
+        assert swings.sided(bench, state, [PHASE], values, first, other) == right
+    assert swings.sided(bench, state, [PHASE], values, right, right) == right
+    # and where the sensor is known to swing so, whichever is found first; the mean phase is that of the middle
+    known = bench_of((with_values(sensor, values), measured))
+    swept = 2 * math.pi * 5.0 * 0.02
+    for first in (phase, (math.pi - phase - swept) % (2 * math.pi)):
+        monkeypatch.setattr(Swing, "suited", lambda *a, first=first: (0.0, 1.0, {"dark": 0.0, "flat": first}))
+        off = (course_of.begun(known).search.phases["flat", PHASE] - phase + math.pi) % (2 * math.pi) - math.pi
+        assert abs(off) < 0.2

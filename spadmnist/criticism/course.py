@@ -21,7 +21,7 @@ from .refining import EXCLUDED, UNSEEN
 from .search import Search
 from .settling import Settled
 from .showing import captures_showing
-from .swings import turned
+from .swings import sided, turned
 from .tried import Tried, is_edge
 
 _AGAIN = 2  # times that the numbers are settled anew beside the model with the effect
@@ -104,6 +104,8 @@ def begun(bench: Bench) -> Course:
         swing = turned(bench, state, keys, {}, fit.FEW)
         if not isinstance(swing, str):
             *_, found = swing.suited(bench, state, [1.0])
+            mirrored = {id: swing.mirrored(id, p, 1.0) for id, p in found.items()}
+            found = sided(bench, state, keys, {}, found, mirrored)
             search.phases.update({(id, key): p for id, p in found.items() for key in keys})
             state = bench.state({}, state.sensors.changed({}, search.phases))
     course = Course(bench, search, state, {}, [], [])

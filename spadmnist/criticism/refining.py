@@ -16,7 +16,7 @@ from .candidates import Dial, Key
 from .fit import RATES, Bench, State, likelier, square, stacked
 from .settling import Settled
 from .showing import captures_showing
-from .swings import NEAR, turned
+from .swings import NEAR, sided, turned
 from .tried import Tried, is_edge, room_of
 
 _ASIDE = 0.1  # of a logarithm, for the slope of what swings
@@ -31,7 +31,6 @@ _LEAST_BOOST = 1.5  # worth it
 _SWINGING = 6  # recordings for phases: what swings has other random numbers than what does not
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first steps to its neighbours, and no shorter
 _EACH = 2.0  # in chi square, of a number that is settled
-_SIDES = 9.0  # in chi square: what a swing must gain in a capture by falling where it rose
 _BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains, and what costs so much is none
 
 
@@ -197,7 +196,8 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
         return one
     gain, times, found = swing.suited(bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
-    found = _rising_or_falling(bench, state, one, found, {id: swing.mirrored(id, p, times) for id, p in found.items()})
+    mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}
+    found = sided(bench, state, one.change.phases, one.values, found, mirrored)
     moved = swing.at(found)
     one.phases = {(id, key): p for id, p in found.items() for key in one.change.phases}
     one.moved = moved.at(times)
@@ -217,30 +217,6 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     one.settled = Settled(dials, now, covariance, residuals, slopes, square(residuals), one.values)
     one.gain = gain - optimism(one)
     return one
-
-
-def _rising_or_falling(
-    bench: Bench, state: State, one: Tried, phases: Mapping[str, float], mirrored: Mapping[str, float]
-) -> dict[str, float]:
-    """The phase of each capture, or the other one with the same total, where it suits the rest of the capture better.
-
-    A capture far shorter than a swing has one side of it alone: the slope is too faint for a cell of a few recordings.
-    """
-    lit = [id for id, seen in bench.seen.items() if not seen.capture.light.dark]
-    models = [
-        state.sensors.changed(one.values, {(id, key): p for id, p in some.items() for key in one.change.phases})
-        for some in (phases, mirrored)
-    ]
-    left = []
-    for moved in bench.moved(state, models, _SWINGING, lit, kept="all"):
-        if isinstance(moved, str):
-            return dict(phases)
-        squares = dict.fromkeys(phases, 0.0)
-        for (id, _), z in bench.residuals(state, moved).items():
-            if id in squares:
-                squares[id] += float(z @ z)
-        left.append(squares)
-    return {id: mirrored[id] if left[1][id] < left[0][id] - _SIDES else p for id, p in phases.items()}
 
 
 def _counted(

@@ -19,6 +19,8 @@ _NEARER = (0.92, 0.96, 1.04, 1.08)
 _PHASES = 24  # that are looked at
 _FINELY = 360  # a whole turn, for the other phase that has the same total
 _TURNS = 8  # of them, that are simulated
+_MANY = 16  # recordings that tell whether it rises or falls
+_SIDES = 9.0  # in chi square: what it must gain in a capture by falling where it rose
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step from one to the next
 
 
@@ -82,12 +84,42 @@ def turned(bench: Bench, state: State, keys: Sequence[Key], values: Mapping[Key,
     turns = [2 * math.pi * k / _TURNS for k in range(_TURNS)]
     pairs = [(id, key) for id in bench.seen for key in keys]
     models = [state.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
-    lit = [id for id, seen in bench.seen.items() if not seen.capture.light.dark]
-    found = bench.moved(state, models, few, lit)
+    found = bench.moved(state, models, few, _lit(bench))
     made = [m for m in found if not isinstance(m, str)]
     if len(made) < len(found):
         return next(m for m in found if isinstance(m, str))
     return Swing.of(made, turns)
+
+
+def sided(
+    bench: Bench,
+    state: State,
+    keys: Sequence[Key],
+    values: Mapping[Key, Any],
+    phases: Mapping[str, float],
+    mirrored: Mapping[str, float],
+) -> dict[str, float]:
+    """The phase of each capture, or the other one with the same total, where it suits the rest of the capture better.
+
+    A capture far shorter than a swing has one side of it alone: too faint a slope for the few recordings of `turned`.
+    keys, values: as there; mirrored: see `Swing.mirrored`.
+    """
+    pairs = [{(id, key): p for id, p in some.items() for key in keys} for some in (phases, mirrored)]
+    left = []
+    models = [state.sensors.changed(values, some) for some in pairs]
+    for moved in bench.moved(state, models, _MANY, _lit(bench)):
+        if isinstance(moved, str):
+            return dict(phases)
+        squares = dict.fromkeys(phases, 0.0)
+        for (id, _), z in bench.residuals(state, moved).items():
+            if id in squares:
+                squares[id] += float(z @ z)
+        left.append(squares)
+    return {id: mirrored[id] if left[1][id] < left[0][id] - _SIDES else p for id, p in phases.items()}
+
+
+def _lit(bench: Bench) -> list[str]:
+    return [id for id, seen in bench.seen.items() if not seen.capture.light.dark]
 
 
 def _waves(x: float, p: float) -> np.ndarray:
