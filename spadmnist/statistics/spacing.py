@@ -47,8 +47,8 @@ class Crowds(Statistic):
 
     Only those that are so close together that in steady light of the same total less than one detection in 10,000,
     1000, 100 or 10 ends such a crowd. Each cell is the normal score of their number beside that of steady light.
-    Crowds overlap, and those of steady light scatter more than independent numbers, up to twice as much. Too few: a
-    readout that falls behind where many come, as it serves one at a time from a queue that is soon full; too many:
+    Crowds overlap, and those of steady light scatter more than independent numbers, up to three times as much. Too few:
+    a readout that falls behind where many come, as it serves one at a time from a queue that is soon full; too many:
     bursts, or light that fluctuates.
     """
 
