@@ -31,7 +31,7 @@ from . import units
 from .errors import InputError, SpadError
 from .events import Events, Layout
 from .kernels import jit
-from .readout import counts_type, no_detection, unsigned_for
+from .readout import SHORTEST_TICK, counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
 
 _MOST_EVENTS = 1 << 29  # of a capture: 16 bytes each are 8 GiB
@@ -248,14 +248,14 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
     value = attribute(nodes, "tick", path)
     if value is None:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
-    if isinstance(value, str) or not 0 < value < math.inf:
+    if isinstance(value, str) or not SHORTEST_TICK <= value < math.inf:
         raise InputError(f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0")
     if value > end:
         raise InputError(
             f"{path}: a tick of {units.show(value, 's')} is longer than the {units.show(end, 's')} that it divides; "
             "tick is in s"
         )
-    unsigned_for(end / value, f"{path}: time stamps")
+    stamps_for(end / value, f"{path}: time stamps")
     return float(value)
 
 
@@ -341,7 +341,7 @@ def _events(file: Any, found: _Found, pixels: int, path: Path) -> tuple[Events, 
         where[start : start + _PIECE] = piece
         _count(where[start : start + _PIECE], counts)
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    ticks = np.empty(len(time), unsigned_for(end, f"{path}: time stamps"))
+    ticks = np.empty(len(time), stamps_for(end, f"{path}: time stamps"))
     place, late = offsets[:-1].copy(), 0
     for start in range(0, len(time), _PIECE):
         piece = time[start : start + _PIECE]

@@ -404,7 +404,35 @@ def _count(damage: Any) -> str:
     return f"{n} file is" if n == 1 else f"{n} files are"
 
 
-@cli.command("import", short_help="Make a measurement of files that other programs wrote.")
+class _ImportCommand(click.Command):
+    """Its options are those of `importers.Said`, made of that table when they are asked for."""
+
+    def get_params(self, context: click.Context) -> list[click.Parameter]:
+        from .importers import formats, said
+
+        if all(param.name != "modality" for param in self.params):
+            kinds = formats()
+            made = [_import_option(name, one, said.about(name, kinds)) for name, one in said.options().items()]
+            self.params[-1:-1] = made
+        return super().get_params(context)
+
+
+def _import_option(name: str, declared: Any, about: str) -> click.Option:
+    words = [f"--{word.replace('_', '-')}" for word in (name, *declared.names)]
+    if declared.flag:
+        return click.Option([*words, name], is_flag=True, help=about)
+    kind: Any = click.STRING
+    if declared.whole is not None:
+        kind = click.IntRange(*declared.whole)
+    elif declared.choices:
+        kind = click.Choice(declared.choices)
+    elif declared.path:
+        kind = click.Path(path_type=Path)
+    metavar = declared.metavar or ("N" if declared.whole else "TIME" if declared.unit == "s" else None)
+    return click.Option([*words, name], type=kind, default=None, metavar=metavar, help=about)
+
+
+@cli.command("import", cls=_ImportCommand, short_help="Make a measurement of files that other programs wrote.")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
 @click.option("--output", "-o", type=click.Path(path_type=Path), metavar="MEASUREMENT", help="Its folder.")
 @click.option("--name", metavar="NAME", help="Of the measurement.  [default: that of the file or folder]")
@@ -415,45 +443,6 @@ def _count(damage: Any) -> str:
     metavar="LIGHT",
     help='What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2". Once for all files, or once for each.',
 )
-@click.option(
-    "--relative-uncertainty", metavar="SHARE", help="Of the light's calibration, one standard deviation: 1.5 %."
-)
-@click.option(
-    "--rows",
-    "--height",
-    "rows",
-    type=click.IntRange(1, 10**6),
-    default=None,
-    metavar="N",
-    help="Of pixels, which are then the channels of the same number.  [default: 1 x channels in use]",
-)
-@click.option("--columns", "--width", "columns", type=click.IntRange(1, 10**6), default=None, metavar="N")
-@click.option(
-    "--positions", type=click.Path(path_type=Path), metavar="FILE.csv", help="x,y (um) of pixels that are no grid."
-)
-@click.option("--exposure", metavar="TIME", help="Of time stamps: how long was recorded.")
-@click.option("--tick", metavar="TIME", help="Length of a tick, where the file does not say it; of a table 1 ps.")
-@click.option(
-    "--modality", type=click.Choice(["tr", "str", "qis", "counts"]), default=None, help="Of a stack of numbers."
-)
-@click.option("--frames", type=click.IntRange(1), default=None, metavar="N", help="How many; the file is compared.")
-@click.option("--frame-time", metavar="TIME", help="How long a frame looks.")
-@click.option("--frame-period", metavar="TIME", help="From one frame to the next.")
-@click.option("--bits", type=click.IntRange(1, 16), default=None, metavar="N", help="Of a count.")
-@click.option(
-    "--counting",
-    type=click.Choice(["frames", "counter"]),
-    default=None,
-    help="A count is the sum of 2^bits - 1 binary frames (default), or of a counter in each frame.",
-)
-@click.option("--packed", is_flag=True, help="In .npy or HDF5 a byte is eight columns.")
-@click.option("--bit-order", type=click.Choice(["big", "little"]), default="big", help="Which bit is the left column.")
-@click.option("--dataset", metavar="PATH", help="In HDF5: the frames.  [default: frames]")
-@click.option("--tdc", type=click.Path(path_type=Path), metavar="FILE.csv", help="LinoSPAD2: ends of the codes, in ps.")
-@click.option("--offsets", type=click.Path(path_type=Path), metavar="FILE.npy", help="LinoSPAD2: of the pixels, in ps.")
-@click.option("--firmware", type=click.Choice(["2212b", "2212s", "2208"]), default=None, help="LinoSPAD2.")
-@click.option("--timestamps", type=click.IntRange(1, 2**24), default=None, metavar="N", help="LinoSPAD2: of a cycle.")
-@click.option("--cycle", metavar="TIME", help="LinoSPAD2: its length.")
 @_json
 def import_(
     files: tuple[Path, ...], output: Path | None, name: str | None, lights: tuple[str, ...], as_json: bool, **given: Any
@@ -476,17 +465,19 @@ def import_(
     if output is None:
         raise SpadError("--output: name the folder of the measurement that is made, for example -o lab")
     said = Said.of(**given)
+    shone = [light(text, said.relative_uncertainty) for text in lights]
     with _terminal() as progress:
-        made = import_files(files, output, said, [light(text) for text in lights], name, progress)
-    for note in made.notes:
-        _say(f"Note: {note}")
+        made = import_files(files, output, said, shone, name, progress)
     if as_json:
-        captures = [{"id": capture.id, "modality": capture.modality} for capture in made.captures]
-        click.echo(json.dumps({"measurement": str(output), "captures": captures, "notes": made.notes}))
-        return
-    for file, capture in zip(files, made.captures, strict=True):
-        click.echo(f"{capture.id}: {capture.modality}, from {file}")
-    _say(f"Made: {output}. Look at it:  spadmnist inspect {output}")
+        captures = [one.as_data() for one in made.took]
+        click.echo(json.dumps({"measurement": str(made.folder), "captures": captures, "notes": made.notes}))
+    else:
+        for one in made.took:
+            click.echo(one.text())
+    for note in made.notes:
+        _say(f"Note: {note}.")
+    if not as_json:
+        _say(f"Made: {made.folder}. Look at it:  spadmnist inspect {made.folder}")
 
 
 @cli.command(short_help="Write captures to files that other programs read.")

@@ -15,125 +15,29 @@ import importlib
 import logging
 import math
 import pkgutil
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import image_files, units
-from ..errors import InputError, SpadError
-from ..recording import Light
+from .. import image_files
+from ..errors import InputError
+from ..recording import MODALITIES
+from .said import LONGEST, SHORTEST, Said, ask, light
+
+__all__ = ["Format", "Found", "Said", "Stack", "ask", "light"]
 
 MOST_CHANNELS = 1 << 24
 MOST_EVENTS = 1 << 29  # of a file
 LARGEST_PIECE = 1 << 28  # bytes that a file may make one take at once
 PICOSECOND = 1e-12
-
-
-# --- what the user says -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Said:
-    """What the user says of the files, in SI. None where nothing was said: then the file is asked."""
-
-    rows: int | None = None
-    columns: int | None = None
-    positions: Path | None = None
-    modality: str | None = None
-    exposure: float | None = None
-    frames: int | None = None
-    frame_time: float | None = None
-    frame_period: float | None = None
-    tick: float | None = None
-    bits: int | None = None
-    counting: str | None = None
-    relative_uncertainty: float | None = None
-    packed: bool = False
-    bit_order: str = "big"
-    dataset: str | None = None
-    tdc: Path | None = None
-    offsets: Path | None = None
-    firmware: str | None = None
-    timestamps: int | None = None
-    cycle: float | None = None
-
-    @staticmethod
-    def of(**given: Any) -> Said:
-        """From the words of a command line: times with their units. Raises SpadError with the option."""
-        for name in ("exposure", "frame_time", "frame_period", "tick", "cycle", "relative_uncertainty"):
-            if given.get(name) is None:
-                continue
-            share = name == "relative_uncertainty"
-            try:
-                value = float(units.parse(given[name], "" if share else "s"))
-            except ValueError as error:
-                raise SpadError(f"{_option(name)}: {error}") from None
-            if not (0 <= value <= 1 if share else value > 0):
-                allowed = "from 0 to 1" if share else "more than 0"
-                raise SpadError(f"{_option(name)}: {given[name]} is not possible; it must be {allowed}")
-            given[name] = value
-        return Said(**given)
-
-
-# what only the user can say where the file does not: (what it is, an example)
-_ASKED = {
-    "exposure": ("how long was recorded", '"100 ms"'),
-    "frame_time": ("how long a frame looks", '"10 us"'),
-    "frame_period": ("the time from one frame to the next", '"10 us"'),
-    "tick": ("the length of a tick", '"100 ps"'),
-    "bits": ("how many bits a count has", "8"),
-    "light": ("what fell on the sensor", 'dark (or "500 nm 75.67 nW/cm^2")'),
-    "firmware": ("the firmware, which decides what pixel an address is", "2212b"),
-    "timestamps": ("how many words a converter has in a cycle", "512"),
-    "cycle": ("how long a cycle is", '"4 ms"'),
-}
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def ask(path: Path, names: Sequence[str]) -> InputError:
-    """One sentence that asks for everything that is missing."""
-    what = ", nor ".join(_ASKED[name][0] for name in names)
-    return InputError(f"{path}: does not say {what}; add {' '.join(f'{_option(n)} {_ASKED[n][1]}' for n in names)}")
-
-
-_LIGHT = 'dark, free, "500 nm free", "500 nm 75.67 nW/cm^2" or "500 nm 5 mlux"'
-_PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
-
-
-def light(text: str) -> Light:
-    """What fell on the sensor, as the command line says it: `dark`, `free`, `500 nm 75.67 nW/cm^2`.
-
-    A level that is free is unknown; where no wavelength is given either, 555 nm stands for it. Raises SpadError.
-    """
-    words = " ".join(text.split())
-    if words == "dark":
-        return Light()
-    found: dict[str, float] = {}
-    for part in re.findall(r"free|[-+.0-9][-+.0-9eE]*\s?[^\s0-9]\S*|\S+", words) or [""]:
-        if part == "free":
-            continue
-        for unit in ("m", "W/m^2", "lux"):
-            try:
-                value = float(units.parse(part, unit))
-            except ValueError:
-                continue
-            if value > 0 and unit not in found:
-                found[unit] = value
-                break
-        else:
-            raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
-    levels = found.keys() - {"m"}
-    if len(levels) + words.count("free") > 1 or ("W/m^2" in found and "m" not in found):
-        raise SpadError(f"--light: {text!r} needs a wavelength and one level; write {_LIGHT}")
-    level = found.get("W/m^2", found.get("lux"))
-    return Light(found.get("m", _PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance")
+LASER_PULSES = (
+    "was recorded in T3 mode, or alike: its times count from the last laser pulse; record in T2 mode, or export the "
+    "times since the start to CSV"
+)
 
 
 # --- what a file holds --------------------------------------------------------------------------------------------
@@ -154,24 +58,42 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
         value = get(name)
         if value is None:
             continue
-        fine = not isinstance(value, str) and (0 < value < 1e18 or (value == 0 and name in _MAY_BE_ZERO))
+        fine = not isinstance(value, str) and (SHORTEST <= value <= LONGEST or (value == 0 and name in _MAY_BE_ZERO))
         if not fine or (name in _WHOLE and value != int(value)):
-            raise InputError(f"{path}: says that its {name} is {str(value)[:40]!r}, which is not possible; correct it")
+            raise InputError(f"{path}: says that its {name} is {_shown(value)}, which is not possible; correct it")
         found[name] = int(value) if name in _WHOLE else float(value)
     return found
 
 
+def _shown(value: Any) -> str:
+    return repr(value[:40]) if isinstance(value, str) else f"{value}"
+
+
 @dataclass(frozen=True)
 class Stack:
-    """Frames that are read when they are asked for: (frames, rows, columns), or packed bytes in place of columns."""
+    """Frames that are read when they are asked for: (frames, rows, columns), or packed bytes in place of columns.
+
+    piece: bytes of frames, as they are stored, that are best read at once.
+    """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     get: Callable[[int, int], np.ndarray]
+    piece: int = 1 << 24
 
     def __getitem__(self, part: slice) -> np.ndarray:
         start, stop, _ = part.indices(self.shape[0])
         return self.get(start, stop)
+
+    @property
+    def step(self) -> int:
+        """Frames in a piece."""
+        return max(1, self.piece // max(1, math.prod(self.shape[1:]) * self.dtype.itemsize))
+
+    def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
+        """(number of its first frame, frames) piece by piece."""
+        for start in range(0, self.shape[0], self.step):
+            yield start, self[start : start + self.step]
 
 
 @dataclass(frozen=True)
@@ -179,8 +101,10 @@ class Found:
     """What a file holds: detections, or frames.
 
     channel, ticks: (detections,) integers in any order, which input and when, in `facts["tick"]` since the start.
-    bits: each number of the frames is a bit, and they are `packed` where eight columns are a byte. facts: what the file
-    says of itself, see `FACTS`; notes: what is to be known of it.
+    pixels: the channels that are pixels, in the pixels' order, silent ones too; None where the file does not say.
+    names: channels that the file does not call by their number. bits: each number of the frames is a bit, and they are
+    `packed` where eight columns are a byte. facts: what the file says of itself, see `FACTS`; sources: where, by the
+    name of the fact. notes: what is to be known of it; left_out: what of the file is no detection of a pixel.
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -190,18 +114,26 @@ class Found:
     bits: bool = False
     packed: bool = False
     notes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    pixels: tuple[int, ...] | None = None
+    names: Mapping[int, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
 
 
 class Format:
     """Reads one kind of file. A class is found by being defined; the first that fits a file reads it.
 
-    about: its name; begins: what such a file begins with; ends: the suffixes of what has no such mark.
+    about: its name; begins: what such a file begins with; ends: the suffixes of what has no such mark. modalities: what
+    it may hold; takes: the options of its own (`Said`) that it uses.
     """
 
     every: ClassVar[list[type[Format]]] = []
     about: ClassVar[str]
     begins: ClassVar[tuple[bytes, ...]] = ()
     ends: ClassVar[tuple[str, ...]] = ()
+    modalities: ClassVar[tuple[str, ...]] = MODALITIES
+    takes: ClassVar[tuple[str, ...]] = ()
+    binary: ClassVar[bool] = False  # its content may begin with anything
 
     def __init_subclass__(cls) -> None:
         Format.every.append(cls)
@@ -230,12 +162,15 @@ def recognise(path: Path) -> type[Format]:
         if not path.is_file():
             raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}; name a file to import")
         with open(path, "rb") as file:
-            head = file.read(16)
+            head = _head(file)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None
     if not head:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")
     kinds = formats()
+    if head.startswith(_GZIP) and not any(path.suffix.lower() in kind.ends for kind in kinds if kind.binary):
+        name = shlex.quote(path.name)
+        raise InputError(f"{path}: is packed by gzip; unpack it (gunzip -k {name}) and import what comes out")
     for kind in kinds:
         if kind.fits(path, head):
             return kind
@@ -243,7 +178,46 @@ def recognise(path: Path) -> type[Format]:
     raise InputError(f"{path}: this is {image_files.looks_like(head)}; what can be imported is {known}")
 
 
+_GZIP = b"\x1f\x8b\x08"
+HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def _head(file: Any) -> bytes:
+    """The first bytes; of HDF5 those from its signature on, which may stand at 0, 512 (MATLAB), 1024, 2048, ..."""
+    head: bytes = file.read(16)
+    size, at = file.seek(0, 2), 512
+    while at < size:
+        file.seek(at)
+        found: bytes = file.read(16)
+        if found.startswith(HDF5):
+            return found
+        at *= 2
+    return head
+
+
 # --- for the classes ----------------------------------------------------------------------------------------------
+
+
+# data sets and columns of times that count from a laser pulse, or that are a part of a time that lies elsewhere
+_FINE_TIMES = ("nanotimes", "nanotime", "microtimes", "microtime", "dtime", "fine", "fine_time")
+
+
+def refuse_fine_times(path: Path, names: Collection[str]) -> None:
+    """Raise InputError where the times of a file are only a part of what was measured."""
+    for name in _FINE_TIMES:
+        if name in names:
+            raise InputError(f"{path}: has {name} beside its times: {LASER_PULSES}")
+
+
+def whole(numbers: np.ndarray, name: str, path: Path) -> np.ndarray:
+    """Numbers that are whole, as integers: MATLAB stores most of them as doubles. Raises InputError for others."""
+    if numbers.dtype.kind != "f":
+        return numbers
+    fine = (np.rint(numbers) == numbers) & (np.abs(numbers) < 2**53)
+    if not fine.all():
+        at = int(fine.argmin())
+        raise InputError(f"{path}: {name}[{at}] is {numbers[at]:g}, which is no whole number; store ticks and pixels")
+    return numbers.astype(np.int64)
 
 
 def damaged(path: Path, error: Exception) -> InputError:

@@ -5,19 +5,44 @@ from __future__ import annotations
 import math
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .. import image_files
 from ..errors import InputError
-from . import FACTS, LARGEST_PIECE, Format, Found, Said, Stack, damaged, facts, frames_in_file, heard, library
+from ..recording import MODALITIES
+from . import (
+    FACTS,
+    LARGEST_PIECE,
+    Format,
+    Found,
+    Said,
+    Stack,
+    ask,
+    damaged,
+    facts,
+    frames_in_file,
+    heard,
+    library,
+    refuse_fine_times,
+    whole,
+)
+from .stacks import arranged, cut
+
+_FRAMES = tuple(name for name in MODALITIES if name != "tr")
 
 
 class Npy(Format):
-    """A stack of frames as a NumPy array (frames, rows, columns); with --packed eight columns are a byte."""
+    """A stack of frames as a NumPy array (frames, rows, columns); with --packed eight columns are a byte.
+
+    With --axes HWM it is (rows, columns, frames). Numbers are whole, also where they are stored as floats.
+    """
 
     about = "NumPy .npy"
     begins = (b"\x93NUMPY",)
+    modalities = _FRAMES
+    takes = ("packed", "bit_order", "axes")
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -27,15 +52,28 @@ class Npy(Format):
             plain, shape, dtype, at = array.flags.c_contiguous, array.shape, array.dtype, array.offset
         except Exception as error:  # the header is a Python literal, and its reader raises nearly anything
             raise damaged(path, error) from None
-        if not plain or len(shape) != 3 or dtype.kind not in "iub":
-            raise InputError(
-                f"{path}: holds {dtype} of the shape {shape}{'' if plain else ' in Fortran order'}; "
-                "store whole numbers (frames, rows, columns) in C order"
-            )
+        if len(shape) != 3 or dtype.kind not in "iubf":
+            raise InputError(f"{path}: holds {dtype} of the shape {shape}; store whole numbers (frames, rows, columns)")
         if path.stat().st_size != at + math.prod(shape) * dtype.itemsize:
             raise InputError(f"{path}: is longer than the {shape} {dtype} that it declares; store it again by np.save")
-        stack = frames_in_file(path, at, np.uint8 if dtype.kind == "b" else dtype, shape)
-        return Found(frames=stack, bits=dtype.kind == "b", packed=said.packed)
+        if said.packed and not plain:
+            raise InputError(f"{path}: packed bits are stored in Fortran order; store them in C order")
+        dtype = np.dtype(np.uint8) if dtype.kind == "b" else dtype
+        letters = said.axes or "MHW"
+        stored, letters = (shape, letters) if plain else (shape[::-1], letters[::-1])
+        rest = tuple(n for n, axis in zip(stored, letters, strict=True) if axis != "M")
+        if letters[0] == "M":
+            get = frames_in_file(path, at, dtype, stored).get
+        else:
+
+            def get(start: int, stop: int) -> np.ndarray:
+                mapped = np.memmap(path, dtype, "r", at, stored)  # closed at once: mapped pages count as memory
+                return np.array(mapped[cut(letters, start, stop)])
+
+        if math.prod(rest) * dtype.itemsize > LARGEST_PIECE:
+            raise InputError(f"{path}: a frame has {rest[0]} x {rest[1]} pixels; that is more than can be read")
+        stack = arranged(stored, dtype, letters, get)
+        return Found(frames=stack, bits=array.dtype.kind == "b", packed=said.packed)
 
 
 class Npz(Format):
@@ -46,6 +84,7 @@ class Npz(Format):
 
     about = "NumPy .npz"
     begins = (b"PK\x03\x04",)
+    takes = ("packed", "bit_order", "axes")
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -60,14 +99,16 @@ class Npz(Format):
         except (zipfile.BadZipFile, OSError, RuntimeError, ValueError, NotImplementedError) as error:
             raise damaged(path, error) from None
         known = facts(path, lambda name: parts[name].item() if name in parts and parts[name].size == 1 else None)
-        whole = {name: part for name, part in parts.items() if name not in FACTS and part.dtype.kind in "iub"}
-        if "frames" in whole and whole["frames"].ndim == 3:
-            frames = whole["frames"]
-            stack = Stack(frames.shape, frames.dtype, lambda start, stop: frames[start:stop])
-            packed = said.packed or "width" in known
-            return Found(known, frames=stack, bits=frames.dtype.kind == "b", packed=packed)
-        if {"time", "pixel"} <= set(whole):
-            return Found(known, whole["pixel"].ravel(), whole["time"].ravel())
+        plain = {name: part for name, part in parts.items() if name not in FACTS and part.dtype.kind in "iubf"}
+        sources = dict.fromkeys(known, "the file")
+        if "frames" in plain and plain["frames"].ndim == 3:
+            frames, letters, packed = plain["frames"], said.axes or "MHW", said.packed or "width" in known
+            stack = arranged(frames.shape, frames.dtype, letters, lambda a, b: frames[cut(letters, a, b)])
+            return Found(known, frames=stack, bits=frames.dtype.kind == "b", packed=packed, sources=sources)
+        if {"time", "pixel"} <= set(plain):
+            refuse_fine_times(path, held)
+            time, pixel = (whole(plain[name].ravel(), name, path) for name in ("time", "pixel"))
+            return Found(known, pixel, time, sources=sources)
         there = ", ".join(sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"
@@ -75,9 +116,11 @@ class Npz(Format):
 
 
 class Tif(Format):
-    """A stack of frames as a TIFF file, a page each."""
+    """A stack of frames as a TIFF file, a page each; with --packed a page's bytes are eight columns each."""
 
     about = "TIFF"
+    modalities = _FRAMES
+    takes = ("packed", "bit_order")
     begins = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     @classmethod
@@ -92,7 +135,7 @@ class Tif(Format):
                 declared = int((file.imagej_metadata or {}).get("images", 1))
         except Exception as error:  # damaged files make it raise nearly anything
             raise damaged(path, error) from None
-        if len(shape) != 2 or dtype is None or dtype.kind not in "iub" or declared > count:
+        if len(shape) != 2 or dtype is None or dtype.kind not in "iubf" or declared > count:
             raise InputError(
                 f"{path}: its {count} pages are {dtype} of the shape {shape}; store a page of whole numbers, rows x "
                 "columns, for each frame"
@@ -113,35 +156,55 @@ class Tif(Format):
                 raise damaged(path, error) from None
             return out
 
-        return Found(frames=Stack((count, *shape), dtype, get), bits=dtype.kind == "b")
+        return Found(frames=Stack((count, *shape), dtype, get), bits=dtype.kind == "b", packed=said.packed)
 
 
 class Raw(Format):
-    """1-bit frames as a camera's memory holds them, 512 x 512 where nothing else is said, row after row.
+    """Raw frames as a camera's memory holds them, 512 x 512 where nothing else is said, row after row.
 
-    The high bit is the left pixel (--bit-order little: the low bit). Four bytes `DONE` at the end, which a transfer
+    Bits, eight columns to a byte, the high bit the left pixel (--bit-order little: the low bit); with --bits counts of
+    so many bits, a byte each, above 8 bits two with the low byte first. Four bytes `DONE` at the end, which a transfer
     over the network leaves, are passed over. Frames are not turned.
 
-    Source: public readers of the SPAD512 agree on this order; no document of its maker was at hand.
+    Source: public readers of the SPAD512 and SPAD512S agree on this order; no document of its maker was at hand.
     """
 
-    about = "raw 1-bit frames .bin"
+    about = "raw frames .bin"
     ends = (".bin", ".raw")
+    modalities = ("qis", "counts")
+    takes = ("packed", "bit_order")
+    binary = True
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
         """The number of frames follows from the size."""
+        counts = said.modality == "counts" or (said.bits is not None and said.modality is None)
+        if counts and said.bits is None:
+            raise ask(path, ["bits"])
+        if counts and (said.packed or said.bits == 1):
+            raise InputError(f"{path}: bits, eight to a byte, are no counts; leave out --packed or --bits")
         rows, columns, size = said.rows or 512, said.columns or 512, path.stat().st_size
-        each = rows * columns // 8
-        if columns % 8:
+        if not counts and columns % 8:
             raise InputError(f"--columns: {columns} do not fill whole bytes; raw frames have a multiple of 8 columns")
+        shape: tuple[int, ...] = (rows, columns // 8)
+        dtype: np.dtype[Any] = np.dtype(np.uint8)
+        if counts:
+            dtype, shape = np.dtype("<u2" if (said.bits or 0) > 8 else np.uint8), (rows, columns)
+        each = math.prod(shape) * dtype.itemsize
+        if each > LARGEST_PIECE:
+            raise InputError(f"{path}: a frame of {rows} x {columns} pixels is more than can be read; give others")
         with open(path, "rb") as file:
             file.seek(max(0, size - 4))
             size -= 4 if size % each == 4 and file.read(4) == b"DONE" else 0
         if size == 0 or size % each:
+            what = f"counts of {said.bits} bits" if counts else "bits"
             raise InputError(
-                f"{path}: {size:,} bytes are no whole frames of {rows} x {columns} bits ({each:,} bytes each); "
-                "give --height and --width, or copy it again"
+                f"{path}: {size:,} bytes are no whole frames of {rows} x {columns} {what} ({each:,} bytes each); "
+                "give --height and --width, --bits where they are counts, or copy it again"
             )
-        stack = frames_in_file(path, 0, np.uint8, (size // each, rows, columns // 8))
-        return Found({"rows": rows, "columns": columns}, frames=stack, bits=True, packed=True)
+        stack = frames_in_file(path, 0, dtype, (size // each, *shape))
+        sized = f"{rows} x {columns} " + ("as said" if said.rows and said.columns else "where nothing else is said")
+        sources = dict.fromkeys(("rows", "columns"), sized)
+        return Found(
+            {"rows": rows, "columns": columns}, frames=stack, bits=not counts, packed=not counts, sources=sources
+        )

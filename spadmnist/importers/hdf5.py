@@ -11,9 +11,20 @@ import numpy as np
 
 from ..capture_files import FILTERS, attribute, check_stored, opened
 from ..errors import InputError
-from . import LARGEST_PIECE, MOST_EVENTS, Format, Found, Said, Stack, facts
+from . import (
+    HDF5,
+    LARGEST_PIECE,
+    MOST_EVENTS,
+    Format,
+    Found,
+    Said,
+    facts,
+    refuse_fine_times,
+    whole,
+)
+from .stacks import arranged, cut
 
-_MARK = (b"\x89HDF\r\n\x1a\n",)
+_MARK = (HDF5,)
 
 
 def _node(file: Any, name: str, path: Path, group: bool = False) -> Any:
@@ -41,14 +52,15 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
     if found is None:
         there = ", ".join(sorted(str(key)[:40] for key in list(file)[:10])) or "nothing"
         raise InputError(f"{path}: has no data set {name}; there is {there} (--dataset names one of frames)")
-    if found.dtype.kind not in "iub" or found.ndim != axes:
+    line = axes == 1 and found.ndim == 2 and 1 in found.shape  # MATLAB has no arrays of one axis
+    if found.dtype.kind not in "iubf" or (found.ndim != axes and not line):
         what = "(frames, rows, columns)" if axes == 3 else "one axis"
         raise InputError(f"{path}: {name} is {found.dtype} of the shape {found.shape}; store whole numbers with {what}")
     made = found.id.get_create_plist()
     if not {made.get_filter(i)[0] for i in range(made.get_nfilters())} <= FILTERS.keys():
         raise InputError(f"{path}: {name} is packed by a filter that HDF5 itself lacks; store it with gzip")
     taken = math.prod(found.chunks or (1,)) * found.dtype.itemsize
-    if taken > LARGEST_PIECE or (axes == 1 and len(found) > MOST_EVENTS):
+    if taken > LARGEST_PIECE or (axes == 1 and found.size > MOST_EVENTS):
         raise InputError(f"{path}: {name} is stored in larger parts than can be read; store it in smaller ones")
     check_stored(found, name, path)
     return found
@@ -62,14 +74,23 @@ def _number(file: Any, name: str, path: Path) -> float:
     return float(np.asarray(found[()]).ravel()[0])
 
 
+def _numbers(file: Any, name: str, path: Path) -> np.ndarray:
+    """(n,) integers of a plain data set."""
+    return whole(_data_set(file, name, path)[...].ravel(), name, path)
+
+
 class PhotonHdf5(Format):
-    """Photon-HDF5: a detector is a pixel; where several spots have photon data of their own, a spot is one.
+    """Photon-HDF5: a detector is a pixel, over all spots; where spots name no detectors, a spot is a pixel.
+
+    Pixels are the detectors that `detectors_specs` or `setup/detectors/id` name, as many as `setup/num_pixels` says;
+    what has another number, a marker for example, is left out.
 
     Source: photon-hdf5.org, version 0.5. What spadmnist exports says how it was recorded in /user/spadmnist.
     """
 
     about = "Photon-HDF5"
     begins = _MARK
+    modalities = ("tr",)
 
     @classmethod
     def fits(cls, path: Path, head: bytes) -> bool:
@@ -85,26 +106,188 @@ class PhotonHdf5(Format):
         with opened(path) as file:
             spots = sorted(int(m[1]) for key in file if (m := re.fullmatch(r"photon_data(\d{1,6})", key)))
             groups = [f"photon_data{spot}" for spot in spots] or ["photon_data"]
+            for group in groups:
+                refuse_fine_times(path, set(_node(file, group, path, group=True) or ()))
             own = _node(file, "user/spadmnist", path, group=True)
             known = {} if own is None else facts(path, lambda name: attribute((own,), name, path))
+            sources = dict.fromkeys(known, "user/spadmnist")
             if _node(file, "acquisition_duration", path) is not None:
                 known.setdefault("exposure", _number(file, "acquisition_duration", path))
+                sources.setdefault("exposure", "acquisition_duration")
             units = {_number(file, f"{group}/timestamps_specs/timestamps_unit", path) for group in groups}
             if len(units) > 1:
                 raise InputError(f"{path}: its spots have ticks of several lengths; store each spot in its own file")
-            ticks = [_data_set(file, f"{group}/timestamps", path)[...] for group in groups]
-            channels = [np.full(len(times), spot, np.uint32) for spot, times in enumerate(ticks)]
-            if not spots and _node(file, "photon_data/detectors", path) is not None:
-                channels = [_data_set(file, "photon_data/detectors", path)[...]]
-        known |= {"tick": units.pop()} | ({"rows": 1, "columns": len(spots)} if spots else {})
-        return Found(facts(path, known.get), np.concatenate(channels), np.concatenate(ticks))
+            ticks = [_rising(file, f"{group}/timestamps", path) for group in groups]
+            detectors = [_detectors(file, group, len(times), path) for group, times in zip(groups, ticks, strict=True)]
+            declared: tuple[int, ...] | None = None
+            notes: list[str] = []
+            if all(found is None for found in detectors):
+                _check_spots(file, groups, path)
+                channels = [np.full(len(times), spot, np.uint32) for spot, times in enumerate(ticks)]
+                pixels: tuple[int, ...] = tuple(range(len(groups)))
+            elif any(found is None for found in detectors):
+                raise InputError(
+                    f"{path}: only some of its spots name the detector of each detection; store all of them"
+                )
+            else:
+                channels, notes = _unlike([found for found in detectors if found is not None], _count(file, path), path)
+                pixels, declared = _pixels(file, groups, channels, path)
+                if "rows" not in known and said.channels is None:
+                    _check_number(file, pixels, channels, path)
+        known["tick"], sources["tick"] = units.pop(), "timestamps_unit"
+        channel, time = np.concatenate(channels), np.concatenate(ticks)
+        left_out = []
+        if declared is not None and said.channels is None:
+            others = ~np.isin(channel, pixels)
+            numbers = np.unique(channel[others])
+            if len(numbers):
+                row = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
+                left_out.append(f"{int(others.sum()):,} entries with the number {row}, no detector's (markers)")
+            channel, time = channel[~others], time[~others]
+        return Found(
+            facts(path, known.get),
+            channel,
+            time,
+            pixels=None if "rows" in known else pixels,
+            notes=tuple(notes),
+            left_out=tuple(left_out),
+            sources=sources,
+        )
+
+
+def _check_spots(file: Any, groups: list[str], path: Path) -> None:
+    """Raise InputError where spots do not say which of several pixels each detection is of."""
+    declared = _count(file, path)
+    if declared is not None and declared != len(groups):
+        spots = f"its {len(groups)} spots do" if len(groups) > 1 else "it does"
+        raise InputError(
+            f"{path}: {spots} not say which of the {declared} pixels (setup/num_pixels) each detection is of; store "
+            "photon_data/detectors, or correct setup/num_pixels"
+        )
+
+
+def _unlike(found: list[np.ndarray], declared: int | None, path: Path) -> tuple[list[np.ndarray], list[str]]:
+    """Numbers that are unique over all spots, as the format asks; where each spot counts anew, they are numbered.
+
+    Raises InputError where neither is so.
+    """
+    own = [np.unique(numbers) for numbers in found]
+    every, times = np.unique(np.concatenate(own), return_counts=True)
+    if times.max(initial=1) == 1:
+        return found, []
+    if times.sum() != declared:
+        raise InputError(
+            f"{path}: the detector {every[times > 1][0]} is of several spots, but numbers are unique over the file; "
+            "number them anew, or correct setup/num_pixels"
+        )
+    starts = np.cumsum([0, *(len(numbers) for numbers in own)])
+    new = [np.searchsorted(mine, numbers) + start for mine, numbers, start in zip(own, found, starts[:-1], strict=True)]
+    return new, ["its spots number their detectors anew; they are the pixels 0, 1, ... spot after spot"]
+
+
+def _detectors(file: Any, group: str, count: int, path: Path) -> np.ndarray | None:
+    """(count,) the detector of each entry, or None where the group does not say."""
+    name = f"{group}/detectors"
+    if _node(file, name, path) is None:
+        return None
+    found = _numbers(file, name, path)
+    if len(found) != count:
+        raise InputError(f"{path}: {group} has {count:,} timestamps and {len(found):,} detectors; it needs as many")
+    return found
+
+
+def _rising(file: Any, name: str, path: Path) -> np.ndarray:
+    """Times as the format asks for them. Raises InputError where they fall back: a converter lost an overflow."""
+    times = _numbers(file, name, path)
+    earlier = times[1:] < times[:-1]
+    if earlier.any():
+        at = int(earlier.argmax())
+        raise InputError(
+            f"{path}: {name} falls back from {times[at]} to {times[at + 1]} at entry {at + 1:,}; the format asks for "
+            "rising times: convert the recording again"
+        )
+    return times
+
+
+def _pixels(
+    file: Any, groups: list[str], channels: list[np.ndarray], path: Path
+) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
+    """(the numbers of the detectors that are pixels, the same where the file lists them, else None).
+
+    Two lists may stand there: what the spots' `detectors_specs` name, and `setup/detectors/id`, which markers may be
+    among. That one counts which has as many as `setup/num_pixels` says.
+    """
+    used = sorted({int(n) for found in channels for n in np.unique(found)})
+    declared = _count(file, path)
+    lists = [sorted(_specified(file, groups, path)), sorted(_identified(file, path))]
+    lists = [numbers for numbers in lists if numbers and (declared is None or len(numbers) == declared)]
+    if lists:
+        return tuple(lists[0]), tuple(lists[0])
+    if declared is not None and not set(used) - set(range(declared)):
+        return tuple(range(declared)), None  # numbered from 0, silent ones too
+    return tuple(used), None
+
+
+def _count(file: Any, path: Path) -> int | None:
+    """What the file says of the number of its pixels."""
+    return None if _node(file, "setup/num_pixels", path) is None else int(_number(file, "setup/num_pixels", path))
+
+
+def _specified(file: Any, groups: list[str], path: Path) -> set[int]:
+    """The detectors that `detectors_specs` assign to a spectral, polarization or split channel."""
+    found: set[int] = set()
+    for group in groups:
+        specs = _node(file, f"{group}/measurement_specs/detectors_specs", path, group=True)
+        for name in specs if specs is not None else ():
+            if re.fullmatch(r"(spectral|polarization|split)_ch\d+", name):
+                found |= _listed(file, f"{group}/measurement_specs/detectors_specs/{name}", path)
+    return found
+
+
+def _identified(file: Any, path: Path) -> set[int]:
+    there = _node(file, "setup/detectors/id", path) is not None
+    return _listed(file, "setup/detectors/id", path) if there else set()
+
+
+def _listed(file: Any, name: str, path: Path) -> set[int]:
+    """Numbers that stand in a small data set, one or several."""
+    found = _node(file, name, path)
+    if found is None or found.dtype.kind not in "iu" or found.ndim > 1 or found.size > _MOST_DETECTORS:
+        raise InputError(f"{path}: {name} is no list of detectors; write their numbers there")
+    return set(map(int, np.asarray(found[()]).ravel()))
+
+
+_MOST_DETECTORS = 1 << 20
+
+
+def _check_number(file: Any, pixels: tuple[int, ...], channels: list[np.ndarray], path: Path) -> None:
+    """Raise InputError where the file says that it has another number of pixels."""
+    declared = _count(file, path)
+    if declared is None or declared == len(pixels):
+        return
+    used = sorted({int(n) for found in channels for n in np.unique(found)})
+    if len(used) > declared:
+        row = ", ".join(map(str, used[:20]))
+        raise InputError(
+            f"{path}: setup/num_pixels says {declared} pixels, but detections are of {len(used)} detectors ({row}); "
+            "name those that are pixels with --channels"
+        )
+    raise InputError(
+        f"{path}: setup/num_pixels says {declared} pixels, but only {len(used)} detectors have a number; name all that "
+        f"are pixels with --channels {','.join(map(str, used[:20]))},..."
+    )
 
 
 class PlainHdf5(Format):
-    """Plain HDF5: the data sets time and pixel, or frames (--dataset names another), as a measurement stores them."""
+    """Plain HDF5: the data sets time and pixel, or frames (--dataset names another), as a measurement stores them.
+
+    In a file of MATLAB (7.3) the axes are those that MATLAB shows, and a stack is (rows, columns, frames) unless --axes
+    says otherwise.
+    """
 
     about = "plain HDF5"
     begins = _MARK
+    takes = ("packed", "bit_order", "dataset", "axes")
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -115,16 +298,28 @@ class PlainHdf5(Format):
             stored = None if detections else _data_set(file, name, path, axes=3)
             nodes = (file,) if detections else (stored, file)
             known = facts(path, lambda key: attribute(nodes, key, path))
+            sources = dict.fromkeys(known, "the file")
             if attribute(nodes, "counting", path) == "counter":
                 known["counter"] = 1
             if stored is None:
-                time, pixel = (_data_set(file, key, path)[...] for key in ("time", "pixel"))
-                return Found(known, pixel, time)
+                refuse_fine_times(path, set(file))
+                time, pixel = (_numbers(file, key, path) for key in ("time", "pixel"))
+                return Found(known, pixel, time, sources=sources)
             shape, dtype = stored.shape, stored.dtype
+            matlab = "MATLAB_class" in stored.attrs
+        packed = said.packed or "width" in known
+        # MATLAB shows the axes in the opposite order
+        letters = "MHW" if packed else (said.axes or "HWM")[::-1] if matlab else said.axes or "MHW"
 
         def get(start: int, stop: int) -> np.ndarray:
             with opened(path) as file:
-                return np.asarray(_data_set(file, name, path, axes=3)[start:stop])
+                return np.asarray(_data_set(file, name, path, axes=3)[cut(letters, start, stop)])
 
-        packed = said.packed or "width" in known
-        return Found(known, frames=Stack(shape, dtype, get), bits=dtype.kind == "b", packed=packed)
+        notes: tuple[str, ...] = ()
+        if matlab and not packed and said.axes is None:
+            notes = (
+                "as MATLAB shows it, the stack is (rows, columns, frames); --axes MHW says that frames come first",
+            )
+        bits = dtype.kind == "b"
+        frames = arranged(shape, dtype, letters, get)
+        return Found(known, frames=frames, bits=bits, packed=packed, sources=sources, notes=notes)

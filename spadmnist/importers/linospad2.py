@@ -34,6 +34,9 @@ class LinoSpad2(Format):
 
     about = "LinoSPAD2 .dat"
     ends = (".dat",)
+    modalities = ("tr",)
+    takes = ("tdc", "offsets", "firmware", "timestamps", "cycle")
+    binary = True
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -80,14 +83,23 @@ class LinoSpad2(Format):
             outside += int((~inside).sum())
             channels.append(pixel[inside].astype(np.uint8))
             ticks.append((codes + (start + cycle) * length)[inside].astype(np.uint64))
+        if said.tick is not None and ends is None:
+            raise InputError("--tick: without --tdc the ticks are the codes; give --tdc as well, or leave out --tick")
         notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
         if full:
             times = f"{full:,} of {kept * cycles:,} times"
             notes.append(f"{times} a converter was full, and blind for the rest of its cycle")
-        if outside:
-            notes.append(f"{outside:,} time stamps lie outside their cycle and were left out")
+        left_out = (f"{outside:,} time stamps that lie outside their cycle",) if outside else ()
         facts = {"tick": tick, "exposure": cycles * said.cycle, "rows": 1, "columns": 256}
-        return Found(facts, np.concatenate(channels), np.concatenate(ticks), notes=tuple(notes))
+        sources = {"exposure": f"{cycles:,} cycles", "tick": "--tdc" if ends is not None else "its codes"}
+        return Found(
+            facts,
+            np.concatenate(channels),
+            np.concatenate(ticks),
+            notes=tuple(notes),
+            left_out=left_out,
+            sources=sources,
+        )
 
 
 @functools.lru_cache(maxsize=1)

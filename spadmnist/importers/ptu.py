@@ -2,24 +2,102 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
-from . import MOST_EVENTS, Format, Found, Said, damaged, heard, library
+from . import LASER_PULSES, MOST_EVENTS, Format, Found, Said, damaged, facts, heard, library
+
+SYNC = 64  # the number by which the sync input is known here; the inputs of all instruments have smaller ones
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a T2 record of an instrument lies in its 32 bits.
+
+    time: bits of the time, the lowest; channel: bits above them; special: is the highest bit the mark of a record that
+    is no detection? wrap: ticks of an overflow; numbered: does an overflow's record say how many there were?
+    inputs: how many channels there are, where any other is damage.
+    """
+
+    time: int
+    channel: int
+    special: bool
+    wrap: int
+    numbered: bool
+    inputs: int
+
+
+_HARP = Layout(time=25, channel=6, special=True, wrap=1 << 25, numbered=True, inputs=63)
+# by the record type that a header names
+LAYOUTS = {
+    0x00010203: Layout(time=28, channel=4, special=False, wrap=210_698_240, numbered=False, inputs=5),  # PicoHarp 300
+    0x00010204: Layout(time=25, channel=6, special=True, wrap=33_552_000, numbered=False, inputs=63),  # HydraHarp 1
+    0x01010204: _HARP,  # HydraHarp 2
+    0x00010205: _HARP,  # TimeHarp 260 N
+    0x00010206: _HARP,  # TimeHarp 260 P
+    0x00010207: _HARP,  # MultiHarp, PicoHarp 330
+}
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """T2 records, decoded. channel, ticks: (detections,) the input of each (`SYNC`: the sync input) and its time."""
+
+    channel: np.ndarray
+    ticks: np.ndarray
+    markers: int
+    unknown: int
+
+
+def decode(records: np.ndarray, layout: Layout) -> Decoded:
+    """Detections from raw T2 records: overflows are added up in 64 bits. Raises ValueError for a channel that is none.
+
+    Source: PicoQuant, demonstration readers of the "Unified TTTR File Format".
+    """
+    time = records & np.uint32((1 << layout.time) - 1)
+    channel = (records >> np.uint32(layout.time) & np.uint32((1 << layout.channel) - 1)).astype(np.uint8)
+    if layout.special:
+        special = records >> np.uint32(31) == 1
+        overflow = special & (channel == 63)
+        marker = special & (channel > 0) & (channel < 16)
+        sync = special & (channel == 0)
+        channel[sync] = SYNC
+        detection = ~special | sync
+        unknown = special & ~(overflow | marker | sync)
+    else:
+        extra = channel == 15
+        overflow = extra & (time & np.uint32(15) == 0)
+        marker = extra & ~overflow
+        detection = ~extra
+        unknown = np.zeros(len(records), bool)
+        wrong = detection & (channel >= layout.inputs)
+        if wrong.any():
+            raise ValueError(f"record {int(wrong.argmax()):,} is of channel {channel[wrong.argmax()]}, which is none")
+    # how often the clock has gone round before each record
+    rounds = overflow.astype(np.int64)
+    if layout.numbered:
+        rounds[overflow] = np.maximum(time[overflow], 1)  # early firmware leaves the number 0
+    rounds = np.cumsum(rounds)
+    ticks = (rounds[detection] * layout.wrap + time[detection]).astype(np.uint64)
+    return Decoded(channel[detection], ticks, int(marker.sum()), int(unknown.sum()))
 
 
 class Ptu(Format):
     """PicoQuant PTU, T2 mode: every detection with its channel and its time.
 
-    Markers, and pulses of the sync input, are no detections. The records are decoded by ptufile, overflows as well.
+    In T2 mode all inputs record alike, the sync input too: where it has detections it is a channel, `sync`, and the
+    first pixel. Markers are no detections.
 
-    Source: PicoQuant, "Unified TTTR File Format".
+    Source: PicoQuant, "Unified TTTR File Format"; the header is read by ptufile, the records here.
     """
 
     about = "PicoQuant PTU"
     begins = (b"PQTTTR",)
+    modalities = ("tr",)
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -27,32 +105,89 @@ class Ptu(Format):
         ptufile = library(path, "ptufile", "ptu")
         try:
             with heard("ptufile"), ptufile.PtuFile(path) as file:
-                if file.is_t3:
-                    raise InputError(
-                        f"{path}: was recorded in T3 mode, whose times count from the last laser pulse; "
-                        "record in T2 mode, or export the times to CSV"
-                    )
-                declared, held = file.number_records, (path.stat().st_size - file.record_offset) // 4
-                if declared > min(held, MOST_EVENTS):
-                    raise InputError(
-                        f"{path}: declares {declared:,} records, {held:,} follow and {MOST_EVENTS:,} can be read; "
-                        "copy it again, or cut it into several"
-                    )
-                raw = file.read_records()
-                records = file.decode_records(raw)
-                tick, tags = float(file.global_resolution), dict(file.tags)
-        except InputError:
-            raise
+                tags, start = dict(file.tags), int(file.record_offset)
         except Exception as error:  # a damaged header makes it raise nearly anything
             raise damaged(path, error) from None
-        # marked as special, with channel 0, which the library takes for the first input (for the PicoHarp 300, which
-        # has no such mark, it would be channel 8, which it has not)
-        sync = raw >> 25 == 64
-        counts = {"markers": int((records["marker"] > 0).sum()), "pulses of the sync input": int(sync.sum())}
-        notes = tuple(f"{n:,} {what} are no detections and were left out" for what, n in counts.items() if n)
-        kept = (records["channel"] >= 0) & ~sync
-        facts = {"tick": tick}
-        milliseconds = tags.get("TTResult_StopAfter") or tags.get("MeasDesc_AcquisitionTime")
+        kind = tags.get("TTResultFormat_TTTRRecType")
+        if tags.get("Measurement_Mode") == 3 or _is_t3(kind):
+            raise InputError(f"{path}: {LASER_PULSES}")
+        if kind not in LAYOUTS:
+            raise InputError(f"{path}: has records of the type {kind!r:.40}, which is no T2; record in T2 mode")
+        known, sources = _header(path, tags)
+        notes = []
+        layout = LAYOUTS[kind]
+        try:
+            found = decode(_records(path, tags, start), layout)
+        except ValueError as error:
+            raise damaged(path, error) from None
+        back = _falls_back(path, found.ticks, layout.wrap)
+        if back:
+            notes.append(f"{back:,} records stand behind a later one; they were sorted")
+        left_out = [f"{found.markers:,} markers, which are no detections"] if found.markers else []
+        if found.unknown:
+            left_out.append(f"{found.unknown:,} special records of an unknown kind")
+        if not tags.get("TTResult_NumberOfRecords"):
+            notes.append("its header was never finished, as of a recording that broke off")
+        sync = int((found.channel == SYNC).sum())
+        if sync and said.channels is None and (found.channel != SYNC).any():
+            notes.append(
+                f"the sync input has {sync:,} detections and is the first pixel; if they are pulses of a laser, choose "
+                "the others with --channels"
+            )
+        return Found(
+            facts(path, known.get),
+            found.channel,
+            found.ticks,
+            notes=tuple(notes),
+            left_out=tuple(left_out),
+            names={SYNC: "sync"},
+            sources=sources,
+        )
+
+
+def _is_t3(kind: Any) -> bool:
+    """T2 and T3 records of an instrument differ in one digit."""
+    return isinstance(kind, int) and kind >> 8 & 15 == 3
+
+
+def _header(path: Path, tags: dict[str, Any]) -> tuple[dict[str, float], dict[str, str]]:
+    """(tick and exposure, by which tags they stand there)."""
+    tick = tags.get("MeasDesc_GlobalResolution")
+    if not isinstance(tick, (int, float)):
+        raise InputError(f"{path}: does not say how long a tick is (MeasDesc_GlobalResolution); copy it again")
+    known, sources = {"tick": float(tick)}, {"tick": "MeasDesc_GlobalResolution"}
+    for name in ("TTResult_StopAfter", "MeasDesc_AcquisitionTime"):
+        milliseconds = tags.get(name)
         if isinstance(milliseconds, int) and milliseconds > 0:
-            facts["exposure"] = milliseconds / 1000
-        return Found(facts, records["channel"][kept].astype(np.uint8), records["time"][kept], notes=notes)
+            known["exposure"], sources["exposure"] = milliseconds / 1000, name
+            break
+    return known, sources
+
+
+def _records(path: Path, tags: dict[str, Any], start: int) -> np.ndarray:
+    """(records,) uint32, as many as the header declares; all that follow where it was never finished."""
+    declared, held = tags.get("TTResult_NumberOfRecords", 0), (path.stat().st_size - start) // 4
+    if not isinstance(declared, int) or declared <= 0:
+        declared = held
+    if declared > min(held, MOST_EVENTS):
+        raise InputError(
+            f"{path}: declares {declared:,} records, {held:,} follow and {MOST_EVENTS:,} can be read; copy it again, "
+            "or cut it into several"
+        )
+    return np.fromfile(path, "<u4", declared, offset=start)
+
+
+def _falls_back(path: Path, ticks: np.ndarray, wrap: int) -> int:
+    """How many detections are earlier than the one before, by less than half an overflow, which is disorder between
+    inputs. Raises InputError where it is more: an overflow is missing, and all later times are wrong.
+    """
+    steps = np.diff(ticks.astype(np.int64))
+    back = steps < 0
+    lost = steps < -(wrap // 2)
+    if lost.any():
+        at = int(lost.argmax())
+        raise InputError(
+            f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {at + 1:,}; "
+            "records are missing there: copy it again from where it was made"
+        )
+    return int(back.sum())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,56 +12,143 @@ import numpy as np
 
 from .. import image_files, units
 from ..errors import InputError
-from . import MOST_CHANNELS, PICOSECOND, Format, Found, Said, damaged
+from . import LASER_PULSES, MOST_CHANNELS, PICOSECOND, Format, Found, Said
 
 _AT_ONCE = 1 << 24  # characters
-_LONGEST_LINE = 1000
+_LONGEST_LINE = 1000  # characters
+_MOST_TICKS = 2**53  # up to which a number with a decimal point is exact
+_HOW = "write pixel,time (ps) (or x,y,time (ns)) into the first line"
+
+# what the columns of other programs are called
+_PIXEL, _X, _Y = ("pixel", "channel", "detector", "ch", "pixel_id"), ("x", "column", "col"), ("y", "row")
+_TIME, _FINE = ("time", "timestamp", "t", "arrival_time", "time_tag", "timetag"), ("fine", "fine_time")
+_FROM_A_PULSE = ("nanotime", "nanotimes", "microtime", "dtime", "tcspc")
+
+
+@dataclass(frozen=True)
+class _Head:
+    """What the columns are: the numbers of the columns of `pixel`, or of x and y, and (column, s) of each time."""
+
+    separator: str | None  # None: any white space
+    columns: int
+    pixel: int | None
+    x: int | None
+    y: int | None
+    times: tuple[tuple[int, float, str], ...]
 
 
 class Table(Format):
     """A table of detections: a line `pixel,time (ps)` (or ns, us, s), then a line for each of them.
 
+    The columns may stand in any order, between commas, semicolons (numbers may then have a decimal comma), tabs or
+    spaces; `x,y,time (ps)` instead of a pixel's number, with --rows and --columns; `fine (ps)` is added to the time.
     Times are rounded to ticks of --tick, 1 ps without it.
     """
 
     about = "CSV of pixel and time"
-    ends = (".csv", ".txt")
+    ends = (".csv", ".txt", ".tsv")
+    modalities = ("tr",)
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
-        """The two columns may stand in either order."""
+        """Times are read as doubles: exact for whole numbers below 2^53."""
         tick = said.tick or PICOSECOND
         channels, ticks = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint64)]
         try:
             with open(path, encoding="utf-8-sig") as file:
-                head = [cell.strip().lower() for cell in file.readline(_LONGEST_LINE).split(",")]
-                unit = [m[1] for cell in head if (m := re.fullmatch(r"time\s*\((\w+)\)", cell))]
-                if len(head) != 2 or len(unit) != 1 or "pixel" not in head:
-                    raise InputError(f"{path}:1: {','.join(head)[:60]!r} is no header; write pixel,time (ps)")
-                try:
-                    scale = float(units.parse(f"1 {unit[0]}", "s"))
-                except ValueError as error:
-                    raise InputError(f"{path}:1: {error}") from None
-                for line, table in _pieces(file, path):
-                    pixel, time = table.T if head[0] == "pixel" else table.T[::-1]
-                    whole = np.rint(time * (scale / tick))
-                    fine = (pixel >= 0) & (pixel < MOST_CHANNELS) & (pixel == np.floor(pixel))
-                    fine &= (time >= 0) & (whole < 2**53)
+                first = file.readline(_LONGEST_LINE)
+                head = _head(first, path)
+                shape = _shape(head, said, path)
+                for line, table in _pieces(file, path, head):
+                    channel, where = _channels(head, table, shape)
+                    time = sum((table[:, i] * (scale / tick) for i, scale, _ in head.times), np.zeros(len(table)))
+                    whole = np.rint(time)
+                    fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
+                    fine &= (time >= 0) & (whole < _MOST_TICKS)
                     if not fine.all():
                         row = int(fine.argmin())
+                        at, unit = table[row, head.times[0][0]], head.times[0][2]
                         raise InputError(
-                            f"{path}:{line + row}: {pixel[row]:g} at {time[row]:g} {unit[0]} is no pixel (0, 1, ...) "
-                            "and a time from 0 on, below 2^53 ticks; correct it, or give a longer --tick"
+                            f"{path}:{line + row}: {where(row)} at {at:.15g} {unit} is no pixel (0, 1, ...) and a time "
+                            "from 0 on, below 2^53 ticks; correct it, or give a longer --tick"
                         )
-                    channels.append(pixel.astype(np.uint32))
+                    channels.append(channel.astype(np.uint32))
                     ticks.append(whole.astype(np.uint64))
         except UnicodeDecodeError as error:
-            raise damaged(path, error) from None
-        return Found({"tick": tick}, np.concatenate(channels), np.concatenate(ticks))
+            raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); store the table as UTF-8") from None
+        facts = {"tick": tick} | ({} if shape is None else {"rows": shape[0], "columns": shape[1]})
+        source = "--tick" if said.tick is not None else "a table's times are rounded to it"
+        return Found(facts, np.concatenate(channels), np.concatenate(ticks), sources={"tick": source})
 
 
-def _pieces(file: Any, path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """(number of its first line, (lines, 2) numbers), piece by piece."""
+def _head(text: str, path: Path) -> _Head:
+    """The columns that the first line names. Raises InputError with the line to write."""
+    line = text.strip().lstrip("#").strip()
+    separator = next((mark for mark in (",", ";", "\t") if mark in line), None)
+    cells = line.split(separator) if separator else re.findall(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?", line)
+    cells = [cell.strip().strip('"').lower() for cell in cells]
+    shown = f"{line[:60]!r}"
+    if cells and all(re.fullmatch(r"[-+.\d,]+(e[-+]?\d+)?", cell) for cell in cells):
+        raise InputError(f"{path}:1: {shown} is a line of numbers, and a header is missing; {_HOW}")
+    pixel, x, y, times, strange = None, None, None, [], []
+    for i, cell in enumerate(cells):
+        name, unit = _named(cell)
+        if name in _FROM_A_PULSE:
+            raise InputError(f"{path}:1: {cell!r}: {LASER_PULSES}")
+        if name in (*_TIME, *_FINE) and unit:
+            try:
+                times.append((name in _FINE, i, float(units.parse(f"1 {unit}", "s")), unit))
+            except ValueError as error:
+                raise InputError(f"{path}:1: {error}") from None
+        elif name in _PIXEL and pixel is None:
+            pixel = i
+        elif name in _X and x is None:
+            x = i
+        elif name in _Y and y is None:
+            y = i
+        else:
+            strange.append(cell)
+    coarse = [one for one in times if not one[0]]
+    placed = (pixel is not None) != (x is not None and y is not None) and (x is None) == (y is None)
+    if strange or len(coarse) != 1 or len(times) > 2 or not placed:
+        bare = [cell for cell in strange if cell in _TIME]
+        why = f"{bare[0]!r} has no unit" if bare else "is no header"
+        raise InputError(f"{path}:1: {shown} {why}; {_HOW}" if not bare else f"{path}:1: in {shown} {why}; {_HOW}")
+    order = tuple((i, scale, unit) for _, i, scale, unit in sorted(times))
+    return _Head(separator, len(cells), pixel, x, y, order)
+
+
+def _named(cell: str) -> tuple[str, str]:
+    """(name, unit) of a column: `time (ps)`, `time [ps]`, `time_ps`, `pixel`."""
+    found = re.fullmatch(r"(\w[\w ]*?)\s*[(\[]\s*([^\W\d_]+)\s*[)\]]", cell)
+    if found is None and (spelt := re.fullmatch(r"(\w+?)_(s|ms|us|µs|μs|ns|ps)", cell)):
+        found = spelt
+    name, unit = (found[1], found[2]) if found else (cell, "")
+    return re.sub(r"\s+", "_", name), unit
+
+
+def _shape(head: _Head, said: Said, path: Path) -> tuple[int, int] | None:
+    """Rows and columns, which x and y need."""
+    if head.x is None:
+        return None
+    if said.rows is None or said.columns is None:
+        raise InputError(f"{path}: names pixels by x and y; say how many there are with --rows and --columns")
+    return said.rows, said.columns
+
+
+def _channels(head: _Head, table: np.ndarray, shape: tuple[int, int] | None) -> tuple[np.ndarray, Any]:
+    """(the pixel of each line, -1 where there is none; how the file names it, by line)."""
+    if head.pixel is not None:
+        number = table[:, head.pixel]
+        return number, lambda row: f"{number[row]:g}"
+    assert shape is not None and head.x is not None and head.y is not None
+    x, y = table[:, head.x], table[:, head.y]
+    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    return np.where(inside, y * shape[1] + x, -1.0), lambda row: f"x = {x[row]:g}, y = {y[row]:g}"
+
+
+def _pieces(file: Any, path: Path, head: _Head) -> Iterator[tuple[int, np.ndarray]]:
+    """(number of its first line, (lines, columns) numbers), piece by piece."""
     line, rest, more = 2, "", True
     while more:
         text = file.read(_AT_ONCE)
@@ -70,13 +158,18 @@ def _pieces(file: Any, path: Path) -> Iterator[tuple[int, np.ndarray]]:
             raise InputError(f"{path}: has a line of more than {_LONGEST_LINE} characters; is it a table?")
         lines = text.splitlines()
         if text.strip():
-            try:
-                table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-            except ValueError as error:
-                raise InputError(
-                    f"{path}: {image_files.reason(error)}, from line {line} on; a line is 3,1250"
-                ) from None
-            if table.shape[1] != 2:
-                raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is a pixel and a time")
-            yield line, table
+            yield line, _numbers(lines, line, path, head)
         line += len(lines)
+
+
+def _numbers(lines: Sequence[str], line: int, path: Path, head: _Head) -> np.ndarray:
+    if head.separator == ";":
+        lines = [one.replace(",", ".") for one in lines]
+    try:
+        table = np.loadtxt(lines, delimiter=head.separator, ndmin=2, comments=None)
+    except ValueError as error:
+        raise InputError(f"{path}: {image_files.reason(error)}, from line {line} on; a line is 3,1250") from None
+    if table.shape[1] != head.columns:
+        what = "a pixel and a time" if head.columns == 2 else f"{head.columns} numbers, as the first line says"
+        raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is {what}")
+    return table

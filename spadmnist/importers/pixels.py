@@ -1,0 +1,212 @@
+"""Which pixel a channel is, and detections as rows of pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import units
+from ..errors import InputError
+from ..events import Events, Layout
+from ..readout import no_detection, stamps_for
+from ..recording import Capture, Recording
+from . import MOST_CHANNELS, Found, Said
+
+_NO_PIXEL = -1
+_MOST_NAMED = 20  # channels that a sentence lists
+
+
+@dataclass(frozen=True)
+class Array:
+    """The pixels of a measurement.
+
+    channels: (pixels,) the channel that each pixel is; None where a channel's number is that of its pixel.
+    """
+
+    layout: Layout
+    channels: tuple[int, ...] | None = None
+
+
+class Channels:
+    """The channels of several files: which are in use, how they are called, which the files say are pixels."""
+
+    def __init__(self) -> None:
+        self.used = np.zeros(0, bool)
+        self.names: dict[int, str] = {}
+        self.declared: list[int] | None = None
+        self.where: Path | None = None  # the first file with detections
+
+    def add(self, path: Path, found: Found) -> None:
+        """Take in what a file holds."""
+        here = np.bincount(channels_of(path, found)).astype(bool)
+        self.where = self.where or path
+        self.used = np.pad(self.used, (0, max(0, len(here) - len(self.used))))
+        self.used[: len(here)] |= here
+        self.names |= found.names
+        if found.pixels is not None:
+            self.declared = [*(self.declared or []), *(c for c in found.pixels if c not in (self.declared or []))]
+
+    @property
+    def in_use(self) -> list[int]:
+        """Channels with a detection; those with a name come first."""
+        return sorted(map(int, np.flatnonzero(self.used)), key=lambda c: (c not in self.names, c))
+
+    def as_pixels(self) -> tuple[int, ...]:
+        """The channels that become pixels where nobody says which: those that the files declare, or those in use."""
+        if self.declared is None:
+            return tuple(self.in_use)
+        return (*self.declared, *(c for c in self.in_use if c not in self.declared))
+
+    def chosen(self, names: Sequence[str]) -> tuple[int, ...]:
+        """The channels that are called so. Raises InputError where none of them has a detection."""
+        known = {name: channel for channel, name in self.names.items()}
+        for name in names:
+            if not name.isdigit() and name not in known:
+                there = self.called(self.in_use)
+                raise InputError(f"{self.where}: has no channel {name!r}; --channels names some of {there}")
+        found = tuple(known[name] if name in known else int(name) for name in names)
+        if not set(found) & set(self.in_use):
+            there = self.called(self.in_use) or "none"
+            raise InputError(
+                f"{self.where}: has no detection of {', '.join(names)}; --channels names some of those in use: {there}"
+            )
+        return found
+
+    def called(self, channels: Sequence[int]) -> str:
+        """Channels as the file calls them, in a row."""
+        shown = ", ".join(self.names.get(c, str(c)) for c in channels[:_MOST_NAMED])
+        return shown + (", ..." if len(channels) > _MOST_NAMED else "")
+
+
+def channels_of(path: Path, found: Found) -> np.ndarray:
+    """The channel of each detection, as numbers that can be indices. Raises InputError for one that can be none."""
+    channel, ticks = found.channel, found.ticks
+    assert channel is not None and ticks is not None
+    if channel.shape != ticks.shape:
+        raise InputError(f"{path}: has {len(ticks):,} times and {len(channel):,} pixels; it needs as many of both")
+    if len(channel):
+        low, high = int(channel.min()), int(channel.max())
+        if low < 0 or high >= MOST_CHANNELS:
+            wrong = low if low < 0 else high
+            raise InputError(f"{path}: has a channel {wrong}; channels are 0 to {MOST_CHANNELS - 1}: correct the file")
+    return channel.astype(np.int64) if channel.dtype.itemsize > 4 or channel.dtype.kind == "b" else channel
+
+
+def array(
+    path: Path, said: Said, shapes: Sequence[tuple[int, int]], channels: Channels, positions: np.ndarray | None
+) -> Array:
+    """The pixels of some files.
+
+    path: the first file, for messages; shapes: rows and columns as far as user, file or plan say them, all alike;
+    positions: (pixels, 2) m, where they are no grid. Raises InputError with a sentence.
+    """
+    shape = shapes[0] if shapes else None
+    if positions is not None:
+        if shape is not None and shape != (1, len(positions)):
+            raise InputError(f"{said.positions}: names {len(positions)} pixels, but {path} has {_by(shape)}")
+        shape = (1, len(positions))
+    numbers = None
+    if said.channels is not None:
+        numbers = channels.chosen(said.channels)
+        if shape is not None and shape[0] * shape[1] != len(numbers):
+            raise InputError(
+                f"--channels: {len(numbers)} channels are no {_by(shape)} pixels; name a channel for each pixel"
+            )
+    elif shape is None:
+        numbers = channels.as_pixels()
+    rows, columns = shape or (1, len(numbers or ()))
+    if not 0 < rows * columns <= MOST_CHANNELS:
+        if rows * columns:
+            raise InputError(f"{path}: {rows} x {columns} pixels are more than the {MOST_CHANNELS:,} that can be held")
+        raise InputError(f"{path}: holds no detection at all; give --rows and --columns to import it nevertheless")
+    if positions is not None:
+        return Array(Layout(1, len(positions), np.nan, np.nan, positions), numbers)
+    return Array(Layout(rows, columns, np.nan, np.nan), numbers)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Detections of a capture as rows of pixels, in time order. notes, left_out: as in `Found`."""
+
+    recording: Recording
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def events(path: Path, found: Found, said: Said, capture: Capture, array: Array, channels: Channels) -> Placed:
+    """The detections of a file. Raises InputError for a channel that is no pixel and a time outside the exposure."""
+    channel, ticks, exposure = channels_of(path, found), found.ticks, capture.conditions.exposure
+    pixels = array.layout.pixels
+    tick = found.facts.get("tick", said.tick)
+    assert ticks is not None and tick is not None
+    if ticks.dtype.kind == "b":
+        ticks = ticks.astype(np.uint8)
+    notes, left_out = [], []
+    pixel = _pixels(path, channel, array, channels)
+    outside = pixel == _NO_PIXEL
+    if outside.any():
+        others = sorted(set(map(int, np.unique(channel[outside]))))
+        which = f"the channel{'s' * (len(others) > 1)} {channels.called(others)}"
+        left_out.append(f"{int(outside.sum()):,} detections of {which} (--channels)")
+        pixel, ticks = pixel[~outside], ticks[~outside]
+    if said.subtract_start and len(ticks):
+        start = ticks.min()
+        notes.append(f"its clock is counted from the first detection, at {units.show(float(start) * tick, 's', 12)}")
+        ticks = ticks - start
+    end = _check_times(path, ticks, tick, exposure, said)
+    # the stable sort of 16-bit integers counts them
+    order = np.argsort(pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), kind="stable")
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))]).astype(np.int64)
+    ticks = ticks[order].astype(stamps_for(end, f"{path}: time stamps"))
+    earlier = ticks[1:] < ticks[:-1]
+    firsts = offsets[1:-1]
+    earlier[firsts[(firsts > 0) & (firsts < len(ticks))] - 1] = False
+    if earlier.any():
+        ticks = ticks[np.lexsort((ticks, np.repeat(np.arange(pixels), np.diff(offsets))))]
+    made = Recording(capture, array.layout, Events(None, offsets, pixels, ticks, tick, end=exposure), None, tick)
+    return Placed(made, tuple(notes), tuple(left_out))
+
+
+def _pixels(path: Path, channel: np.ndarray, array: Array, channels: Channels) -> np.ndarray:
+    """The pixel of each detection; `_NO_PIXEL` where it is of none."""
+    if array.channels is None:
+        used = channels.in_use
+        unnumbered = [c for c in used if c in channels.names]
+        beyond = [c for c in used if c not in channels.names and c >= array.layout.pixels]
+        wrong = [c for c in [*unnumbered, *beyond] if c <= int(channel.max(initial=0)) and (channel == c).any()]
+        if wrong:
+            why = "has no number" if wrong[0] in channels.names else f"lies beyond the {_by(array.layout.shape)} pixels"
+            listed = channels.called(used).replace(" ", "")
+            raise InputError(
+                f"{path}: the channel {channels.called(wrong[:1])} {why}; say with --channels {listed} which channels "
+                "the pixels are, in their order, or give other --rows and --columns"
+            )
+        return channel
+    pixel_of = np.full(max(int(channel.max(initial=0)), *array.channels) + 1, _NO_PIXEL, np.int32)
+    pixel_of[list(array.channels)] = np.arange(len(array.channels))
+    return np.asarray(pixel_of[channel])
+
+
+def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, said: Said) -> int:
+    """The last tick of the exposure. Raises InputError where a stamp lies outside."""
+    if tick > exposure:
+        times = units.show(tick, "s", 9), units.show(exposure, "s", 9)
+        raise InputError(f"{path}: its ticks of {times[0]} are longer than the exposure of {times[1]}; correct one")
+    end = no_detection(exposure, tick)
+    if not len(ticks) or (int(ticks.min()) >= 0 and int(ticks.max()) <= end):
+        return end
+    low, high = (units.show(float(t) * tick, "s", 9) for t in (ticks.min(), ticks.max()))
+    advice = "give another --exposure"
+    if 0 <= int(ticks.max()) - int(ticks.min()) <= end and not said.subtract_start:
+        advice = "if its clock does not start at 0, give --subtract-start, otherwise another --exposure"
+    raise InputError(
+        f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {low} to {high}, outside the exposure "
+        f"of {units.show(exposure, 's', 9)}; {advice}"
+    )
+
+
+def _by(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))

@@ -1,0 +1,294 @@
+"""What the user says of the files: every option of `import`, declared once.
+
+A field of `Said` is an option. What stands beside it makes the help of the command line, the check of its value, and
+the check that it has an effect on a file: an option that a file cannot use is a mistake, never ignored.
+"""
+
+# ruff: noqa: RUF009 - a function declares the fields
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .. import units
+from ..errors import InputError, SpadError
+from ..readout import SHORTEST_TICK
+from ..recording import MODALITIES, Light
+
+if TYPE_CHECKING:
+    from . import Format
+
+# s (and other SI units): what a time or a level may be; beyond it a number is damaged
+SHORTEST, LONGEST = SHORTEST_TICK, 1e18
+UNCERTAIN = 0.05  # relative standard deviation of a light level of which none is given
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of `import`.
+
+    about: its help. unit: the SI unit of a quantity, `""` for a share. modalities: what it says something of. own: only
+    of kinds of files that take it by name (`Format.takes`). ask: what is asked for where it is missing, and an example.
+    whole, choices, flag, path: what a value is; metavar: how the help calls it; names: further words for it. instead:
+    what is so where it does not apply.
+    """
+
+    about: str
+    modalities: tuple[str, ...] = MODALITIES
+    own: bool = False
+    unit: str | None = None
+    whole: tuple[int, int] | None = None
+    choices: tuple[str, ...] = ()
+    flag: bool = False
+    path: bool = False
+    metavar: str | None = None
+    names: tuple[str, ...] = ()
+    instead: str = ""
+    ask: tuple[str, str] | None = None
+
+
+def _option(about: str, default: Any = None, **more: Any) -> Any:
+    return field(default=default, metadata={"option": Option(about, **more)})
+
+
+_TIMES, _FRAMES = ("tr",), ("qis", "str", "counts")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What the user says of the files, in SI. None where nothing was said: then the file is asked."""
+
+    relative_uncertainty: float | None = _option(
+        f"Of the light's calibration, one standard deviation: 1.5 %.  [default: {UNCERTAIN:.0%}]",
+        unit="",
+        metavar="SHARE",
+    )
+    rows: int | None = _option(
+        "Of pixels, which are then the channels of the same number.  [default: 1 x channels in use]",
+        whole=(1, 10**6),
+        names=("height",),
+    )
+    columns: int | None = _option("Of pixels.", whole=(1, 10**6), names=("width",))
+    positions: Path | None = _option("x,y (um) of pixels that are no grid.", path=True, metavar="FILE.csv")
+    channels: tuple[str, ...] | None = _option(
+        "The channels that are pixels, in the pixels' order: 0,1,sync. Others are left out.",
+        modalities=_TIMES,
+        metavar="LIST",
+    )
+    exposure: float | None = _option(
+        "How long was recorded.",
+        modalities=_TIMES,
+        unit="s",
+        instead="frames last their number x --frame-period",
+        ask=("how long was recorded", '"100 ms"'),
+    )
+    subtract_start: bool = _option(
+        "Of a clock that does not start at 0: the first detection is then at 0.", False, modalities=_TIMES, flag=True
+    )
+    tick: float | None = _option(
+        "Length of a tick, where the file does not say it; of a table 1 ps.",
+        modalities=("tr", "str"),
+        unit="s",
+        ask=("the length of a tick", '"100 ps"'),
+    )
+    modality: str | None = _option("Of a stack of numbers.", choices=MODALITIES)
+    axes: str | None = _option(
+        "Of a stack: MHW (frames, rows, columns) or HWM (rows, columns, frames).  [default: MHW; of MATLAB HWM]",
+        modalities=_FRAMES,
+        own=True,
+        choices=("MHW", "HWM"),
+    )
+    frames: int | None = _option("How many; the file is compared.", modalities=_FRAMES, whole=(1, 10**9))
+    frame_time: float | None = _option(
+        "How long a frame looks.", modalities=_FRAMES, unit="s", ask=("how long a frame looks", '"10 us"')
+    )
+    frame_period: float | None = _option(
+        "From one frame to the next.",
+        modalities=_FRAMES,
+        unit="s",
+        ask=("the time from one frame to the next", '"10 us"'),
+    )
+    bits: int | None = _option(
+        "Of a count; raw counts are a byte each, above 8 bits two.",
+        modalities=("counts",),
+        whole=(1, 16),
+        ask=("how many bits a count has", "8"),
+    )
+    counting: str | None = _option(
+        "A count is the sum of 2^bits - 1 binary frames (default), or of a counter in each frame.",
+        modalities=("counts",),
+        choices=("frames", "counter"),
+    )
+    packed: bool = _option("A byte is eight columns.", False, modalities=("qis",), own=True, flag=True)
+    bit_order: str | None = _option(
+        "Of packed bits: which one is the left column.  [default: big]",
+        modalities=("qis",),
+        own=True,
+        choices=("big", "little"),
+    )
+    dataset: str | None = _option("The frames.  [default: frames]", modalities=_FRAMES, own=True, metavar="PATH")
+    tdc: Path | None = _option("Ends of the codes, in ps.", modalities=_TIMES, own=True, path=True, metavar="FILE.csv")
+    offsets: Path | None = _option("Of the pixels, in ps.", modalities=_TIMES, own=True, path=True, metavar="FILE.npy")
+    firmware: str | None = _option(
+        "Decides what pixel an address is.",
+        modalities=_TIMES,
+        own=True,
+        choices=("2212b", "2212s", "2208"),
+        ask=("the firmware, which decides what pixel an address is", "2212b"),
+    )
+    timestamps: int | None = _option(
+        "Of a cycle.",
+        modalities=_TIMES,
+        own=True,
+        whole=(1, 2**24),
+        ask=("how many words a converter has in a cycle", "512"),
+    )
+    cycle: float | None = _option(
+        "Its length.", modalities=_TIMES, own=True, unit="s", ask=("how long a cycle is", '"4 ms"')
+    )
+
+    @staticmethod
+    def of(**given: Any) -> Said:
+        """From the words of a command line: times with their units. Raises SpadError with the option."""
+        for name, option in options().items():
+            if option.unit is not None and given.get(name) is not None:
+                given[name] = _number(name, option.unit, given[name])
+        if given.get("channels") is not None:
+            given["channels"] = _names(given["channels"])
+        return Said(**given)
+
+    @property
+    def given(self) -> list[str]:
+        """The names of the options that were given."""
+        return [one.name for one in fields(self) if getattr(self, one.name) != one.default]
+
+
+def options() -> dict[str, Option]:
+    """Every option by its name, in the order of the help."""
+    return {one.name: one.metadata["option"] for one in fields(Said)}
+
+
+def word(name: str) -> str:
+    """How an option is written: `frame_time` -> `--frame-time`."""
+    return "--" + name.replace("_", "-")
+
+
+def about(name: str, kinds: Sequence[type[Format]]) -> str:
+    """The help of an option; what only some kinds of files take names them."""
+    option = options()[name]
+    takers = [kind.about for kind in kinds if name in kind.takes]
+    if not option.own:
+        return option.about
+    return f"Of {takers[0]}: {option.about}" if len(takers) == 1 else f"{option.about} ({', '.join(sorted(takers))})"
+
+
+def _number(name: str, unit: str, text: str) -> float:
+    share = not unit
+    try:
+        value = float(units.parse(text, unit))
+    except ValueError as error:
+        raise SpadError(f"{word(name)}: {error}") from None
+    if not (0 <= value <= 1 if share else SHORTEST <= value <= LONGEST):
+        allowed = "from 0 to 1" if share else f"from {SHORTEST:g} s to {LONGEST:g} s"
+        raise SpadError(f"{word(name)}: {text} is not possible; it must be {allowed}")
+    return value
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(part.strip().lower() for part in text.split(","))
+    wrong = [name for name in names if not re.fullmatch(r"\d{1,8}|[a-z]\w*", name)]
+    if wrong:
+        raise SpadError(f"--channels: {wrong[0]!r} is no channel; write them as the file names them, as in 0,1,sync")
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise SpadError(f"--channels: {twice[0]} stands there twice; each channel is one pixel")
+    return names
+
+
+# --- does an option have an effect? ---------------------------------------------------------------------------------
+
+
+def without_effect(said: Said, kind: type[Format], modalities: Iterable[str], packed: bool | None = None) -> str | None:
+    """Why the first option that says nothing of a file does so; None where all have an effect.
+
+    kind: of the file; modalities: what it may hold; packed: are its frames packed bits? None: not known yet.
+    """
+    held = set(modalities)
+    for name in said.given:
+        option = options()[name]
+        of = _words(option, kind, name)
+        if option.own and name not in kind.takes:
+            return f"{word(name)} does not apply to {kind.about}, only to {of}; leave it out"
+        if not held & set(option.modalities):
+            what = "frames" if len(held) > 1 else next(iter(held))
+            instead = f" ({option.instead})" if option.instead else ""
+            return f"{word(name)} does not apply to {what}{instead}, only to {of}; leave it out"
+        if name == "bit_order" and packed is False:
+            return f"{word(name)} does not apply to numbers, only to packed bits; leave it out"
+        if name == "axes" and packed:
+            return f"{word(name)} does not apply to packed bits, whose columns are the last axis; leave it out"
+    return None
+
+
+def _words(option: Option, kind: type[Format], name: str) -> str:
+    """What an option is for."""
+    if option.own and name not in kind.takes:
+        return ", ".join(sorted({other.about for other in kind.every if name in other.takes}))
+    return {
+        _TIMES: "time stamps (tr)",
+        _FRAMES: "frames",
+        ("qis",): "packed bits (qis)",
+        ("tr", "str"): "time stamps (tr, str)",
+    }.get(option.modalities, " and ".join(option.modalities))
+
+
+def ask(path: Path, names: Sequence[str]) -> InputError:
+    """One sentence that asks for everything that is missing."""
+    known = {name: option.ask for name, option in options().items() if option.ask}
+    known["light"] = ("what fell on the sensor", 'dark (or "500 nm 75.67 nW/cm^2")')
+    asked = [(name, known[name]) for name in names]
+    what = ", nor ".join(told[0] for _, told in asked if told)
+    write = " ".join(f"{word(name)} {told[1]}" for name, told in asked if told)
+    return InputError(f"{path}: does not say {what}; add {write}")
+
+
+# --- light ----------------------------------------------------------------------------------------------------------
+
+_LIGHT = 'dark, free, "500 nm free", "500 nm 75.67 nW/cm^2" or "500 nm 5 mlux"'
+_PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
+
+
+def light(text: str, relative_uncertainty: float | None = None) -> Light:
+    """What fell on the sensor, as the command line says it: `dark`, `free`, `500 nm 75.67 nW/cm^2`.
+
+    A level that is free is unknown; where no wavelength is given either, 555 nm stands for it. relative_uncertainty: of
+    a level, one standard deviation; `UNCERTAIN` where it is None. Raises SpadError.
+    """
+    words = " ".join(text.split())
+    if words == "dark":
+        return Light()
+    found: dict[str, float] = {}
+    for part in re.findall(r"free|[-+.0-9][-+.0-9eE]*\s?[^\s0-9]\S*|\S+", words) or [""]:
+        if part == "free":
+            continue
+        for unit in ("m", "W/m^2", "lux"):
+            try:
+                value = float(units.parse(part, unit))
+            except ValueError:
+                continue
+            if 0 < value < math.inf and unit not in found:
+                found[unit] = value
+                break
+        else:
+            raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
+    levels = found.keys() - {"m"}
+    if len(levels) + words.count("free") > 1 or ("W/m^2" in found and "m" not in found):
+        raise SpadError(f"--light: {text!r} needs a wavelength and one level; write {_LIGHT}")
+    level = found.get("W/m^2", found.get("lux"))
+    share = 0.0 if level is None else UNCERTAIN if relative_uncertainty is None else relative_uncertainty
+    return Light(found.get("m", _PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance", share)
