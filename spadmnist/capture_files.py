@@ -31,7 +31,7 @@ from . import units
 from .errors import InputError, SpadError
 from .events import Events, Layout
 from .kernels import jit
-from .readout import SHORTEST_TICK, counts_type, no_detection, stamps_for, unsigned_for
+from .readout import counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
 
 _MOST_EVENTS = 1 << 29  # of a capture: 16 bytes each are 8 GiB
@@ -248,8 +248,10 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
     value = attribute(nodes, "tick", path)
     if value is None:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
-    if isinstance(value, str) or not SHORTEST_TICK <= value < math.inf:
-        raise InputError(f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0")
+    if isinstance(value, str) or not units.SHORTEST <= value < math.inf:
+        raise InputError(
+            f"{path}: the attribute tick is {value!r}; it must be a number of seconds, at least {units.SHORTEST:g}"
+        )
     if value > end:
         raise InputError(
             f"{path}: a tick of {units.show(value, 's')} is longer than the {units.show(end, 's')} that it divides; "

@@ -405,15 +405,14 @@ def _count(damage: Any) -> str:
 
 
 class _ImportCommand(click.Command):
-    """Its options are those of `importers.Said`, made of that table when they are asked for."""
+    """Its options are those of `import_options.Said`, made of that table when they are asked for."""
 
     def get_params(self, context: click.Context) -> list[click.Parameter]:
-        from .importers import formats, said
+        from . import import_options
 
         if all(param.name != "modality" for param in self.params):
-            kinds = formats()
-            made = [_import_option(name, one, said.about(name, kinds)) for name, one in said.options().items()]
-            self.params[-1:-1] = made
+            declared = import_options.options().items()
+            self.params[-1:-1] = [_import_option(name, one, import_options.about(one)) for name, one in declared]
         return super().get_params(context)
 
 
@@ -450,8 +449,8 @@ def import_(
     """Make a measurement of FILES, each a capture that is named as its file.
 
     The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
-    NumPy .npy and .npz, TIFF; or by its name: LinoSPAD2 .dat, raw 1-bit frames .bin, CSV of pixel and time. What no
-    file says is asked for. Times are written with their unit: --exposure "100 ms".
+    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits, or counts with --bits),
+    CSV of pixel and time. What no file says is asked for. Times are written with their unit: --exposure "100 ms".
 
     \b
     spadmnist import t2.ptu -o lab --light free

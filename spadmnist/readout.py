@@ -12,7 +12,6 @@ from .errors import SpadError
 from .events import Events
 
 READOUTS = ("tr", "str", "qis", "counts")
-SHORTEST_TICK = 1e-18  # s: a tick that a file declares is at least so long, or the number is damaged
 
 
 def unsigned_for(largest: float, what: str) -> type[np.unsignedinteger]:

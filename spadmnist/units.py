@@ -52,6 +52,9 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\
 
 _LONGEST = 60  # characters of a quantity
 
+# SI units: what a time or a level that a file declares may be; beyond it the number is damaged
+SHORTEST, LONGEST = 1e-18, 1e18
+
 
 class Quantity(float):
     """A finite number in SI units that remembers how it was written (`.text`) and its unit (`.unit`)."""

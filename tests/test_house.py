@@ -21,6 +21,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 # a module imports from layers below its own, and within its own only along an arrow
 LAYERS = [
     {"errors", "heap", "units", "streams", "light"},
+    {"import_options"},
     {"disk", "kernels"},
     {"document", "plugins", "events", "image_files", "digits", "store"},
     {"effects", "readout", "images"},

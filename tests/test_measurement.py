@@ -358,7 +358,7 @@ TR_FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "tick is nan": ({"attributes": {"tick": np.nan}}, ("nan", "more than 0")),
     "tick is many": ({"attributes": {"tick": np.ones(3)}}, ("not one number",)),
     "tick in ps": ({"attributes": {"tick": 100.0}}, ("100 s is longer than the 1 ms", "tick is in s")),
-    "tick too fine": ({"attributes": {"tick": 1e-30}}, ("beyond what a time stamp can hold",)),
+    "tick too fine": ({"attributes": {"tick": 1e-30}}, ("1e-30", "more than 0 (1e-18 s)")),
     "modality": ({"attributes": {"modality": "qis"}}, ("'qis'", "is 'tr'")),
     "unequal": ({"time": np.zeros(499, np.uint64)}, ("499", "500", "one for each detection")),
     "pixel out of range": ({"pixel": np.full(500, 30, np.uint16)}, ("pixel[0] is 30", "0 to 29")),

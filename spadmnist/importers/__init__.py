@@ -25,8 +25,10 @@ import numpy as np
 
 from .. import image_files
 from ..errors import InputError
+from ..import_options import Said, ask
 from ..recording import MODALITIES
-from .said import LONGEST, SHORTEST, Said, ask, light
+from ..units import LONGEST, SHORTEST
+from .lights import light
 
 __all__ = ["Format", "Found", "Said", "Stack", "ask", "light"]
 
@@ -124,7 +126,7 @@ class Format:
     """Reads one kind of file. A class is found by being defined; the first that fits a file reads it.
 
     about: its name; begins: what such a file begins with; ends: the suffixes of what has no such mark. modalities: what
-    it may hold; takes: the options of its own (`Said`) that it uses.
+    it may hold; takes: the options of its own that it uses (`Option.own`).
     """
 
     every: ClassVar[list[type[Format]]] = []

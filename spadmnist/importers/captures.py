@@ -12,10 +12,10 @@ from .. import config, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
+from ..import_options import options, without_effect, word
 from ..recording import Capture, Light, Recording
 from . import FACTS, Found, Said, ask, pixels, recognise, stacks
 from .pixels import Channels
-from .said import options, without_effect, word
 
 
 @dataclass(frozen=True)

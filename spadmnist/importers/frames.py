@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import image_files
 from ..errors import InputError
+from ..import_options import BITS, STACKS
 from ..recording import MODALITIES
 from . import (
     FACTS,
@@ -42,7 +43,7 @@ class Npy(Format):
     about = "NumPy .npy"
     begins = (b"\x93NUMPY",)
     modalities = _FRAMES
-    takes = ("packed", "bit_order", "axes")
+    takes = (BITS, STACKS)
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -84,7 +85,7 @@ class Npz(Format):
 
     about = "NumPy .npz"
     begins = (b"PK\x03\x04",)
-    takes = ("packed", "bit_order", "axes")
+    takes = (BITS, STACKS)
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
@@ -120,7 +121,7 @@ class Tif(Format):
 
     about = "TIFF"
     modalities = _FRAMES
-    takes = ("packed", "bit_order")
+    takes = (BITS,)
     begins = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     @classmethod
@@ -172,7 +173,7 @@ class Raw(Format):
     about = "raw frames .bin"
     ends = (".bin", ".raw")
     modalities = ("qis", "counts")
-    takes = ("packed", "bit_order")
+    takes = (BITS,)
     binary = True
 
     @classmethod

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..capture_files import FILTERS, attribute, check_stored, opened
 from ..errors import InputError
+from ..import_options import BITS, PLAIN_HDF5, STACKS
 from . import (
     HDF5,
     LARGEST_PIECE,
@@ -287,7 +288,7 @@ class PlainHdf5(Format):
 
     about = "plain HDF5"
     begins = _MARK
-    takes = ("packed", "bit_order", "dataset", "axes")
+    takes = (BITS, STACKS, PLAIN_HDF5)
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:

@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import image_files, units
 from ..errors import InputError
+from ..import_options import LINOSPAD2
 from . import PICOSECOND, Format, Found, Said, ask, frames_in_file
 
 _CLOCK, _CODES = 2500, 140  # ps, codes in it
@@ -35,7 +36,7 @@ class LinoSpad2(Format):
     about = "LinoSPAD2 .dat"
     ends = (".dat",)
     modalities = ("tr",)
-    takes = ("tdc", "offsets", "firmware", "timestamps", "cycle")
+    takes = (LINOSPAD2,)
     binary = True
 
     @classmethod

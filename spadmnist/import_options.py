@@ -8,39 +8,43 @@ the check that it has an effect on a file: an option that a file cannot use is a
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from .. import units
-from ..errors import InputError, SpadError
-from ..readout import SHORTEST_TICK
-from ..recording import MODALITIES, Light
+from . import units
+from .errors import InputError, SpadError
+from .units import LONGEST, SHORTEST
 
-if TYPE_CHECKING:
-    from . import Format
-
-# s (and other SI units): what a time or a level may be; beyond it a number is damaged
-SHORTEST, LONGEST = SHORTEST_TICK, 1e18
+MODALITIES = ("tr", "str", "qis", "counts")
+# what options are for that only some kinds of files use
+BITS, STACKS = "frames of bits", "stacks of numbers (.npy, .npz, HDF5)"
+PLAIN_HDF5, LINOSPAD2 = "plain HDF5", "LinoSPAD2"
 UNCERTAIN = 0.05  # relative standard deviation of a light level of which none is given
+
+
+class Kind(Protocol):
+    """A kind of file: its name, and the options of its own that it uses (`Option.own`)."""
+
+    about: str
+    takes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Option:
     """An option of `import`.
 
-    about: its help. unit: the SI unit of a quantity, `""` for a share. modalities: what it says something of. own: only
-    of kinds of files that take it by name (`Format.takes`). ask: what is asked for where it is missing, and an example.
-    whole, choices, flag, path: what a value is; metavar: how the help calls it; names: further words for it. instead:
-    what is so where it does not apply.
+    about: its help. unit: the SI unit of a quantity, `""` for a share. modalities: what it says something of. own: what
+    it is for, where only some kinds of files use it (their `takes`). ask: what is asked for where it is missing, and an
+    example. whole, choices, flag, path: what a value is; metavar: how the help calls it; names: further words for it.
+    instead: what is so where it does not apply.
     """
 
     about: str
     modalities: tuple[str, ...] = MODALITIES
-    own: bool = False
+    own: str = ""
     unit: str | None = None
     whole: tuple[int, int] | None = None
     choices: tuple[str, ...] = ()
@@ -100,7 +104,7 @@ class Said:
     axes: str | None = _option(
         "Of a stack: MHW (frames, rows, columns) or HWM (rows, columns, frames).  [default: MHW; of MATLAB HWM]",
         modalities=_FRAMES,
-        own=True,
+        own=STACKS,
         choices=("MHW", "HWM"),
     )
     frames: int | None = _option("How many; the file is compared.", modalities=_FRAMES, whole=(1, 10**9))
@@ -124,32 +128,36 @@ class Said:
         modalities=("counts",),
         choices=("frames", "counter"),
     )
-    packed: bool = _option("A byte is eight columns.", False, modalities=("qis",), own=True, flag=True)
+    packed: bool = _option("A byte is eight columns.", False, modalities=("qis",), own=BITS, flag=True)
     bit_order: str | None = _option(
         "Of packed bits: which one is the left column.  [default: big]",
         modalities=("qis",),
-        own=True,
+        own=BITS,
         choices=("big", "little"),
     )
-    dataset: str | None = _option("The frames.  [default: frames]", modalities=_FRAMES, own=True, metavar="PATH")
-    tdc: Path | None = _option("Ends of the codes, in ps.", modalities=_TIMES, own=True, path=True, metavar="FILE.csv")
-    offsets: Path | None = _option("Of the pixels, in ps.", modalities=_TIMES, own=True, path=True, metavar="FILE.npy")
+    dataset: str | None = _option("The frames.  [default: frames]", modalities=_FRAMES, own=PLAIN_HDF5, metavar="PATH")
+    tdc: Path | None = _option(
+        "Ends of the codes, in ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.csv"
+    )
+    offsets: Path | None = _option(
+        "Of the pixels, in ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.npy"
+    )
     firmware: str | None = _option(
         "Decides what pixel an address is.",
         modalities=_TIMES,
-        own=True,
+        own=LINOSPAD2,
         choices=("2212b", "2212s", "2208"),
         ask=("the firmware, which decides what pixel an address is", "2212b"),
     )
     timestamps: int | None = _option(
         "Of a cycle.",
         modalities=_TIMES,
-        own=True,
+        own=LINOSPAD2,
         whole=(1, 2**24),
         ask=("how many words a converter has in a cycle", "512"),
     )
     cycle: float | None = _option(
-        "Its length.", modalities=_TIMES, own=True, unit="s", ask=("how long a cycle is", '"4 ms"')
+        "Its length.", modalities=_TIMES, own=LINOSPAD2, unit="s", ask=("how long a cycle is", '"4 ms"')
     )
 
     @staticmethod
@@ -178,13 +186,9 @@ def word(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def about(name: str, kinds: Sequence[type[Format]]) -> str:
-    """The help of an option; what only some kinds of files take names them."""
-    option = options()[name]
-    takers = [kind.about for kind in kinds if name in kind.takes]
-    if not option.own:
-        return option.about
-    return f"Of {takers[0]}: {option.about}" if len(takers) == 1 else f"{option.about} ({', '.join(sorted(takers))})"
+def about(option: Option) -> str:
+    """The help of an option; what only some kinds of files use says so."""
+    return f"{option.own[0].upper()}{option.own[1:]}: {option.about}" if option.own else option.about
 
 
 def _number(name: str, unit: str, text: str) -> float:
@@ -213,7 +217,9 @@ def _names(text: str) -> tuple[str, ...]:
 # --- does an option have an effect? ---------------------------------------------------------------------------------
 
 
-def without_effect(said: Said, kind: type[Format], modalities: Iterable[str], packed: bool | None = None) -> str | None:
+def without_effect(
+    said: Said, kind: Kind | type[Kind], modalities: Iterable[str], packed: bool | None = None
+) -> str | None:
     """Why the first option that says nothing of a file does so; None where all have an effect.
 
     kind: of the file; modalities: what it may hold; packed: are its frames packed bits? None: not known yet.
@@ -222,7 +228,7 @@ def without_effect(said: Said, kind: type[Format], modalities: Iterable[str], pa
     for name in said.given:
         option = options()[name]
         of = _words(option, kind, name)
-        if option.own and name not in kind.takes:
+        if option.own and option.own not in kind.takes:
             return f"{word(name)} does not apply to {kind.about}, only to {of}; leave it out"
         if not held & set(option.modalities):
             what = "frames" if len(held) > 1 else next(iter(held))
@@ -235,10 +241,10 @@ def without_effect(said: Said, kind: type[Format], modalities: Iterable[str], pa
     return None
 
 
-def _words(option: Option, kind: type[Format], name: str) -> str:
+def _words(option: Option, kind: Kind | type[Kind], name: str) -> str:
     """What an option is for."""
-    if option.own and name not in kind.takes:
-        return ", ".join(sorted({other.about for other in kind.every if name in other.takes}))
+    if option.own and option.own not in kind.takes:
+        return option.own
     return {
         _TIMES: "time stamps (tr)",
         _FRAMES: "frames",
@@ -255,40 +261,3 @@ def ask(path: Path, names: Sequence[str]) -> InputError:
     what = ", nor ".join(told[0] for _, told in asked if told)
     write = " ".join(f"{word(name)} {told[1]}" for name, told in asked if told)
     return InputError(f"{path}: does not say {what}; add {write}")
-
-
-# --- light ----------------------------------------------------------------------------------------------------------
-
-_LIGHT = 'dark, free, "500 nm free", "500 nm 75.67 nW/cm^2" or "500 nm 5 mlux"'
-_PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
-
-
-def light(text: str, relative_uncertainty: float | None = None) -> Light:
-    """What fell on the sensor, as the command line says it: `dark`, `free`, `500 nm 75.67 nW/cm^2`.
-
-    A level that is free is unknown; where no wavelength is given either, 555 nm stands for it. relative_uncertainty: of
-    a level, one standard deviation; `UNCERTAIN` where it is None. Raises SpadError.
-    """
-    words = " ".join(text.split())
-    if words == "dark":
-        return Light()
-    found: dict[str, float] = {}
-    for part in re.findall(r"free|[-+.0-9][-+.0-9eE]*\s?[^\s0-9]\S*|\S+", words) or [""]:
-        if part == "free":
-            continue
-        for unit in ("m", "W/m^2", "lux"):
-            try:
-                value = float(units.parse(part, unit))
-            except ValueError:
-                continue
-            if 0 < value < math.inf and unit not in found:
-                found[unit] = value
-                break
-        else:
-            raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
-    levels = found.keys() - {"m"}
-    if len(levels) + words.count("free") > 1 or ("W/m^2" in found and "m" not in found):
-        raise SpadError(f"--light: {text!r} needs a wavelength and one level; write {_LIGHT}")
-    level = found.get("W/m^2", found.get("lux"))
-    share = 0.0 if level is None else UNCERTAIN if relative_uncertainty is None else relative_uncertainty
-    return Light(found.get("m", _PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance", share)
