@@ -449,7 +449,7 @@ def import_(
     """Make a measurement of FILES, each a capture that is named as its file.
 
     The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
-    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits, or counts with --bits),
+    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits; counts with --bits),
     CSV of pixel and time. What no file says is asked for. Times are written with their unit: --exposure "100 ms".
 
     \b

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,24 +107,22 @@ _MIRRORED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], a
 class Seen:
     """What was seen of the frames of a capture as they were read, in order: to be told when all are.
 
-    detections: their sum (of counts: of what is counted); filled: (frames,) has a frame any? white: the number that
-    stands for a detection; others: is there a number that is neither 0 nor white of 8 bits?
+    detections: their sum (of counts: of what is counted); white: the number that stands for a detection; others: is
+    there a number that is neither 0 nor white of 8 bits? upto: frames seen so far.
     """
 
     modality: str
     detections: int = 0
-    filled: list[np.ndarray] = field(default_factory=list)
     white: int = 0
     others: bool = False
     upto: int = 0
 
-    def add(self, start: int, piece: np.ndarray, detections: int, filled: np.ndarray) -> None:
+    def add(self, start: int, piece: np.ndarray, detections: int) -> None:
         """Take in the frames from `start` on, once."""
         if start != self.upto:
             return
         self.upto = start + len(piece)
         self.detections += detections
-        self.filled.append(filled)
 
     def notes(self) -> tuple[str, ...]:
         """What is to be known of the numbers."""
@@ -133,11 +131,6 @@ class Seen:
         if self.modality == "counts" and self.detections and not self.others:
             return ("every count is 0 or 255, as in a binary stack; if it is one, leave out --bits",)
         return ()
-
-
-def _filled(frames: np.ndarray) -> np.ndarray:
-    """(frames,) is there anything in a frame?"""
-    return np.asarray(frames.reshape(len(frames), -1).any(axis=1))
 
 
 def recording(path: Path, found: Found, said: Said, capture: Capture, layout: Layout) -> tuple[Recording, Seen]:
@@ -167,7 +160,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
             piece = _MIRRORED[piece] if said.bit_order == "little" else piece
             if columns % 8 and (piece[:, :, -1] & (0xFF >> columns % 8)).any():
                 raise InputError(f"{path}: bits beyond the {columns} columns are set; correct --columns or --bit-order")
-            seen.add(start, piece, int(np.bitwise_count(piece).sum()), _filled(piece))
+            seen.add(start, piece, int(np.bitwise_count(piece).sum()))
             return piece
         if piece.dtype.kind == "f" and not (fine := np.rint(piece) == piece).all():
             raise InputError(
@@ -184,7 +177,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
                 raise wrong(low if low < 0 else high, start)
             bits = piece != 0
             seen.white = seen.white or high
-            seen.add(start, piece, int(np.count_nonzero(bits)), _filled(bits))
+            seen.add(start, piece, int(np.count_nonzero(bits)))
             return np.packbits(bits, axis=2)
         if low < 0 or high > most:
             raise wrong(low if low < 0 else high, start)
@@ -192,7 +185,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
         count = int(np.count_nonzero(lit)) if kind == "str" else int(piece.sum(dtype=np.float64))
         if not seen.others:
             seen.others = kind == "str" or bool(((piece != 0) & (piece != 255)).any())
-        seen.add(start, piece, count, _filled(lit))
+        seen.add(start, piece, count)
         return piece.astype(dtype)
 
     shape = (*stack.shape[:2], -(-columns // 8) if kind == "qis" else columns)
