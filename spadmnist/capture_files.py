@@ -250,7 +250,7 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
     if isinstance(value, str) or not units.SHORTEST <= value < math.inf:
         raise InputError(
-            f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0 ({units.SHORTEST:g} s)"
+            f"{path}: the attribute tick is {value!r}; it must be seconds, more than 0 ({units.SHORTEST:g} s)"
         )
     if value > end:
         raise InputError(
