@@ -17,6 +17,7 @@ from spadmnist import capture_files, measurement
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Layout
+from spadmnist.import_options import MOST_ROWS
 from spadmnist.importers import Said, Stack, stacks
 from spadmnist.importers.captures import Imported, import_files
 from spadmnist.recording import Capture, Light
@@ -214,6 +215,28 @@ def test_the_tick_of_a_capture(tmp_path: Path, tick: float) -> None:
     capture = Capture("a", "tr", Light(), Conditions(1.0, 1, 1.0, 1.0, None))
     with pytest.raises(InputError, match=r"tick"):
         capture_files.read(path, capture, Layout(1, 2, np.nan, np.nan), 0.0)
+
+
+@pytest.mark.parametrize("name", ["relative_uncertainty", "own_uncertainty"])
+@pytest.mark.parametrize("share", [-0.1, 1.1, 1e18, float("nan")])
+def test_shares_that_are_not_possible(tmp_path: Path, name: str, share: float) -> None:
+    hdf5(tmp_path / "a.h5", {"tick": 1e-9, name: share}, **TIMES)
+    assert f"says that its {name} is {share}, which is not possible" in refusal(tmp_path / "a.h5")
+    lit = hdf5(tmp_path / "b.h5", {"tick": 1e-9, "relative_uncertainty": 1e-30, "own_uncertainty": 1.0}, **TIMES)
+    assert run(lit, SECOND, ()).captures[0].light == Light(None, None, "irradiance", 1e-30, 1.0)
+
+
+def test_more_pixels_than_a_measurement_holds(tmp_path: Path) -> None:
+    """What is written can be opened."""
+    hdf5(tmp_path / "a.h5", {"tick": 1e-9}, **TIMES)
+    made = import_files([tmp_path / "a.h5"], tmp_path / "most", replace(SECOND, columns=MOST_ROWS), DARK)
+    assert measurement.open(made.folder).layout.shape == (1, MOST_ROWS)
+    hdf5(tmp_path / "b.h5", {"tick": 1e-9, "columns": MOST_ROWS + 1}, **TIMES)
+    assert f"1 x {MOST_ROWS + 1} pixels are more than the 16,777,216" in refusal(tmp_path / "b.h5")
+    assert "4097 x 4097 pixels are more" in refusal(tmp_path / "a.h5", replace(SECOND, rows=4097, columns=4097))
+    used = np.arange(MOST_ROWS + 1, dtype=np.uint32)  # each of them a pixel
+    hdf5(tmp_path / "c.h5", {"tick": 1e-9}, time=np.zeros(len(used), np.uint32), pixel=used)
+    assert f"1 x {MOST_ROWS + 1} pixels are more than" in refusal(tmp_path / "c.h5")
 
 
 @pytest.mark.parametrize("name", ["exposure", "wavelength", "frame_time"])

@@ -322,6 +322,49 @@ def test_linospad2_word_by_word(tmp_path: Path, firmware: str, lines: int, calib
     assert np.abs(np.subtract(found, sorted(expected))[:, 1]).max() < 0.51e-12
 
 
+def calibration(path: Path, ends: np.ndarray) -> Path:
+    head = "," + ",".join(map(str, range(140)))
+    np.savetxt(path, np.c_[np.arange(256), ends], delimiter=",", header=head, comments="")
+    return path
+
+
+def test_linospad2_calibrations(tmp_path: Path) -> None:
+    """Read as it stands there now; pixels without one are told; the firmware in its name is not contradicted."""
+    file = words(tmp_path / "a.dat", [(0, 5, 0, 140 + 70)])
+    ends = np.linspace(0, 2500, 141)[1:] * np.ones((256, 1))
+    for n, factor in enumerate((0.9, 0.5)):
+        table = calibration(tmp_path / "t.csv", ends * factor)
+        made = import_files([file], tmp_path / str(n), replace(LINO, tdc=table), DARK)
+        one = back(made)
+        assert one.events is not None and one.events.times[0] * 1e12 == pytest.approx(
+            2500 + ends[0, 70] * factor, abs=1
+        )
+        assert not any("not calibrated" in note for note in made.notes)
+    ends[:3] = 0
+    table = calibration(tmp_path / "t.csv", ends)
+    made = import_files([file], tmp_path / "some", replace(LINO, tdc=table), DARK)
+    assert any("3 pixels are not calibrated by --tdc; their codes are taken as equally long" in n for n in made.notes)
+    named = calibration(tmp_path / "TDC_NL11_#33_2212s.csv", ends)
+    assert "is of the firmware 2212s by its name, not of 2212b" in refusal(file, replace(LINO, tdc=named))
+    made = import_files([file], tmp_path / "named", replace(LINO, tdc=named, firmware=None), DARK)
+    assert np.flatnonzero(back(made).totals).tolist() == [5]
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e9, -1e300])
+def test_linospad2_offsets_that_are_none(tmp_path: Path, wrong: float) -> None:
+    file = words(tmp_path / "a.dat", [(0, 5, 0, 140 + 70)])
+    table = calibration(tmp_path / "t.csv", np.linspace(0, 2500, 141)[1:] * np.ones((256, 1)))
+    np.save(tmp_path / "o.npy", np.where(np.arange(256) == 7, wrong, 0.0))
+    said = replace(LINO, tdc=table, offsets=tmp_path / "o.npy")
+    assert "offsets are 256 numbers in ps, each less than 1 ms" in refusal(file, said)
+
+
+def test_linospad2_cycles_that_are_too_long(tmp_path: Path) -> None:
+    file = words(tmp_path / "a.dat", [(0, 5, 0, 7)])
+    for cycle in (1e9, 1e18):
+        assert "than can be counted; give another --cycle or --tick" in refusal(file, replace(LINO, cycle=cycle))
+
+
 def test_linospad2_asks(tmp_path: Path) -> None:
     file = words(tmp_path / "a.dat", [])
     said = refusal(file, Said(), [])

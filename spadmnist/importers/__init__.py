@@ -51,7 +51,7 @@ FACTS = (
     *("wavelength", "irradiance", "lux", "relative_uncertainty", "own_uncertainty"),
 )
 _WHOLE = ("rows", "columns", "bits", "counter", "width")
-_MAY_BE_ZERO = ("counter", "relative_uncertainty", "own_uncertainty")
+_SHARES = ("counter", "relative_uncertainty", "own_uncertainty")  # from 0 to 1
 
 
 def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
@@ -61,7 +61,8 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
         value = get(name)
         if value is None:
             continue
-        fine = not isinstance(value, str) and (SHORTEST <= value <= LONGEST or (value == 0 and name in _MAY_BE_ZERO))
+        low, high = (0, 1) if name in _SHARES else (SHORTEST, LONGEST)
+        fine = not isinstance(value, str) and low <= value <= high
         if not fine or (name in _WHOLE and value != int(value)):
             raise InputError(f"{path}: says that its {name} is {_shown(value)}, which is not possible; correct it")
         found[name] = int(value) if name in _WHOLE else float(value)
