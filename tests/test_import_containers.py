@@ -281,6 +281,23 @@ def test_times_of_frames_are_no_detections(tmp_path: Path) -> None:
     assert list(back(import_files([file], tmp_path / "tr", SECOND, DARK)).totals) == [1, 1]
 
 
+def test_names_of_what_a_file_holds_stay_on_one_line(tmp_path: Path) -> None:
+    name = "a\n\x1b[31mb"
+    hdf5(tmp_path / "a.h5", **{name: bits()})
+    np.savez(tmp_path / "a.npz", **{name: bits()})
+    for file in ("a.h5", "a.npz"):
+        text = refusal(tmp_path / file, CLOCK)
+        assert "a  [31mb" in text and text.isprintable()
+
+
+def test_a_width_that_is_not_the_columns(tmp_path: Path) -> None:
+    facts = {"width": 16, "rows": 3, "columns": 11}
+    hdf5(tmp_path / "a.h5", facts, frames=np.packbits(bits(), axis=2))
+    np.savez(tmp_path / "a.npz", frames=np.packbits(bits(), axis=2), **facts)  # type: ignore[arg-type]
+    for file in ("a.h5", "a.npz"):
+        assert "says that it has 11 columns and a width of 16" in refusal(tmp_path / file, CLOCK)
+
+
 def test_a_width_of_numbers(tmp_path: Path) -> None:
     """A file may say the width of frames that are not packed."""
     for name, file in (("a", hdf5(tmp_path / "a.h5", {"width": 11}, frames=bits())), ("b", tmp_path / "b.npz")):
@@ -466,13 +483,24 @@ def test_numbers_that_are_no_counts(tmp_path: Path, value: Any, kind: Any, says:
         assert "stands in the frames" in text
 
 
-@pytest.mark.parametrize(("none", "told"), [(100, False), (0, True)])
-def test_time_stamps_without_a_stamp_for_none(tmp_path: Path, none: int, told: bool) -> None:
-    """Where 0 means that there was no detection, each would be a detection at the start of its frame."""
+@pytest.mark.parametrize(("none", "frame_time", "told"), [(100, 10e-6, False), (0, 10e-6, True), (100, 12e-6, True)])
+def test_time_stamps_without_a_stamp_for_none(
+    tmp_path: Path, none: int, frame_time: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where 0, or the end of a shorter frame, means that there was no detection, each would be one."""
+    monkeypatch.setattr(Stack, "step", 3)
     array = np.where(bits(), np.random.Generator(np.random.Philox(1)).integers(0, 100, (20, 3, 11)), none)
-    made = run(save(tmp_path / "a.npy", array), replace(CLOCK, modality="str", tick=1e-7))
-    assert any("no time stamp means that there was no detection" in note for note in made.notes) == told
+    made = run(save(tmp_path / "a.npy", array), replace(CLOCK, modality="str", tick=1e-7, frame_time=frame_time))
+    count = np.count_nonzero(array == none)
+    says = f"no time stamp means that there was no detection, and {count} of {array.size} are {none}; if that means it"
+    assert any(says in note for note in made.notes) == told
     assert made.took[0].detections == (array.size if told else bits().sum())
+
+
+def test_time_stamps_of_bright_light(tmp_path: Path) -> None:
+    """Every frame has a detection, at any time in it: nothing is said."""
+    array = np.random.Generator(np.random.Philox(1)).integers(0, 100, (20, 3, 11))
+    assert not run(save(tmp_path / "a.npy", array), replace(CLOCK, modality="str", tick=1e-7)).notes
 
 
 @pytest.mark.parametrize("kind", ["qis", "counts", "packed", "str"])

@@ -158,6 +158,17 @@ def test_pixels_that_are_none(tmp_path: Path, number: str) -> None:
     assert "is no pixel (0, 1, ...)" in refusal(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize("size", [1, 5, 16, 1 << 20])
+@pytest.mark.parametrize("blank", ["", "\n", "\n\n\n"])
+def test_the_line_that_is_wrong(tmp_path: Path, size: int, blank: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Empty lines count, in whatever pieces the file is read."""
+    monkeypatch.setattr(table, "_AT_ONCE", size)
+    text = "pixel,time (ps)\n" + blank + "".join(f"0,{n}\n{blank}" for n in range(9)) + "0,-1\n" + "1,5\n"
+    (tmp_path / "a.csv").write_text(text)
+    line = text.split("\n").index("0,-1") + 1
+    assert f"a.csv:{line}: 0 at -1 ps" in refusal(tmp_path / "a.csv")
+
+
 # --- x and y ------------------------------------------------------------------------------------------------------
 
 

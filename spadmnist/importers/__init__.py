@@ -249,9 +249,11 @@ def one_axis(numbers: np.ndarray, name: str, path: Path) -> np.ndarray:
 def is_packed(path: Path, shape: tuple[int, ...], known: Mapping[str, Any], said: Said) -> bool:
     """Does a stack hold packed bits, as the user or the width of a row says? A file may also say that of numbers.
 
-    Raises InputError where both say another width.
+    Raises InputError for a width that contradicts the columns.
     """
     width = known.get("width")
+    if width is not None and known.get("columns", width) != width:
+        raise InputError(f"{path}: says that it has {known['columns']} columns and a width of {width}; correct it")
     if width is not None and said.columns not in (None, width):
         raise InputError(f"{path}: its rows have {width} columns, not {said.columns}; leave out --columns")
     return said.packed or (width is not None and (shape[2] != width or width == 1))

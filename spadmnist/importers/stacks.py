@@ -101,7 +101,7 @@ def _white(stack: Stack) -> int | None:
 
 # --- frames as a recording ------------------------------------------------------------------------------------------
 
-_MANY = 0.05  # share of time stamps that are 0: more than that is no first detection, but the lack of one
+_MANY = 0.05  # share of time stamps that are equal: more than that at an end of a frame mean that there is no detection
 _MIRRORED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
 
 
@@ -110,8 +110,9 @@ class Seen:
     """What was seen of the frames of a capture as they were read, in order: to be told when all are.
 
     detections: their sum (of counts: of what is counted); white: the number that stands for a detection; others: is
-    there a number that is neither 0 nor white of 8 bits? first, last: numbers of the frames with a detection; zeros:
-    time stamps that are 0; upto: frames seen so far.
+    there a number that is neither 0 nor white of 8 bits? first, last: numbers of the frames with a detection; upto:
+    frames seen so far. Of time stamps: zeros: how many are 0; latest: the last one; at_latest: how many are that one;
+    missed: does one mean that there was no detection?
     """
 
     modality: str
@@ -120,9 +121,11 @@ class Seen:
     others: bool = False
     first: int | None = None
     last: int = -1
-    zeros: int = 0
-    missed: bool = False
     upto: int = 0
+    zeros: int = 0
+    latest: int = 0
+    at_latest: int = 0
+    missed: bool = False
 
     def add(self, start: int, each: np.ndarray) -> bool:
         """Take in the frames from `start` on, once. each: the detections of each frame. Were they new?"""
@@ -142,11 +145,14 @@ class Seen:
             yield f"0 and {self.white} are read as no detection and a detection"
         if self.modality == "counts" and self.detections and not self.others:
             yield "every count is 0 or 255, as in a binary stack; if it is one, leave out --bits"
-        if self.modality == "str" and not self.missed and self.zeros > _MANY * self.detections:
-            yield (
-                f"no time stamp means that there was no detection, and {self.zeros:,} are 0; if 0 means that, store "
-                "the ticks of a frame in its place"
-            )
+        if self.modality == "str" and not self.missed:
+            for value, count in ((0, self.zeros), (self.latest, self.at_latest)):
+                if count > _MANY * self.detections:
+                    yield (
+                        f"no time stamp means that there was no detection, and {count:,} of {self.detections:,} are "
+                        f"{value}; if that means it, correct --frame-time, or store the ticks of a frame in its place"
+                    )
+                    break
         for silent, where in ((self.first or 0, "first"), (self.upto - 1 - self.last, "last")):
             if self.detections * silent > SURE * self.upto:
                 yield f"nothing was recorded in the {where} {silent:,} of {self.upto:,} frames; if so, cut them off"
@@ -205,6 +211,10 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
             if seen.add(start, each):
                 seen.zeros += int(np.count_nonzero(piece == 0))
                 seen.missed |= int(each.sum()) < piece.size
+                if high >= seen.latest:
+                    seen.at_latest = seen.at_latest if high == seen.latest else 0
+                    seen.at_latest += int(np.count_nonzero(piece == high))
+                    seen.latest = high
         else:
             seen.others = seen.others or bool(((piece != 0) & (piece != 255)).any())
             seen.add(start, piece.sum(axis=(1, 2), dtype=np.float64))
