@@ -77,13 +77,14 @@ def opened(path: Path) -> Iterator[Any]:
     except MemoryError:
         raise InputError(f"{path}: needs more memory than there is; cut the capture into several") from None
     except _DAMAGE as error:
-        reason = " ".join(_printable(str(error)).split())
+        reason = " ".join(printable(str(error)).split())
         raise InputError(
             f"{path}: is damaged, cut short or was never closed ({reason[:120]}); copy it again from where it was made"
         ) from None
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """A name or sentence from a file on one line."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
@@ -91,7 +92,7 @@ def _data_set(file: Any, name: str, path: Path) -> Any:
     """A plain data set of unsigned integers (or of booleans) in the file itself."""
     import h5py
 
-    there = ", ".join(sorted(_printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
+    there = ", ".join(sorted(printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
     link = file.get(name, getlink=True)
     if link is None:
         raise InputError(f"{path}: has no data set {name}; there is {there}")
@@ -250,7 +251,8 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
     if isinstance(value, str) or not units.SHORTEST <= value < math.inf:
         raise InputError(
-            f"{path}: the attribute tick is {value!r}; it must be seconds, more than 0 ({units.SHORTEST:g} s)"
+            f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0 "
+            f"({units.SHORTEST:g} s)"
         )
     if value > end:
         raise InputError(

@@ -19,8 +19,9 @@ from .errors import InputError, SpadError
 from .units import LONGEST, SHORTEST
 
 MODALITIES = ("tr", "str", "qis", "counts")
+MOST_ROWS = 100_000  # and columns, of a measurement
 # what options are for that only some kinds of files use
-BITS, STACKS = "frames of bits", "stacks of numbers (.npy, .npz, HDF5)"
+BITS, STACKS = "frames of bits", "stacks of numbers (.npy, .npz, TIFF, HDF5)"
 PLAIN_HDF5, LINOSPAD2 = "plain HDF5", "LinoSPAD2"
 UNCERTAIN = 0.05  # relative standard deviation of a light level of which none is given
 
@@ -74,10 +75,10 @@ class Said:
     )
     rows: int | None = _option(
         "Of pixels, which are then the channels of the same number.  [default: 1 x channels in use]",
-        whole=(1, 10**6),
+        whole=(1, MOST_ROWS),
         names=("height",),
     )
-    columns: int | None = _option("Of pixels.", whole=(1, 10**6), names=("width",))
+    columns: int | None = _option("Of pixels.", whole=(1, MOST_ROWS), names=("width",))
     positions: Path | None = _option("x,y (um) of pixels that are no grid.", path=True, metavar="FILE.csv")
     channels: tuple[str, ...] | None = _option(
         "The channels that are pixels, in the pixels' order: 0,1,sync. Others are left out.",
@@ -208,6 +209,7 @@ def _names(text: str) -> tuple[str, ...]:
     wrong = [name for name in names if not re.fullmatch(r"\d{1,8}|[a-z]\w*", name)]
     if wrong:
         raise SpadError(f"--channels: {wrong[0]!r} is no channel; write them as the file names them, as in 0,1,sync")
+    names = tuple(str(int(name)) if name.isdigit() else name for name in names)
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise SpadError(f"--channels: {twice[0]} stands there twice; each channel is one pixel")

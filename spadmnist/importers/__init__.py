@@ -36,6 +36,7 @@ MOST_CHANNELS = 1 << 24
 MOST_EVENTS = 1 << 29  # of a file
 LARGEST_PIECE = 1 << 28  # bytes that a file may make one take at once
 PICOSECOND = 1e-12
+SURE = 25.0  # detections that were due where there are none: under steady light one recording of 10^10 is so by chance
 LASER_PULSES = (
     "was recorded in T3 mode, or alike: its times count from the last laser pulse; record in T2 mode, or export the "
     "times since the start to CSV"
@@ -50,7 +51,7 @@ FACTS = (
     *("wavelength", "irradiance", "lux", "relative_uncertainty", "own_uncertainty"),
 )
 _WHOLE = ("rows", "columns", "bits", "counter", "width")
-_MAY_BE_ZERO = ("counter", "relative_uncertainty", "own_uncertainty")
+_SHARES = ("counter", "relative_uncertainty", "own_uncertainty")  # from 0 to 1
 
 
 def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
@@ -60,7 +61,8 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
         value = get(name)
         if value is None:
             continue
-        fine = not isinstance(value, str) and (SHORTEST <= value <= LONGEST or (value == 0 and name in _MAY_BE_ZERO))
+        low, high = (0, 1) if name in _SHARES else (SHORTEST, LONGEST)
+        fine = not isinstance(value, str) and low <= value <= high
         if not fine or (name in _WHOLE and value != int(value)):
             raise InputError(f"{path}: says that its {name} is {_shown(value)}, which is not possible; correct it")
         found[name] = int(value) if name in _WHOLE else float(value)
@@ -176,11 +178,14 @@ def recognise(path: Path) -> type[Format]:
     for kind in kinds:
         if kind.fits(path, head):
             return kind
+    if head.startswith(_OLD_MATLAB):
+        raise InputError(f"{path}: is a MATLAB file older than 7.3; save it again with save(..., '-v7.3')")
     known = ", ".join(sorted(kind.about for kind in kinds))
     raise InputError(f"{path}: this is {image_files.looks_like(head)}; what can be imported is {known}")
 
 
 _GZIP = b"\x1f\x8b\x08"
+_OLD_MATLAB = b"MATLAB 5.0"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -215,11 +220,55 @@ def whole(numbers: np.ndarray, name: str, path: Path) -> np.ndarray:
     """Numbers that are whole, as integers: MATLAB stores most of them as doubles. Raises InputError for others."""
     if numbers.dtype.kind != "f":
         return numbers
-    fine = (np.rint(numbers) == numbers) & (np.abs(numbers) < 2**53)
+    fine = are_whole(numbers)
     if not fine.all():
         at = int(fine.argmin())
-        raise InputError(f"{path}: {name}[{at}] is {numbers[at]:g}, which is no whole number; store ticks and pixels")
+        why = no_whole(numbers[at])
+        raise InputError(f"{path}: {name}[{at}] is {numbers[at]:.15g}, {why}; store ticks and pixels as integers")
     return numbers.astype(np.int64)
+
+
+def are_whole(numbers: np.ndarray) -> np.ndarray:
+    """Which floats are whole numbers, and small enough that theirs is a number of its own: 2^24 of single precision."""
+    return (np.rint(numbers) == numbers) & (np.abs(numbers) <= 2.0 ** (np.finfo(numbers.dtype).nmant + 1))
+
+
+def no_whole(number: np.floating[Any]) -> str:
+    """What to say of a float that `are_whole` excludes."""
+    large = np.isfinite(number) and np.rint(number) == number
+    return f"which {number.dtype} does not tell from the next whole number" if large else "which is no whole number"
+
+
+def one_axis(numbers: np.ndarray, name: str, path: Path) -> np.ndarray:
+    """(n,) numbers that are stored so, or as a line of a matrix, as MATLAB does it. Raises InputError."""
+    if numbers.ndim != 1 and not (numbers.ndim == 2 and 1 in numbers.shape):
+        raise InputError(f"{path}: {name} has the shape {numbers.shape}; store a number for each detection")
+    return numbers.ravel()
+
+
+def is_packed(path: Path, shape: tuple[int, ...], known: Mapping[str, Any], said: Said) -> bool:
+    """Does a stack hold packed bits, as the user or the width of a row says? A file may also say that of numbers.
+
+    Raises InputError for a width that contradicts the columns.
+    """
+    width = known.get("width")
+    if width is not None and known.get("columns", width) != width:
+        raise InputError(f"{path}: says that it has {known['columns']} columns and a width of {width}; correct it")
+    if width is not None and said.columns not in (None, width):
+        raise InputError(f"{path}: its rows have {width} columns, not {said.columns}; leave out --columns")
+    return said.packed or (width is not None and (shape[2] != width or width == 1))
+
+
+def holds_detections(path: Path, names: Collection[str], frames: bool, said: Said) -> bool:
+    """Does a file of arrays hold detections, rather than frames? names: of the arrays; frames: are there frames?
+
+    Raises InputError where it holds both and nobody says which are meant.
+    """
+    if not {"time", "pixel"} <= set(names):
+        return "time" in names and not frames
+    if frames and said.modality is None:
+        raise InputError(f"{path}: holds detections (time, pixel) and frames; say with --modality which are meant")
+    return not frames or said.modality == "tr"
 
 
 def damaged(path: Path, error: Exception) -> InputError:

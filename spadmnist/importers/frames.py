@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import image_files
+from ..capture_files import printable
 from ..errors import InputError
 from ..import_options import BITS, STACKS
 from ..recording import MODALITIES
@@ -19,13 +20,15 @@ from . import (
     Format,
     Found,
     Said,
-    Stack,
     ask,
     damaged,
     facts,
     frames_in_file,
     heard,
+    holds_detections,
+    is_packed,
     library,
+    one_axis,
     refuse_fine_times,
     whole,
 )
@@ -60,7 +63,7 @@ class Npy(Format):
         if said.packed and not plain:
             raise InputError(f"{path}: packed bits are stored in Fortran order; store them in C order")
         dtype = np.dtype(np.uint8) if dtype.kind == "b" else dtype
-        letters = said.axes or "MHW"
+        letters = "MHW" if said.packed else said.axes or "MHW"
         stored, letters = (shape, letters) if plain else (shape[::-1], letters[::-1])
         rest = tuple(n for n, axis in zip(stored, letters, strict=True) if axis != "M")
         if letters[0] == "M":
@@ -99,29 +102,38 @@ class Npz(Format):
                         parts[name] = image_files.read_member(archive, held[name], size, f"{path}: {name}")
         except (zipfile.BadZipFile, OSError, RuntimeError, ValueError, NotImplementedError) as error:
             raise damaged(path, error) from None
-        known = facts(path, lambda name: parts[name].item() if name in parts and parts[name].size == 1 else None)
+        for name in set(FACTS) & set(parts):
+            if parts[name].size != 1:
+                raise InputError(f"{path}: its {name} has the shape {parts[name].shape}; store one number")
+        known = facts(path, lambda name: parts[name].item() if name in parts else None)
         plain = {name: part for name, part in parts.items() if name not in FACTS and part.dtype.kind in "iubf"}
         sources = dict.fromkeys(known, "the file")
-        if "frames" in plain and plain["frames"].ndim == 3:
-            frames, letters, packed = plain["frames"], said.axes or "MHW", said.packed or "width" in known
+        stacked = "frames" in plain and plain["frames"].ndim == 3
+        if stacked and not holds_detections(path, plain, stacked, said):
+            frames = plain["frames"]
+            packed = is_packed(path, frames.shape, known, said)
+            letters = "MHW" if packed else said.axes or "MHW"
             stack = arranged(frames.shape, frames.dtype, letters, lambda a, b: frames[cut(letters, a, b)])
             return Found(known, frames=stack, bits=frames.dtype.kind == "b", packed=packed, sources=sources)
         if {"time", "pixel"} <= set(plain):
             refuse_fine_times(path, held)
-            time, pixel = (whole(plain[name].ravel(), name, path) for name in ("time", "pixel"))
+            time, pixel = (whole(one_axis(plain[name], name, path), name, path) for name in ("time", "pixel"))
             return Found(known, pixel, time, sources=sources)
-        there = ", ".join(sorted(held)[:8])[:200]
+        there = ", ".join(printable(name) for name in sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"
         )
 
 
 class Tif(Format):
-    """A stack of frames as a TIFF file, a page each; with --packed a page's bytes are eight columns each."""
+    """A stack of frames as a TIFF file, a page each; with --packed a page's bytes are eight columns each.
+
+    With --axes HWM a page is a row of pixels, as (columns, frames).
+    """
 
     about = "TIFF"
     modalities = _FRAMES
-    takes = (BITS,)
+    takes = (BITS, STACKS)
     begins = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     @classmethod
@@ -132,10 +144,14 @@ class Tif(Format):
             with heard("tifffile"):
                 file = tifffile.TiffFile(path)
                 first, count = file.pages[0], len(file.pages)
-                shape, dtype = first.shape, first.dtype
-                declared = int((file.imagej_metadata or {}).get("images", 1))
+                shape, dtype = tuple(map(int, first.shape)), first.dtype
+                of_imagej = file.imagej_metadata or {}
+                declared, colours = int(of_imagej.get("images", 1)), int(of_imagej.get("channels", 1))
+                white_is_0 = first.photometric == tifffile.PHOTOMETRIC.MINISWHITE
         except Exception as error:  # damaged files make it raise nearly anything
             raise damaged(path, error) from None
+        if colours > 1:
+            raise InputError(f"{path}: has {colours} channels (ImageJ), one after the other; store each by itself")
         if len(shape) != 2 or dtype is None or dtype.kind not in "iubf" or declared > count:
             raise InputError(
                 f"{path}: its {count} pages are {dtype} of the shape {shape}; store a page of whole numbers, rows x "
@@ -144,20 +160,31 @@ class Tif(Format):
         if math.prod(shape) * dtype.itemsize > LARGEST_PIECE:
             raise InputError(f"{path}: a page has {shape[0]} x {shape[1]} pixels; that is more than can be read")
 
+        letters = "MHW" if said.packed else said.axes or "MHW"
+
         def get(start: int, stop: int) -> np.ndarray:
-            out = np.empty((stop - start, *shape), dtype)
+            pages, *part = cut(letters, start, stop)
+            numbers = range(count)[pages]
+            out = np.empty((len(numbers), *(len(range(n)[some]) for n, some in zip(shape, part, strict=True))), dtype)
             try:
                 with heard("tifffile"):
-                    for i in range(start, stop):
-                        page = file.pages[i]
+                    for i, number in enumerate(numbers):
+                        page = file.pages[number]
                         if page.shape != shape or page.dtype != dtype:
-                            raise ValueError(f"page {i} is {page.dtype} {page.shape}, unlike the first")
-                        out[i - start] = page.asarray()
+                            raise ValueError(f"page {number} is {page.dtype} {page.shape}, unlike the first")
+                        out[i] = page.asarray()[*part]
             except Exception as error:
+                if "imagecodecs" in str(error):
+                    raise InputError(
+                        f"{path}: is packed as {page.compression.name}, which the package imagecodecs reads; it is not "
+                        "installed; pip install imagecodecs, or store it in another way"
+                    ) from None
                 raise damaged(path, error) from None
             return out
 
-        return Found(frames=Stack((count, *shape), dtype, get), bits=dtype.kind == "b", packed=said.packed)
+        notes = ("its pages show 0 as white; the numbers are taken as they stand, 0 as no detection",) * white_is_0
+        stack = arranged((count, *shape), dtype, letters, get)
+        return Found(frames=stack, bits=dtype.kind == "b", packed=said.packed, notes=notes)
 
 
 class Raw(Format):
@@ -196,7 +223,7 @@ class Raw(Format):
             raise InputError(f"{path}: a frame of {rows} x {columns} pixels is more than can be read; give others")
         with open(path, "rb") as file:
             file.seek(max(0, size - 4))
-            size -= 4 if size % each == 4 and file.read(4) == b"DONE" else 0
+            size -= 4 if size % each == 4 % each and file.read(4) == b"DONE" else 0
         if size == 0 or size % each:
             what = f"counts of {said.bits} bits" if counts else "bits"
             raise InputError(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture_files import FILTERS, attribute, check_stored, opened
+from ..capture_files import FILTERS, attribute, check_stored, opened, printable
 from ..errors import InputError
 from ..import_options import BITS, PLAIN_HDF5, STACKS
 from . import (
@@ -20,6 +20,8 @@ from . import (
     Found,
     Said,
     facts,
+    holds_detections,
+    is_packed,
     refuse_fine_times,
     whole,
 )
@@ -51,7 +53,7 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
     """A plain data set of whole numbers that is there as a whole."""
     found = _node(file, name, path)
     if found is None:
-        there = ", ".join(sorted(str(key)[:40] for key in list(file)[:10])) or "nothing"
+        there = ", ".join(sorted(printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
         raise InputError(f"{path}: has no data set {name}; there is {there} (--dataset names one of frames)")
     line = axes == 1 and found.ndim == 2 and 1 in found.shape  # MATLAB has no arrays of one axis
     if found.dtype.kind not in "iubf" or (found.ndim != axes and not line):
@@ -77,7 +79,10 @@ def _number(file: Any, name: str, path: Path) -> float:
 
 def _numbers(file: Any, name: str, path: Path) -> np.ndarray:
     """(n,) integers of a plain data set."""
-    return whole(_data_set(file, name, path)[...].ravel(), name, path)
+    found = _data_set(file, name, path)
+    if found.attrs.get("MATLAB_empty"):  # then the shape stands in place of the numbers
+        return np.zeros(0, np.uint64)
+    return whole(found[...].ravel(), name, path)
 
 
 class PhotonHdf5(Format):
@@ -107,6 +112,8 @@ class PhotonHdf5(Format):
         with opened(path) as file:
             spots = sorted(int(m[1]) for key in file if (m := re.fullmatch(r"photon_data(\d{1,6})", key)))
             groups = [f"photon_data{spot}" for spot in spots] or ["photon_data"]
+            if spots and "photon_data" in file:
+                raise InputError(f"{path}: has both photon_data and {groups[0]}; store one of them, or number both")
             for group in groups:
                 refuse_fine_times(path, set(_node(file, group, path, group=True) or ()))
             own = _node(file, "user/spadmnist", path, group=True)
@@ -200,6 +207,8 @@ def _detectors(file: Any, group: str, count: int, path: Path) -> np.ndarray | No
 def _rising(file: Any, name: str, path: Path) -> np.ndarray:
     """Times as the format asks for them. Raises InputError where they fall back: a converter lost an overflow."""
     times = _numbers(file, name, path)
+    if times.dtype.kind == "u" and int(times.max(initial=0)) < 2**63:
+        times = times.astype(np.int64)  # spots may be stored in types of their own
     earlier = times[1:] < times[:-1]
     if earlier.any():
         at = int(earlier.argmax())
@@ -279,6 +288,14 @@ def _check_number(file: Any, pixels: tuple[int, ...], channels: list[np.ndarray]
     )
 
 
+def _has_stack(file: Any) -> bool:
+    """Are there frames? What is a link, or of another shape, is none."""
+    import h5py
+
+    link = file.get("frames", getlink=True)
+    return isinstance(link, h5py.HardLink) and getattr(file["frames"], "ndim", 0) == 3
+
+
 class PlainHdf5(Format):
     """Plain HDF5: the data sets time and pixel, or frames (--dataset names another), as a measurement stores them.
 
@@ -295,20 +312,20 @@ class PlainHdf5(Format):
         """Attributes of the file, or of the data set, say how it was recorded, by the names of `FACTS`."""
         name = said.dataset or "frames"
         with opened(path) as file:
-            detections = said.dataset is None and "time" in file
-            stored = None if detections else _data_set(file, name, path, axes=3)
-            nodes = (file,) if detections else (stored, file)
+            detections = said.dataset is None and holds_detections(path, set(file), _has_stack(file), said)
+            stored = _data_set(file, "time" if detections else name, path, axes=1 if detections else 3)
+            nodes = (stored, file)
             known = facts(path, lambda key: attribute(nodes, key, path))
             sources = dict.fromkeys(known, "the file")
             if attribute(nodes, "counting", path) == "counter":
                 known["counter"] = 1
-            if stored is None:
+            if detections:
                 refuse_fine_times(path, set(file))
                 time, pixel = (_numbers(file, key, path) for key in ("time", "pixel"))
                 return Found(known, pixel, time, sources=sources)
             shape, dtype = stored.shape, stored.dtype
             matlab = "MATLAB_class" in stored.attrs
-        packed = said.packed or "width" in known
+        packed = is_packed(path, shape, known, said)
         # MATLAB shows the axes in the opposite order
         letters = "MHW" if packed else (said.axes or "HWM")[::-1] if matlab else said.axes or "MHW"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from . import PICOSECOND, Format, Found, Said, ask, frames_in_file
 _CLOCK, _CODES = 2500, 140  # ps, codes in it
 _AT_ONCE = 1 << 22  # words
 _LARGEST_TABLE = 1 << 24  # bytes of a calibration
+_LONGEST_OFFSET = 1e9  # ps
 
 
 class LinoSpad2(Format):
@@ -44,6 +44,10 @@ class LinoSpad2(Format):
         """The firmware may also stand in the name of the calibration, as in TDC_NL11_#33_2212b.csv."""
         named = [name for name in ("2212b", "2212s", "2208") if said.tdc is not None and name in said.tdc.stem]
         firmware = said.firmware or (named[0] if named else None)
+        if named and firmware not in named:
+            raise InputError(
+                f"{said.tdc}: is of the firmware {named[0]} by its name, not of {firmware}; give another --tdc"
+            )
         known = {"firmware": firmware, "timestamps": said.timestamps, "cycle": said.cycle}
         if missing := [name for name, value in known.items() if value is None]:
             raise ask(path, missing)
@@ -58,13 +62,18 @@ class LinoSpad2(Format):
             )
         if said.offsets is not None and said.tdc is None:
             raise InputError("--offsets: they are added to calibrated time stamps; give --tdc as well")
-        ends = None if said.tdc is None else _calibration(said.tdc)
+        ends, uncalibrated = (None, 0) if said.tdc is None else _calibration(said.tdc)
         offsets = np.zeros(256) if said.offsets is None else _offsets(said.offsets)
         tick = _CLOCK / _CODES * PICOSECOND if ends is None else said.tick or PICOSECOND
         length = round(said.cycle / tick)
         if abs(said.cycle / tick - length) > 1e-6 * max(1.0, 1e-6 * length):
             raise InputError(
                 f"--cycle: {units.show(said.cycle, 's')} is no whole number of ticks of {units.show(tick, 's')}"
+            )
+        if cycles * length >= 1 << 63:
+            raise InputError(
+                f"--cycle: {cycles:,} cycles of {units.show(said.cycle, 's')} have more ticks of "
+                f"{units.show(tick, 's')} than can be counted; give another --cycle or --tick"
             )
         words = frames_in_file(path, 0, "<u4", (cycles, lines, said.timestamps))
         channels, ticks, outside, full = [np.zeros(0, np.uint8)], [np.zeros(0, np.uint64)], 0, 0
@@ -87,6 +96,8 @@ class LinoSpad2(Format):
         if said.tick is not None and ends is None:
             raise InputError("--tick: without --tdc the ticks are the codes; give --tdc as well, or leave out --tick")
         notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
+        if uncalibrated:
+            notes.append(f"{uncalibrated} pixels are not calibrated by --tdc; their codes are taken as equally long")
         if full:
             times = f"{full:,} of {kept * cycles:,} times"
             notes.append(f"{times} a converter was full, and blind for the rest of its cycle")
@@ -103,9 +114,8 @@ class LinoSpad2(Format):
         )
 
 
-@functools.lru_cache(maxsize=1)
-def _calibration(path: Path) -> np.ndarray:
-    """(256, 140) ps, the end of each code; equal codes for a pixel that was not calibrated (all zero)."""
+def _calibration(path: Path) -> tuple[np.ndarray, int]:
+    """((256, 140) ps, the end of each code; pixels that were not calibrated (all zero), whose codes are equal)."""
     try:
         if path.stat().st_size > _LARGEST_TABLE:
             raise ValueError("it is too large")
@@ -120,8 +130,9 @@ def _calibration(path: Path) -> np.ndarray:
             f"{path}: is no calibration of codes ({image_files.reason(error)}); it has a line of headings, then for "
             "each of 256 pixels its number and 140 times in ps"
         ) from None
-    ends[~ends.any(axis=1)] = np.arange(1, 1 + _CODES) * (_CLOCK / _CODES)
-    return ends
+    without = ~ends.any(axis=1)
+    ends[without] = np.arange(1, 1 + _CODES) * (_CLOCK / _CODES)
+    return ends, int(without.sum())
 
 
 def _offsets(path: Path) -> np.ndarray:
@@ -130,6 +141,6 @@ def _offsets(path: Path) -> np.ndarray:
             found = image_files.read_npy(file, path.stat().st_size, str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None
-    if found.shape != (256,) or not np.isfinite(found).all():
-        raise InputError(f"{path}: has the shape {found.shape}; offsets are 256 finite numbers, in ps")
+    if found.shape != (256,) or not (np.abs(found) < _LONGEST_OFFSET).all():
+        raise InputError(f"{path}: has the shape {found.shape}; offsets are 256 numbers in ps, each less than 1 ms")
     return found.astype(np.float64)

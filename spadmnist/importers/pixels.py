@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,10 @@ import numpy as np
 from .. import units
 from ..errors import InputError
 from ..events import Events, Layout
+from ..import_options import MOST_ROWS
 from ..readout import no_detection, stamps_for
 from ..recording import Capture, Recording
-from . import MOST_CHANNELS, Found, Said
+from . import MOST_CHANNELS, SURE, Found, Said
 
 _NO_PIXEL = -1
 _MOST_NAMED = 20  # channels that a sentence lists
@@ -35,6 +36,7 @@ class Channels:
 
     def __init__(self) -> None:
         self.used = np.zeros(0, bool)
+        self.numbered = np.zeros(0, bool)  # those in use that some file knows by their number alone
         self.names: dict[int, str] = {}
         self.declared: list[int] | None = None
         self.where: Path | None = None  # the first file with detections
@@ -43,9 +45,15 @@ class Channels:
         """Take in what a file holds."""
         here = np.bincount(channels_of(path, found)).astype(bool)
         self.where = self.where or path
-        self.used = np.pad(self.used, (0, max(0, len(here) - len(self.used))))
-        self.used[: len(here)] |= here
+        self.used = _either(self.used, here)
+        here[[c for c in found.names if c < len(here)]] = False
+        self.numbered = _either(self.numbered, here)
         self.names |= found.names
+        for channel, name in self.names.items():
+            if channel < len(self.numbered) and self.numbered[channel]:
+                raise InputError(
+                    f"{path}: some files call the channel {channel} {name}, others do not; import these by themselves"
+                )
         if found.pixels is not None:
             self.declared = [*(self.declared or []), *(c for c in found.pixels if c not in (self.declared or []))]
 
@@ -63,13 +71,13 @@ class Channels:
     def chosen(self, names: Sequence[str]) -> tuple[int, ...]:
         """The channels that are called so. Raises InputError where none of them has a detection."""
         known = {name: channel for channel, name in self.names.items()}
+        there = self.called(self.in_use) or "none"
         for name in names:
-            if not name.isdigit() and name not in known:
-                there = self.called(self.in_use)
+            is_number = name.isdigit() and int(name) < MOST_CHANNELS and int(name) not in self.names
+            if name not in known and not is_number:
                 raise InputError(f"{self.where}: has no channel {name!r}; --channels names some of {there}")
         found = tuple(known[name] if name in known else int(name) for name in names)
         if not set(found) & set(self.in_use):
-            there = self.called(self.in_use) or "none"
             raise InputError(
                 f"{self.where}: has no detection of {', '.join(names)}; --channels names some of those in use: {there}"
             )
@@ -79,6 +87,14 @@ class Channels:
         """Channels as the file calls them, in a row."""
         shown = ", ".join(self.names.get(c, str(c)) for c in channels[:_MOST_NAMED])
         return shown + (", ..." if len(channels) > _MOST_NAMED else "")
+
+
+def _either(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """One or the other, as long as the longer."""
+    out = np.zeros(max(len(one), len(two)), bool)
+    out[: len(one)] |= one
+    out[: len(two)] |= two
+    return out
 
 
 def channels_of(path: Path, found: Found) -> np.ndarray:
@@ -118,10 +134,13 @@ def array(
     elif shape is None:
         numbers = channels.as_pixels()
     rows, columns = shape or (1, len(numbers or ()))
-    if not 0 < rows * columns <= MOST_CHANNELS:
-        if rows * columns:
-            raise InputError(f"{path}: {rows} x {columns} pixels are more than the {MOST_CHANNELS:,} that can be held")
+    if rows * columns == 0:
         raise InputError(f"{path}: holds no detection at all; give --rows and --columns to import it nevertheless")
+    if rows * columns > MOST_CHANNELS or max(rows, columns) > MOST_ROWS:
+        raise InputError(
+            f"{path}: {rows} x {columns} pixels are more than the {MOST_CHANNELS:,}, and {MOST_ROWS:,} in a row or "
+            "column, that can be held; give other --rows and --columns"
+        )
     if positions is not None:
         return Array(Layout(1, len(positions), np.nan, np.nan, positions), numbers)
     return Array(Layout(rows, columns, np.nan, np.nan), numbers)
@@ -142,9 +161,13 @@ def events(path: Path, found: Found, said: Said, capture: Capture, array: Array,
     pixels = array.layout.pixels
     tick = found.facts.get("tick", said.tick)
     assert ticks is not None and tick is not None
-    if ticks.dtype.kind == "b":
-        ticks = ticks.astype(np.uint8)
+    ticks = ticks.astype(np.int64 if ticks.dtype.kind == "i" else np.uint64, copy=False)
     notes, left_out = [], []
+    if path == channels.where and said.channels is not None and array.channels is not None:
+        used = channels.in_use
+        if silent := [c for c in array.channels if c not in used]:
+            is_of = f"s {channels.called(silent)} have" if len(silent) > 1 else f" {channels.called(silent)} has"
+            notes.append(f"the channel{is_of} no detection in any file")
     pixel = _pixels(path, channel, array, channels)
     outside = pixel == _NO_PIXEL
     if outside.any():
@@ -157,6 +180,7 @@ def events(path: Path, found: Found, said: Said, capture: Capture, array: Array,
         notes.append(f"its clock is counted from the first detection, at {units.show(float(start) * tick, 's', 12)}")
         ticks = ticks - start
     end = _check_times(path, ticks, tick, exposure, said)
+    notes += _silence(ticks, tick, exposure)
     # the stable sort of 16-bit integers counts them
     order = np.argsort(pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))]).astype(np.int64)
@@ -165,6 +189,10 @@ def events(path: Path, found: Found, said: Said, capture: Capture, array: Array,
     firsts = offsets[1:-1]
     earlier[firsts[(firsts > 0) & (firsts < len(ticks))] - 1] = False
     if earlier.any():
+        back = units.show(float((ticks[:-1][earlier] - ticks[1:][earlier]).max()) * tick, "s")
+        notes.append(
+            f"its times fall back {int(earlier.sum()):,} times within a pixel, by up to {back}; they were sorted"
+        )
         ticks = ticks[np.lexsort((ticks, np.repeat(np.arange(pixels), np.diff(offsets))))]
     made = Recording(capture, array.layout, Events(None, offsets, pixels, ticks, tick, end=exposure), None, tick)
     return Placed(made, tuple(notes), tuple(left_out))
@@ -206,6 +234,24 @@ def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, sa
         f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {low} to {high}, outside the exposure "
         f"of {units.show(exposure, 's', 9)}; {advice}"
     )
+
+
+def _silence(ticks: np.ndarray, tick: float, exposure: float) -> Iterator[str]:
+    """What is to be known of a recording that begins late or breaks off: its rate would be wrong."""
+    if not len(ticks):
+        return
+    first, last = float(ticks.min()) * tick, float(ticks.max()) * tick
+    whole = units.show(exposure, "s", 6)
+    if len(ticks) * first > SURE * exposure:
+        yield (
+            f"nothing was recorded in the first {units.show(first, 's')} of {whole}; if its clock did not start at 0, "
+            "give --subtract-start and the --exposure since then"
+        )
+    if len(ticks) * (exposure - last) > SURE * exposure:
+        yield (
+            f"nothing was recorded in the last {units.show(exposure - last, 's')} of {whole}; if it broke off, give "
+            f'--exposure "{units.show(last, "s", 6)}"'
+        )
 
 
 def _by(shape: Sequence[int]) -> str:

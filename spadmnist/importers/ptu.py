@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from . import LASER_PULSES, MOST_EVENTS, Format, Found, Said, damaged, facts, heard, library
 
+_MOST_TICKS = 1 << 63  # that are added up here
 SYNC = 64  # the number by which the sync input is known here; the inputs of all instruments have smaller ones
 
 
@@ -54,7 +55,7 @@ class Decoded:
 
 
 def decode(records: np.ndarray, layout: Layout) -> Decoded:
-    """Detections from raw T2 records: overflows are added up in 64 bits. Raises ValueError for a channel that is none.
+    """Detections from raw T2 records: overflows are added up in 64 bits. Raises ValueError where that is not possible.
 
     Source: PicoQuant, demonstration readers of the "Unified TTTR File Format".
     """
@@ -82,6 +83,8 @@ def decode(records: np.ndarray, layout: Layout) -> Decoded:
     if layout.numbered:
         rounds[overflow] = np.maximum(time[overflow], 1)  # early firmware leaves the number 0
     rounds = np.cumsum(rounds)
+    if len(rounds) and rounds[-1] >= _MOST_TICKS // layout.wrap:
+        raise ValueError(f"its clock goes round {rounds[-1]:,} times")
     ticks = (rounds[detection] * layout.wrap + time[detection]).astype(np.uint64)
     return Decoded(channel[detection], ticks, int(marker.sum()), int(unknown.sum()))
 
@@ -114,20 +117,15 @@ class Ptu(Format):
         if kind not in LAYOUTS:
             raise InputError(f"{path}: has records of the type {kind!r:.40}, which is no T2; record in T2 mode")
         known, sources = _header(path, tags)
-        notes = []
-        layout = LAYOUTS[kind]
+        layout, (records, notes) = LAYOUTS[kind], _records(path, tags, start)
         try:
-            found = decode(_records(path, tags, start), layout)
+            found = decode(records, layout)
         except ValueError as error:
             raise damaged(path, error) from None
-        back = _falls_back(path, found.ticks, layout.wrap)
-        if back:
-            notes.append(f"{back:,} records stand behind a later one; they were sorted")
+        _check_order(path, found.ticks, layout.wrap)
         left_out = [f"{found.markers:,} markers, which are no detections"] if found.markers else []
         if found.unknown:
             left_out.append(f"{found.unknown:,} special records of an unknown kind")
-        if not tags.get("TTResult_NumberOfRecords"):
-            notes.append("its header was never finished, as of a recording that broke off")
         sync = int((found.channel == SYNC).sum())
         if sync and said.channels is None and (found.channel != SYNC).any():
             notes.append(
@@ -164,30 +162,30 @@ def _header(path: Path, tags: dict[str, Any]) -> tuple[dict[str, float], dict[st
     return known, sources
 
 
-def _records(path: Path, tags: dict[str, Any], start: int) -> np.ndarray:
-    """(records,) uint32, as many as the header declares; all that follow where it was never finished."""
-    declared, held = tags.get("TTResult_NumberOfRecords", 0), (path.stat().st_size - start) // 4
+def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[np.ndarray, list[str]]:
+    """((records,) uint32, as many as the header declares; all that follow where it was never finished, notes)."""
+    declared, held, notes = tags.get("TTResult_NumberOfRecords", 0), (path.stat().st_size - start) // 4, []
     if not isinstance(declared, int) or declared <= 0:
         declared = held
+        notes.append("its header was never finished, as of a recording that broke off")
+    elif declared < held:
+        notes.append(f"{held:,} records follow where its header declares {declared:,}; the rest was not read")
     if declared > min(held, MOST_EVENTS):
         raise InputError(
             f"{path}: declares {declared:,} records, {held:,} follow and {MOST_EVENTS:,} can be read; copy it again, "
             "or cut it into several"
         )
-    return np.fromfile(path, "<u4", declared, offset=start)
+    return np.fromfile(path, "<u4", declared, offset=start), notes
 
 
-def _falls_back(path: Path, ticks: np.ndarray, wrap: int) -> int:
-    """How many detections are earlier than the one before, by less than half an overflow, which is disorder between
-    inputs. Raises InputError where it is more: an overflow is missing, and all later times are wrong.
+def _check_order(path: Path, ticks: np.ndarray, wrap: int) -> None:
+    """Raise InputError where a time falls back by more than half an overflow: one is missing, and all later times are
+    wrong. Less is disorder between inputs.
     """
-    steps = np.diff(ticks.astype(np.int64))
-    back = steps < 0
-    lost = steps < -(wrap // 2)
+    lost = np.diff(ticks.astype(np.int64)) < -(wrap // 2)
     if lost.any():
         at = int(lost.argmax())
         raise InputError(
             f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {at + 1:,}; "
             "records are missing there: copy it again from where it was made"
         )
-    return int(back.sum())

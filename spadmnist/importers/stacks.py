@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..events import Layout
 from ..readout import counts_type, no_detection
 from ..recording import Capture, Recording
-from . import Found, Said, Stack, ask
+from . import SURE, Found, Said, Stack, are_whole, ask, no_whole
 
 _STRIDED_PIECE = 1 << 28  # bytes: of frames that lie across the file each piece reads all of it, so pieces are large
 
@@ -44,7 +44,8 @@ def cut(letters: str, start: int, stop: int) -> tuple[slice, ...]:
 
 def axes_note(found: Found, said: Said) -> tuple[str, ...]:
     """A note where the frames of a stack are more likely its last axis than its first, and nobody said which."""
-    if found.frames is None or found.packed or said.axes is not None or None not in (said.rows, said.columns):
+    known = "rows" in found.facts or None not in (said.rows, said.columns)
+    if found.frames is None or found.packed or said.axes is not None or known:
         return ()
     frames, rows, columns = found.frames.shape
     if min(rows, frames) > 1 and rows != columns and (frames == rows or columns > max(frames, rows)):
@@ -92,7 +93,7 @@ def _white(stack: Stack) -> int | None:
     for _, piece in stack.pieces():
         most = piece.max(initial=0)
         if not white:
-            white = int(most) if most in _WHITES else 0
+            white = int(most) if float(most) in _WHITES else 0
         if most not in (0, white) or not ((piece == 0) | (piece == white)).all():
             return None
     return white or 1
@@ -100,6 +101,7 @@ def _white(stack: Stack) -> int | None:
 
 # --- frames as a recording ------------------------------------------------------------------------------------------
 
+_MANY = 0.05  # share of time stamps that are equal: more than that at an end of a frame mean that there is no detection
 _MIRRORED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
 
 
@@ -108,29 +110,52 @@ class Seen:
     """What was seen of the frames of a capture as they were read, in order: to be told when all are.
 
     detections: their sum (of counts: of what is counted); white: the number that stands for a detection; others: is
-    there a number that is neither 0 nor white of 8 bits? upto: frames seen so far.
+    there a number that is neither 0 nor white of 8 bits? first, last: numbers of the frames with a detection; upto:
+    frames seen so far. Of time stamps: zeros: how many are 0; latest: the last one; at_latest: how many are that one;
+    missed: does one mean that there was no detection?
     """
 
     modality: str
     detections: int = 0
     white: int = 0
     others: bool = False
+    first: int | None = None
+    last: int = -1
     upto: int = 0
+    zeros: int = 0
+    latest: int = 0
+    at_latest: int = 0
+    missed: bool = False
 
-    def add(self, start: int, piece: np.ndarray, detections: int) -> None:
-        """Take in the frames from `start` on, once."""
+    def add(self, start: int, each: np.ndarray) -> bool:
+        """Take in the frames from `start` on, once. each: the detections of each frame. Were they new?"""
         if start != self.upto:
-            return
-        self.upto = start + len(piece)
-        self.detections += detections
+            return False
+        self.upto = start + len(each)
+        self.detections += int(each.sum())
+        lit = np.flatnonzero(each)
+        if len(lit):
+            self.first = start + int(lit[0]) if self.first is None else self.first
+            self.last = start + int(lit[-1])
+        return True
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Iterator[str]:
         """What is to be known of the numbers."""
         if self.modality == "qis" and self.white > 1:
-            return (f"0 and {self.white} are read as no detection and a detection",)
+            yield f"0 and {self.white} are read as no detection and a detection"
         if self.modality == "counts" and self.detections and not self.others:
-            return ("every count is 0 or 255, as in a binary stack; if it is one, leave out --bits",)
-        return ()
+            yield "every count is 0 or 255, as in a binary stack; if it is one, leave out --bits"
+        if self.modality == "str" and not self.missed:
+            for value, count in ((0, self.zeros), (self.latest, self.at_latest)):
+                if count > _MANY * self.detections:
+                    yield (
+                        f"no time stamp means that there was no detection, and {count:,} of {self.detections:,} are "
+                        f"{value}; if that means it, correct --frame-time, or store the ticks of a frame in its place"
+                    )
+                    break
+        for silent, where in ((self.first or 0, "first"), (self.upto - 1 - self.last, "last")):
+            if self.detections * silent > SURE * self.upto:
+                yield f"nothing was recorded in the {where} {silent:,} of {self.upto:,} frames; if so, cut them off"
 
 
 def recording(path: Path, found: Found, said: Said, capture: Capture, layout: Layout) -> tuple[Recording, Seen]:
@@ -149,7 +174,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
         most, dtype = c.largest_count, np.dtype(counts_type(c.largest_count))
         why = f"{c.bits} bits count up to {most}"
     if found.packed and stack.dtype != np.uint8:
-        raise InputError(f"{path}: packed frames are {stack.dtype}; store uint8")
+        raise InputError(f"{path}: packed frames are {stack.dtype}; store uint8, or leave out --packed")
     seen = Seen(kind)
 
     def wrong(value: Any, start: int) -> InputError:
@@ -160,11 +185,11 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
             piece = _MIRRORED[piece] if said.bit_order == "little" else piece
             if columns % 8 and (piece[:, :, -1] & (0xFF >> columns % 8)).any():
                 raise InputError(f"{path}: bits beyond the {columns} columns are set; correct --columns or --bit-order")
-            seen.add(start, piece, int(np.bitwise_count(piece).sum()))
+            seen.add(start, np.bitwise_count(piece).sum(axis=(1, 2), dtype=np.int64))
             return piece
-        if piece.dtype.kind == "f" and not (fine := np.rint(piece) == piece).all():
+        if piece.dtype.kind == "f" and not (fine := are_whole(piece)).all():
             raise InputError(
-                f"{path}: {piece[~fine][0]:g} stands in the frames from {start} on, which is no whole number; store "
+                f"{path}: {piece[~fine][0]:g} stands in the frames from {start} on, {no_whole(piece[~fine][0])}; store "
                 "what was recorded"
             )
         low, high = int(piece.min(initial=0)), int(piece.max(initial=0))
@@ -177,15 +202,22 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
                 raise wrong(low if low < 0 else high, start)
             bits = piece != 0
             seen.white = seen.white or high
-            seen.add(start, piece, int(np.count_nonzero(bits)))
+            seen.add(start, np.count_nonzero(bits, axis=(1, 2)))
             return np.packbits(bits, axis=2)
         if low < 0 or high > most:
             raise wrong(low if low < 0 else high, start)
-        lit = piece < most if kind == "str" else piece > 0
-        count = int(np.count_nonzero(lit)) if kind == "str" else int(piece.sum(dtype=np.float64))
-        if not seen.others:
-            seen.others = kind == "str" or bool(((piece != 0) & (piece != 255)).any())
-        seen.add(start, piece, count)
+        if kind == "str":
+            each = np.count_nonzero(piece < most, axis=(1, 2))
+            if seen.add(start, each):
+                seen.zeros += int(np.count_nonzero(piece == 0))
+                seen.missed |= int(each.sum()) < piece.size
+                if high >= seen.latest:
+                    seen.at_latest = seen.at_latest if high == seen.latest else 0
+                    seen.at_latest += int(np.count_nonzero(piece == high))
+                    seen.latest = high
+        else:
+            seen.others = seen.others or bool(((piece != 0) & (piece != 255)).any())
+            seen.add(start, piece.sum(axis=(1, 2), dtype=np.float64))
         return piece.astype(dtype)
 
     shape = (*stack.shape[:2], -(-columns // 8) if kind == "qis" else columns)

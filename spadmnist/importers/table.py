@@ -59,17 +59,18 @@ class Table(Format):
                 first = file.readline(_LONGEST_LINE)
                 head = _head(first, path)
                 shape = _shape(head, said, path)
-                for line, table in _pieces(file, path, head):
+                for line, lines, table in _pieces(file, path, head):
                     channel, where = _channels(head, table, shape)
-                    time = sum((table[:, i] * (scale / tick) for i, scale, _ in head.times), np.zeros(len(table)))
+                    time = sum((table[:, i] * _ratio(scale, tick) for i, scale, _ in head.times), np.zeros(len(table)))
                     whole = np.rint(time)
                     fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
                     fine &= (time >= 0) & (whole < _MOST_TICKS)
                     if not fine.all():
                         row = int(fine.argmin())
                         at, unit = table[row, head.times[0][0]], head.times[0][2]
+                        line = [n for n, text in enumerate(lines, line) if text.strip()][row]
                         raise InputError(
-                            f"{path}:{line + row}: {where(row)} at {at:.15g} {unit} is no pixel (0, 1, ...) and a time "
+                            f"{path}:{line}: {where(row)} at {at:.15g} {unit} is no pixel (0, 1, ...) and a time "
                             "from 0 on, below 2^53 ticks; correct it, or give a longer --tick"
                         )
                     channels.append(channel.astype(np.uint32))
@@ -84,7 +85,7 @@ class Table(Format):
 def _head(text: str, path: Path) -> _Head:
     """The columns that the first line names. Raises InputError with the line to write."""
     line = text.strip().lstrip("#").strip()
-    separator = next((mark for mark in (",", ";", "\t") if mark in line), None)
+    separator = next((mark for mark in (";", ",", "\t") if mark in line), None)
     cells = line.split(separator) if separator else re.findall(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?", line)
     cells = [cell.strip().strip('"').lower() for cell in cells]
     shown = f"{line[:60]!r}"
@@ -143,22 +144,28 @@ def _channels(head: _Head, table: np.ndarray, shape: tuple[int, int] | None) -> 
         return number, lambda row: f"{number[row]:g}"
     assert shape is not None and head.x is not None and head.y is not None
     x, y = table[:, head.x], table[:, head.y]
-    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0]) & (x == np.floor(x)) & (y == np.floor(y))
     return np.where(inside, y * shape[1] + x, -1.0), lambda row: f"x = {x[row]:g}, y = {y[row]:g}"
 
 
-def _pieces(file: Any, path: Path, head: _Head) -> Iterator[tuple[int, np.ndarray]]:
-    """(number of its first line, (lines, columns) numbers), piece by piece."""
+def _ratio(scale: float, tick: float) -> float:
+    """Ticks in a unit of time, to the last digit where they are a whole number, as 1000 ps in 1 ns."""
+    ratio = scale / tick
+    return float(round(ratio)) if abs(ratio - round(ratio)) < 1e-12 * ratio else ratio
+
+
+def _pieces(file: Any, path: Path, head: _Head) -> Iterator[tuple[int, list[str], np.ndarray]]:
+    """(number of the first line, lines, (lines that are not empty, columns) numbers), piece by piece."""
     line, rest, more = 2, "", True
     while more:
         text = file.read(_AT_ONCE)
         more = bool(text)
-        text, _, rest = (rest + text).rpartition("\n") if more else (rest, "", "")
+        text, end, rest = (rest + text).rpartition("\n") if more else (rest, "", "")
         if len(rest) > _LONGEST_LINE:
             raise InputError(f"{path}: has a line of more than {_LONGEST_LINE} characters; is it a table?")
-        lines = text.splitlines()
+        lines = text.split("\n") if text or end else []
         if text.strip():
-            yield line, _numbers(lines, line, path, head)
+            yield line, lines, _numbers(lines, line, path, head)
         line += len(lines)
 
 
