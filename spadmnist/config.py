@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
 
 from . import document, plugins, reconstruct, units
 from .document import Document
@@ -29,6 +29,7 @@ from .experiment import Experiment, Level
 from .images import ImageSource
 from .readout import READOUTS, no_detection, unsigned_for
 from .reconstruct import Method
+from .section import LATER, Section
 from .sensor import Sensor
 
 Path_ = tuple[Any, ...]
@@ -59,25 +60,14 @@ _Irradiance = Annotated[_Q, _quantity("W/m^2"), AfterValidator(_positive)]
 _Share = Annotated[_Q, _quantity(""), AfterValidator(_at_most_all)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        strict=True,
-        extra="forbid",
-        frozen=True,
-        validate_default=True,
-        allow_inf_nan=False,
-        arbitrary_types_allowed=True,
-    )
-
-
-class _Scene(_Model):
+class _Scene(Section):
     images: ImageSource
     wavelength: _Length = Field(default="555 nm")  # type: ignore[assignment]
     lux: list[_Lux] | None = Field(default=None, min_length=1)
     irradiance: list[_Irradiance] | None = Field(default=None, min_length=1)
 
 
-class _Recording(_Model):
+class _Recording(Section):
     exposure: _Time
     frames: int | None = Field(default=None, ge=1, le=10**9)
     frame_time: _Time | None = None
@@ -87,11 +77,11 @@ class _Recording(_Model):
     counting: Literal["frames", "counter"] | None = None
 
 
-class _Output(_Model):
+class _Output(Section):
     format: Literal["zarr", "hdf5"] = "zarr"
 
 
-class _Layout(_Model):
+class _Layout(Section):
     rows: int | None = Field(default=None, ge=1, le=100_000)
     columns: int | None = Field(default=None, ge=1, le=100_000)
     positions: str | None = None  # a CSV file, instead of rows and columns
@@ -99,7 +89,7 @@ class _Layout(_Model):
     fill_factor: _Share = Field(default="1")  # type: ignore[assignment]
 
 
-class _Sensor(_Model):
+class _Sensor(Section):
     name: str = ""
     rules: Literal["paper", "device"] = "paper"
     chip_seed: int = Field(default=0, ge=0, lt=2**63)
@@ -110,8 +100,8 @@ class _Sensor(_Model):
 # the sections of a config: each is checked by itself, so that a mistake in one hides none in another
 _SECTIONS: dict[str, Any] = {
     "seed": Annotated[int, Field(ge=0, lt=2**63)],
-    "limit": Annotated[int | None, Field(ge=1)],
-    "causes": bool,
+    "limit": Annotated[int | None, Field(ge=1), LATER],
+    "causes": Annotated[bool, LATER],
     "scene": _Scene,
     "recording": _Recording,
     "reconstruct": list[str] | None,
@@ -724,57 +714,49 @@ def positions_text(positions: np.ndarray) -> str:
 def _resolved(
     parts: Mapping[str, Any], described: _Described, methods: tuple[str, ...], conditions: Conditions, base: Path
 ) -> dict[str, Any]:
-    """All defaults filled in and the sensor in place, in a fixed order; numbers stay as they were written."""
-    scene, recording, model = parts["scene"], parts["recording"], described.model
-    levels = {"lux": scene.lux} if scene.lux is not None else {"irradiance": scene.irradiance}
+    """All defaults filled in and the sensor in place, in a fixed order; numbers stay as they were written.
+
+    What came later than the first program is left out where it stands at its default: entries of the config, of its
+    sections (`Section.written`) and parameters of effects (`Parameter.later`).
+    """
+    recording, model, folder = parts["recording"], described.model, described.reader.base
     time = recording.frame_time.text if recording.frame_time else f"{conditions.frame_time!r} s"
-    effects: dict[str, Any] = {}
-    for effect in described.sensor.effects:
-        given = described.written.get(effect.name) or {}
-        effects[effect.name] = {
-            name: _from(base, described.reader.base, given[name]) if name in given else _default_text(declared)
-            for name, declared in effect.parameters.items()
-            if name in given or declared.default is not None
-        }
-    layout: dict[str, Any] = {"rows": model.layout.rows, "columns": model.layout.columns}
-    if model.layout.positions is not None:
-        layout = {"positions": _reached(base, described.reader.base, model.layout.positions)}
-    return {
-        "seed": parts["seed"],
-        **({"limit": parts["limit"]} if parts["limit"] is not None else {}),
-        **({"causes": True} if parts["causes"] else {}),
-        "scene": {
-            "images": scene.images.model_dump(exclude_none=True),
-            "wavelength": scene.wavelength.text,
-            **{kind: [q.text for q in values] for kind, values in levels.items()},
-        },
-        "recording": {
-            "exposure": recording.exposure.text,
-            "frames": conditions.frames,
-            "frame_time": time,
-            "frame_period": recording.frame_period.text if recording.frame_period else time,
-            "readouts": [r for r in READOUTS if r in recording.readouts],
-            **({"bits": conditions.bits, "counting": conditions.counting} if conditions.bits else {}),
-        },
+    settled = {
+        "frames": conditions.frames,
+        "frame_time": time,
+        "frame_period": recording.frame_period.text if recording.frame_period else time,
+        "readouts": [r for r in READOUTS if r in recording.readouts],
+        "bits": conditions.bits or None,
+        "counting": conditions.counting if conditions.bits else None,
+    }
+    layout = model.layout
+    if layout.positions is not None:
+        layout = layout.model_copy(update={"positions": _reached(base, folder, layout.positions)})
+    listed = described.sensor.effects
+    effects = {e.name: _parameters(e, described.written.get(e.name) or {}, base, folder) for e in listed}
+    whole = {
+        **parts,
+        "scene": parts["scene"].written(),
+        "recording": recording.model_copy(update=settled).written(),
         "reconstruct": list(methods),
-        "sensor": {
-            "name": model.name,
-            "rules": model.rules,
-            "chip_seed": model.chip_seed,
-            "layout": {
-                **layout,
-                "pixel_area": model.layout.pixel_area.text,
-                "fill_factor": _plain(model.layout.fill_factor),
-            },
-            "effects": effects,
-        },
-        "output": {"format": parts["output"].format},
+        "sensor": model.model_copy(update={"layout": layout, "effects": effects}).written(),
+        "output": parts["output"].written(),
+    }
+    return {
+        name: whole[name]
+        for name, kind in _SECTIONS.items()
+        if not (LATER in get_args(kind) and whole[name] == _DEFAULTS[name])
     }
 
 
-def _plain(value: units.Quantity) -> Any:
-    """A dimensionless number as it was written: a number, or text with its per cent."""
-    return value.text if "%" in value.text else float(value)
+def _parameters(effect: Effect, given: Mapping[str, Any], base: Path, folder: Path) -> dict[str, Any]:
+    """The parameters of an effect of a sensor file in `folder`, as they were written or at their defaults."""
+    return {
+        name: _from(base, folder, given[name]) if name in given else _default_text(declared)
+        for name, declared in effect.parameters.items()
+        if (name in given or declared.default is not None)
+        and not (declared.later and getattr(effect, name) == declared.default)
+    }
 
 
 def _from(base: Path, folder: Path, given: Any) -> Any:

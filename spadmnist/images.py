@@ -20,12 +20,13 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from . import image_files
 from .digits import draw_digit
 from .errors import InputError
 from .image_files import idx_sha256, looks_like, read_idx, read_image, read_member, read_npy, reason
+from .section import Section
 
 # SHA-256 of the unpacked files: packed copies differ from mirror to mirror
 MNIST_SHA256 = {
@@ -144,10 +145,8 @@ def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) ->
         raise InputError(problem)
 
 
-class _Source(BaseModel):
+class _Source(Section):
     """What every source shares. `load` is for callers; each source writes `_read` and `describe`."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
     def load(
         self,

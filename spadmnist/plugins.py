@@ -52,6 +52,7 @@ class Parameter:
     choices: tuple[str, ...] = ()
     required: bool = False
     needs: str = ""  # the parameter without which this one does nothing
+    later: bool = False  # datasets of earlier programs do not name it
     name: str = ""
 
     @property
@@ -100,6 +101,7 @@ def parameter(
     choices: tuple[str, ...] = (),
     required: bool = False,
     needs: str = "",
+    later: bool = False,
 ) -> Any:
     """Declare a parameter in the body of a plug-in's class.
 
@@ -108,7 +110,8 @@ def parameter(
     per_pixel: it may be a map from a file or a distribution; per: the same over "row", "column" or "code" (of a
     converter; the effect declares a parameter `period`, their number) instead of "pixel". by_wavelength: it may be a
     table over the wavelength. choices: the words that are allowed, where it is no number. needs: another parameter,
-    without which this one does nothing.
+    without which this one does nothing. later: datasets have been made with this effect before it had this parameter,
+    whose default does what was done then: a manifest names it only where it has another value.
     """
     per = "pixel" if per_pixel else per
     if per not in PER:
@@ -117,8 +120,11 @@ def parameter(
         raise TypeError(f"{default!r} is none of the choices {', '.join(choices)}")
     if unit != "bool" and not units.is_known(unit):
         raise TypeError(f"{unit!r} is not an SI unit that is known here")
+    if later and required:
+        raise TypeError(f"{about}: it came later, so that old configs lack it: it cannot be required")
     return Parameter(
-        default, unit, about, symbol, bounds, open_bounds, off, search, per, by_wavelength, choices, required, needs
+        *(default, unit, about, symbol, bounds, open_bounds, off, search, per),
+        *(by_wavelength, choices, required, needs, later),
     )
 
 
