@@ -114,8 +114,12 @@ def idx_sha256(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def read_image(path: Path) -> np.ndarray:
-    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour."""
+def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
+    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour.
+
+    A palette is colour unless all colours that the picture uses are greys; grey_palettes=False: then, too.
+    Raises InputError.
+    """
     from PIL import Image, UnidentifiedImageError
 
     with warnings.catch_warnings():
@@ -124,7 +128,7 @@ def read_image(path: Path) -> np.ndarray:
             with Image.open(path, formats=_FORMATS) as image:
                 image.verify()  # PNG's checksums, which decoding leaves out
             with Image.open(path, formats=_FORMATS) as image:
-                return _to_pixels(image, path)
+                return _to_pixels(image, path, grey_palettes)
         except InputError:
             raise
         except UnidentifiedImageError as error:
@@ -141,7 +145,7 @@ def read_image(path: Path) -> np.ndarray:
             ) from error
 
 
-def _to_pixels(image: Any, path: Path) -> np.ndarray:
+def _to_pixels(image: Any, path: Path, grey_palettes: bool) -> np.ndarray:
     """The pixels of an open Pillow image, or InputError where they would not be what the file says."""
     # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
     if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
@@ -163,7 +167,10 @@ def _to_pixels(image: Any, path: Path) -> np.ndarray:
         return pixels.astype(np.uint16)
     if mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L"))
-    return np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
+    colours = np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
+    if grey_palettes and mode in ("P", "PA") and (colours == colours[0]).all():
+        return np.ascontiguousarray(colours[0])
+    return colours
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:

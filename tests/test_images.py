@@ -547,7 +547,13 @@ def test_kinds_of_pixels(tmp_path: Path) -> None:
         ("rgb.png", RGB, None, RGB.transpose(2, 0, 1)),
         ("rgba.png", opaque, None, RGB.transpose(2, 0, 1)),
         ("la.png", GREY, "LA", GREY),
-        ("p.png", GREY, "P", np.stack([GREY] * 3)),
+        ("p.png", GREY, "P", GREY),
+        ("p.bmp", GREY, "P", GREY),
+        ("p.tif", GREY, "P", GREY),
+        ("l.gif", GREY, None, GREY),
+        ("p.gif", GREY, "P", GREY),
+        ("1.gif", GREY > 5, None, np.where(GREY > 5, 255, 0)),
+        ("grey_rgb.png", np.dstack([GREY] * 3), None, np.stack([GREY] * 3)),
     ]
     for name, array, mode, expected in cases:
         root = tmp_path / name.replace(".", "-")
@@ -562,6 +568,68 @@ def test_kinds_of_pixels(tmp_path: Path) -> None:
     assert np.array_equal(load_folder(tmp_path / "16-pgm")["train"].pixels[0], deep)
     assert load_folder(tmp_path / "16-png")["train"].white == 65535
     assert load_folder(tmp_path / "16-png", white=60000)["train"].white == 60000
+
+
+def palette(path: Path, colours: np.ndarray, indices: np.ndarray, **options: Any) -> np.ndarray:
+    """Writes a picture with a palette (colours: (n, 3) uint8); returns what it shows, (3, rows, columns)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(indices.astype(np.uint8), "L")
+    image.putpalette(colours.astype(np.uint8).tobytes())
+    image.save(path, **options)
+    return colours.astype(np.uint8)[indices].transpose(2, 0, 1)
+
+
+GREYS = np.stack([np.arange(12) * 20] * 3, axis=1)[::-1]  # in another order than the levels
+COLOURS = np.concatenate([GREYS, [[250, 0, 0]]])
+INDICES = np.arange(12).reshape(3, 4)
+
+
+@pytest.mark.parametrize("suffix", ["png", "gif", "bmp", "tif"])
+def test_a_palette_is_grey_where_all_colours_used_are(tmp_path: Path, suffix: str) -> None:
+    """Whatever else the palette holds; one pixel in colour makes a picture in colour."""
+    for name, colours, indices in (("g", GREYS, INDICES), ("h", COLOURS, INDICES), ("c", COLOURS, INDICES + 1)):
+        shown = palette(tmp_path / name / f"a.{suffix}", colours, indices)
+        part = load_folder(tmp_path / name)["train"]
+        assert np.array_equal(part.pixels[0], shown if name == "c" else shown[0]) and part.white == 255
+        assert part.pixels.dtype == np.uint8 and part.pixels.flags.c_contiguous
+
+
+def test_grey_pictures_with_and_without_palettes_in_one_folder(tmp_path: Path) -> None:
+    save(tmp_path / "f" / "a.png", GREY)
+    shown = palette(tmp_path / "f" / "b.gif", GREYS, INDICES)
+    palette(tmp_path / "f" / "c.png", COLOURS, INDICES)
+    save(tmp_path / "f" / "d.gif", GREY)
+    pixels = load_folder(tmp_path / "f")["train"].pixels
+    assert np.array_equal(pixels, [GREY, shown[0], shown[0], GREY])
+    save(tmp_path / "f" / "e.png", RGB)
+    refused(lambda: load_folder(tmp_path / "f"), tmp_path / "f" / "e.png", "8-bit colour", "but a.png is", "8-bit grey")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("train/a.gif", "train/b.gif"),
+        ("train/b.gif", "train/a.gif"),
+        ("train/a.gif", "test/b.gif"),
+        ("test/a.gif", "train/b.gif"),
+    ],
+)
+def test_a_picture_without_colour_among_pictures_in_colour(tmp_path: Path, names: tuple[str, str]) -> None:
+    """It stays as colour as the others, whichever comes first."""
+    grey = palette(tmp_path / "f" / names[0], GREYS, INDICES)
+    colour = palette(tmp_path / "f" / names[1], COLOURS, INDICES + 1)
+    splits = load_folder(tmp_path / "f")
+    found = {n: x for part in splits.values() for n, x in zip(part.names or (), part.pixels, strict=True)}
+    assert np.array_equal(found[names[0]], grey) and np.array_equal(found[names[1]], colour)
+
+
+@pytest.mark.parametrize("suffix", ["png", "gif"])
+def test_a_grey_palette_with_a_transparent_colour(tmp_path: Path, suffix: str) -> None:
+    """Refused where the picture shows it."""
+    palette(tmp_path / "f" / f"a.{suffix}", COLOURS, INDICES, transparency=3)
+    refused(lambda: load_folder(tmp_path / "f"), f"a.{suffix}", "transparent", "background")
+    palette(tmp_path / "g" / f"a.{suffix}", COLOURS, INDICES, transparency=12)
+    assert load_folder(tmp_path / "g")["train"].pixels.shape == (1, 3, 4)
 
 
 def png(columns: int, rows: int, depth: int, kind: int, data: bytes) -> bytes:
@@ -644,6 +712,8 @@ def test_images_that_differ(tmp_path: Path, array: np.ndarray, parts: list[str])
 def test_splits_that_differ(tmp_path: Path) -> None:
     save(tmp_path / "f" / "train" / "a.png", GREY)
     save(tmp_path / "f" / "test" / "a.png", RGB)
+    refused(lambda: load_folder(tmp_path / "f"), "folder f", "(3, 4)", "(3, 3, 4)", "both splits")
+    palette(tmp_path / "f" / "train" / "b.gif", GREYS, INDICES)
     refused(lambda: load_folder(tmp_path / "f"), "folder f", "(3, 4)", "(3, 3, 4)", "both splits")
 
 
