@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from . import image_files
 from .digits import draw_digit
 from .errors import InputError
-from .image_files import idx_sha256, looks_like, read_idx, read_image, read_member, read_npy, reason
+from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
 
 # SHA-256 of the unpacked files: packed copies differ from mirror to mirror
 MNIST_SHA256 = {
@@ -602,15 +602,14 @@ class Array(_Source):
     ) -> dict[str, Images]:
         path = _find(self.path, [images_dir if images_dir is not None else base], Path.is_file)
         with open(path, "rb") as file:
-            head = file.read(6)
+            head = file.read(image_files.HEAD)
             file.seek(0)
-            if head == b"\x93NUMPY":
+            if head.startswith(b"\x93NUMPY"):
                 images = read_npy(file, path.stat().st_size, str(path))
                 return {"train": self._split(images, None, limit, (str(path), None))}
             if head[:2] == b"PK":
                 return self._read_npz(file, path, limit)
-        seems = looks_like(head) if head else "an empty file"
-        raise InputError(f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez")
+        raise another(path, head, "a .npy or .npz file; store the array by np.save or np.savez")
 
     def _read_npz(self, file: IO[bytes], path: Path, limit: int | None) -> dict[str, Images]:
         try:
