@@ -74,6 +74,7 @@ class Block:
 
     @property
     def marks(self) -> list[pytest.MarkDecorator]:
+        """`diagnose` is left to `make verify`: it takes longer than all others."""
         return [pytest.mark.slow] if "spadmnist diagnose" in self.text else []
 
     @property
@@ -178,7 +179,8 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
         patch.setenv("SPADMNIST_CACHE", str(folder / "cache"))
-        patch.setenv("SPADMNIST_DATA", str(MNIST)) if MNIST.is_dir() else None
+        if MNIST.is_dir():
+            patch.setenv("SPADMNIST_DATA", str(MNIST))
         patch.delenv("MAKEFLAGS", raising=False)
         yield Reader(folder)
 
