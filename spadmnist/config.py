@@ -647,7 +647,7 @@ def read_positions(path: Path) -> np.ndarray:
             if not any(cell.strip() for cell in cells):
                 continue
             if not headed:
-                if [re.sub(r"\s", "", cell).lower() for cell in cells] not in _HEADERS:
+                if [re.sub(r"\s", "", units.plain(cell)).lower() for cell in cells] not in _HEADERS:
                     raise InputError(f"{place}: {_brief(','.join(cells))} is no header; the first line is x,y (in um)")
                 headed = True
                 continue

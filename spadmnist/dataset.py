@@ -27,7 +27,7 @@ from . import config, disk, kernels, plugins, reconstruct, store, units
 from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
-from .experiment import Experiment, Level
+from .experiment import Experiment, Level, level_of
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
@@ -664,9 +664,7 @@ class Dataset:
 
     def __getitem__(self, key: str | tuple[str, str]) -> Part:
         level_text, split = key if isinstance(key, tuple) else (key, None)
-        level = next((x for x in self._levels if x.text == level_text), None)
-        if level is None:
-            raise KeyError(f"{level_text!r} is not a light level here; there are {', '.join(self.levels)}")
+        level = level_of(self._levels, level_text)
         if split is None:
             if len(self._splits) > 1:
                 names = " and ".join(self._splits)

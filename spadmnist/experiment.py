@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,14 +35,31 @@ class Level:
 
     @property
     def folder(self) -> str:
-        """Its name on disk: `5 mlux` -> `5_mlux`, `120 nW/cm^2` -> `120_nW_per_cm2`."""
-        text = re.sub(r"^\+?(?=\.)", "0", self.text.lstrip("+")).replace("/", "_per_").replace("^", "")
+        """Its name on disk: `5 mlux` -> `5_mlux`, `5 µlux` -> `5_ulux`, `120 nW/cm^2` -> `120_nW_per_cm2`."""
+        text = re.sub(r"^\+?(?=\.)", "0", units.plain(self.text).lstrip("+")).replace("/", "_per_").replace("^", "")
         return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")
 
     @property
     def key(self) -> str:
         """What its random numbers are keyed by: the value, however it is written."""
         return f"{self.kind}/{float(self.value).hex()}"
+
+
+def level_of(levels: Sequence[Level], text: str) -> Level:
+    """The one of the levels that is written as `text`, or has its value. Raises KeyError with a sentence."""
+    for level in levels:
+        if level.text == text:
+            return level
+    for level in levels:
+        try:
+            if units.parse(text, "lux" if level.kind == "lux" else "W/m^2") == level.value:
+                return level
+        except ValueError:
+            continue
+    known = [x.text for x in levels]
+    near = next((x for x in known if x.split()[0] == str(text).strip()), None)
+    hint = f' Did you mean "{near}"?' if near else did_you_mean(text, known)
+    raise KeyError(f"{text!r} is not a light level here.{hint} There are {', '.join(known)}")
 
 
 @dataclass(frozen=True)
@@ -90,19 +108,7 @@ class Experiment:
 
     def level(self, text: str) -> Level:
         """The level written as `text`, or of the same value. Raises KeyError with a sentence."""
-        for level in self.levels:
-            if level.text == text:
-                return level
-        for level in self.levels:
-            try:
-                if units.parse(text, "lux" if level.kind == "lux" else "W/m^2") == level.value:
-                    return level
-            except ValueError:
-                continue
-        known = [x.text for x in self.levels]
-        near = next((x for x in known if x.split()[0] == text.strip()), None)
-        hint = f' Did you mean "{near}"?' if near else did_you_mean(text, known)
-        raise KeyError(f"{text!r} is not a light level here.{hint} There are {', '.join(known)}")
+        return level_of(self.levels, text)
 
     # --- images --------------------------------------------------------------------------------------------------
 

@@ -26,6 +26,29 @@ _MAX_DEFLATE = 1032  # deflate, the packing of gzip and zip, gains at most this 
 # Pillow's other formats stay shut: some of them start programs (EPS calls Ghostscript)
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "GIF", "WEBP")
 
+HEAD = 16  # bytes by which the kind of a file is told: the longest beginning below
+_BEGINNINGS = {  # what a file begins with, and what it is
+    b"PK": "a zip archive",
+    b"\x89PNG": "a PNG image",
+    b"\xff\xd8": "a JPEG image",
+    b"GIF8": "a GIF image",
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "a TIFF image"),
+    b"\x93NUMPY": "a NumPy array",
+    b"\x89HDF": "an HDF5 file",
+    b"MATLAB 5.0 MAT-f": "a MATLAB file of version 5",
+    b"MATLAB 7.3 MAT-f": "a MATLAB file of version 7.3",
+    b"PQTTTR": "a PicoQuant PTU file",
+    b"PAR1": "a Parquet file",
+    b"%PDF": "a PDF document",
+}
+# what packs a single file: its name, and the command that unpacks it and keeps the packed one
+_PACKERS = {
+    b"\x1f\x8b": ("gzip", "gunzip -k"),
+    b"BZh": ("bzip2", "bunzip2 -k"),
+    b"\xfd7zXZ\0": ("xz", "unxz -k"),
+    b"\x28\xb5\x2f\xfd": ("Zstandard", "unzstd"),
+}
+
 
 def reason(error: Exception) -> str:
     """What another library says is wrong: one line, or only the kind of error where it says too much."""
@@ -45,22 +68,22 @@ def read_idx(path: Path, ndim: int) -> np.ndarray:
             stream = gzip.GzipFile(fileobj=file) if packed else file
             file_bytes = os.fstat(file.fileno()).st_size
             most = file_bytes * _MAX_DEFLATE if packed else file_bytes
-            return _read_idx(cast(IO[bytes], stream), ndim, path, most)
+            return _read_idx(cast(IO[bytes], stream), ndim, path, most, packed)
     except (gzip.BadGzipFile, zlib.error, EOFError) as error:
         raise InputError(f"{path}: its gzip data are damaged ({reason(error)}); download or copy it again") from error
 
 
-def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int) -> np.ndarray:
-    """The array in an unpacked stream that cannot hold more than `most` bytes."""
+def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int, packed: bool) -> np.ndarray:
+    """The array in a stream that cannot hold more than `most` bytes. packed: gzip unpacks it."""
     magic = bytes([0, 0, 8, ndim])
     head = stream.read(4 + 4 * ndim)
     if not head:
         raise InputError(f"{path}: the file is empty; download or copy it again")
     if head[:4] != magic:
-        raise InputError(
-            f"{path}: this is {looks_like(head)}, not an IDX file of unsigned bytes in {ndim} "
-            f"dimension{'s' * (ndim > 1)} (it would begin with {magic.hex(' ')}); name the right file"
-        )
+        wanted = f"an IDX file of unsigned bytes in {ndim} dimension{'s' * (ndim > 1)}"
+        begins = f"it would begin with {magic.hex(' ')}"
+        head += stream.read(max(0, HEAD - len(head)))
+        raise another(path, head, f"{wanted} ({begins}); name the right file", packed)
     if len(head) < 4 + 4 * ndim:
         raise InputError(f"{path}: the file ends inside its header; download or copy it again")
     shape = tuple(int.from_bytes(head[i : i + 4], "big") for i in range(4, len(head), 4))
@@ -85,25 +108,31 @@ def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int) -> np.ndarray
     return data.reshape(shape)
 
 
-def looks_like(head: bytes) -> str:
-    """What a file that begins with `head` seems to be."""
-    known = {
-        b"PK": "a zip archive",
-        b"\x1f\x8b": "a file that gzip packed twice",
-        b"\x89PNG": "a PNG image",
-        b"\xff\xd8": "a JPEG image",
-        b"\x93NUMPY": "a NumPy array",
-        b"\x89HDF": "an HDF5 file",
-        b"%PDF": "a PDF document",
-    }
-    for prefix, name in known.items():
-        if head.startswith(prefix):
-            return name
+def looks_like(head: bytes, inside_gzip: bool = False) -> str:
+    """What a file that begins with `head` is, to stand behind 'this is', with what to do where that is to unpack it.
+
+    inside_gzip: `head` is what gzip unpacked from the beginning of the file.
+    """
+    for beginning, (name, unpack) in _PACKERS.items():
+        if head.startswith(beginning) and not inside_gzip:
+            return f"packed by {name}; unpack it ({unpack} FILE)"
+        if head.startswith(beginning):
+            how = "gzip packed twice" if name == "gzip" else f"{name} packed, and then gzip"
+            return f"a file that {how}; unpack it once (gunzip -k FILE)"
+    for beginning, kind in _BEGINNINGS.items():
+        if head.startswith(beginning):
+            return kind
     if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
         return "an HTML page, perhaps a server's error page"
     if len(head) >= 4 and head[:2] == b"\0\0" and head[2] in (8, 9, 11, 12, 13, 14):
         return f"an IDX file of another kind (type {head[2]:#04x}, {head[3]} dimensions)"
-    return f"a file that begins with {head[:4].hex(' ')}"
+    return f"a file that begins with {head[:4].hex(' ')}" if head else "an empty file"
+
+
+def another(path: Path, head: bytes, wanted: str, inside_gzip: bool = False) -> InputError:
+    """What to say of a file that begins with `head` (see `looks_like`) and is not `wanted`: what, and what to do."""
+    rest = "" if head.startswith(tuple(_PACKERS)) else f", not {wanted}"
+    return InputError(f"{path}: this is {looks_like(head, inside_gzip)}{rest}")
 
 
 def idx_sha256(array: np.ndarray) -> str:
@@ -114,8 +143,12 @@ def idx_sha256(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def read_image(path: Path) -> np.ndarray:
-    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour."""
+def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
+    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour.
+
+    A palette is colour unless all colours that the picture uses are greys; grey_palettes=False: then, too.
+    Raises InputError.
+    """
     from PIL import Image, UnidentifiedImageError
 
     with warnings.catch_warnings():
@@ -124,7 +157,7 @@ def read_image(path: Path) -> np.ndarray:
             with Image.open(path, formats=_FORMATS) as image:
                 image.verify()  # PNG's checksums, which decoding leaves out
             with Image.open(path, formats=_FORMATS) as image:
-                return _to_pixels(image, path)
+                return _to_pixels(image, path, grey_palettes)
         except InputError:
             raise
         except UnidentifiedImageError as error:
@@ -141,7 +174,7 @@ def read_image(path: Path) -> np.ndarray:
             ) from error
 
 
-def _to_pixels(image: Any, path: Path) -> np.ndarray:
+def _to_pixels(image: Any, path: Path, grey_palettes: bool) -> np.ndarray:
     """The pixels of an open Pillow image, or InputError where they would not be what the file says."""
     # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
     if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
@@ -163,7 +196,10 @@ def _to_pixels(image: Any, path: Path) -> np.ndarray:
         return pixels.astype(np.uint16)
     if mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L"))
-    return np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
+    colours = np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
+    if grey_palettes and mode in ("P", "PA") and (colours == colours[0]).all():
+        return np.ascontiguousarray(colours[0])
+    return colours
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:

@@ -25,7 +25,7 @@ from pydantic import Field
 from . import image_files
 from .digits import draw_digit
 from .errors import InputError
-from .image_files import idx_sha256, looks_like, read_idx, read_image, read_member, read_npy, reason
+from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
 from .section import Section
 
 # SHA-256 of the unpacked files: packed copies differ from mirror to mirror
@@ -402,7 +402,8 @@ class Folder(_Source):
     With `train` and `test` folders in it these are the splits and all else is left out. Inside a split the
     first folder is the class; labels count the classes of both splits in alphabetical order. The order of the
     images is that of their paths. Hidden files and files that are not images by their suffix are left out.
-    Pixel values are taken as they are stored: EXIF orientation and colour profiles are ignored.
+    Pixel values are taken as they are stored: EXIF orientation and colour profiles are ignored. Pictures with palettes
+    (GIF, some PNG) are grey where none of the folder has a colour.
     A relative path refers to --images-dir or, without it, to the folder of the config.
     """
 
@@ -434,13 +435,14 @@ class Folder(_Source):
                 "or put all images into one folder to go without labels"
             )
         number = {name: i for i, name in enumerate(label_names)}
-        splits = {}
         for split, part in files.items():
             if not part:
                 allowed = ", ".join(_SUFFIXES)
                 raise InputError(f"{root / prefixes[split]}: there is no image in it; put some there ({allowed})")
-            of_part = classes[split]
-            pixels = _read_folder(root, part[:limit], self.white)
+        arrays = _read_splits(root, {split: part[:limit] for split, part in files.items()}, self.white)
+        splits = {}
+        for split, part in files.items():
+            of_part, pixels = classes[split], arrays[split]
             splits[split] = Images(
                 pixels,
                 None if of_part is None else np.array([number[c] for c in of_part[:limit]], np.uint8),
@@ -505,9 +507,37 @@ def _classes(root: Path, prefix: str, names: list[str]) -> list[str] | None:
     return [parts[0] for parts in inner]
 
 
-def _read_folder(root: Path, names: list[str], white: float | None) -> np.ndarray:
+class _Unlike(InputError):
+    """An image is of another size or kind than the first."""
+
+
+def _read_splits(root: Path, files: dict[str, list[str]], white: float | None) -> dict[str, np.ndarray]:
+    """The images of each split. Pictures whose palettes hold greys alone are grey where all others are, too.
+
+    Beside pictures in colour they are colour: one of a folder of colour pictures may happen to have none.
+    """
+
+    def read(grey_palettes: bool) -> dict[str, np.ndarray]:
+        return {split: _read_folder(root, names, white, grey_palettes) for split, names in files.items()}
+
+    try:
+        splits = read(True)
+        if len({pixels.ndim for pixels in splits.values()}) == 1:
+            return splits
+        unlike = None
+    except _Unlike as error:
+        unlike = error
+    try:
+        return read(False)
+    except _Unlike:
+        if unlike is None:
+            return splits
+        raise unlike from None
+
+
+def _read_folder(root: Path, names: list[str], white: float | None, grey_palettes: bool) -> np.ndarray:
     """All images, (n, rows, columns) or (n, 3, rows, columns), after checking that they are alike."""
-    first = read_image(root / names[0])
+    first = read_image(root / names[0], grey_palettes)
     if first.nbytes * len(names) > image_files.MAX_BYTES:
         raise InputError(
             f"{root}: {len(names)} images like {names[0]} take more than the {image_files.MAX_BYTES} bytes allowed; "
@@ -516,9 +546,9 @@ def _read_folder(root: Path, names: list[str], white: float | None) -> np.ndarra
     pixels = np.empty((len(names), *first.shape), first.dtype)
     top = _white(white, first.dtype)
     for i, name in enumerate(names):
-        image = read_image(root / name) if i else first
+        image = read_image(root / name, grey_palettes) if i else first
         if (image.shape, image.dtype) != (first.shape, first.dtype):
-            raise InputError(
+            raise _Unlike(
                 f"{root / name}: it is {_kind(image)}, but {names[0]} is {_kind(first)}; "
                 "all images must be of one size and kind: convert or remove those that differ"
             )
@@ -571,15 +601,14 @@ class Array(_Source):
     ) -> dict[str, Images]:
         path = _find(self.path, [images_dir if images_dir is not None else base], Path.is_file)
         with open(path, "rb") as file:
-            head = file.read(6)
+            head = file.read(image_files.HEAD)
             file.seek(0)
-            if head == b"\x93NUMPY":
+            if head.startswith(b"\x93NUMPY"):
                 images = read_npy(file, path.stat().st_size, str(path))
                 return {"train": self._split(images, None, limit, (str(path), None))}
             if head[:2] == b"PK":
                 return self._read_npz(file, path, limit)
-        seems = looks_like(head) if head else "an empty file"
-        raise InputError(f"{path}: this is {seems}, not a .npy or .npz file; store the array by np.save or np.savez")
+        raise another(path, head, "a .npy or .npz file; store the array by np.save or np.savez")
 
     def _read_npz(self, file: IO[bytes], path: Path, limit: int | None) -> dict[str, Images]:
         try:

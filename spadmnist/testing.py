@@ -59,20 +59,26 @@ _REPETITIONS = 32
 
 @dataclass
 class Report:
-    """What `check_effect` found: a verdict on each check, and by how many standard errors each statistic moved."""
+    """What `check_effect` found: a verdict on each check, and by how many standard errors each statistic moved.
+
+    warnings: sentences on what is no fault of the effect, but should be mended.
+    """
 
     name: str
     checks: dict[str, str] = field(default_factory=dict)
     moved: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         lines = [self.name, *(f"  {name}: {verdict}" for name, verdict in self.checks.items())]
+        lines += [f"  warning: {sentence}" for sentence in self.warnings]
         return "\n".join([*lines, *(f"    {name:16} {z:8.1f}" for name, z in self.moved.items())])
 
 
 def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
     """Does an effect keep the contract? Raises AssertionError with one sentence where it does not.
 
+    Returns what was found, to be printed; a docstring without a `Source:` is a warning there.
     effect: the class or its name. parameters: values in SI in place of those that the contract chooses; see `strong`.
     """
     kind: type[Effect] = Effect.registry.find(effect) if isinstance(effect, str) else effect
@@ -87,7 +93,7 @@ def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
         except Exception as error:
             what = str(error) if isinstance(error, AssertionError | SpadError) else f"{type(error).__name__}: {error}"
             raise AssertionError(f"{source_file(kind)}: the effect {kind.name}, {title}: {what}") from error
-    report.moved = trial.moved
+    report.moved, report.warnings = trial.moved, trial.warnings
     return report
 
 
@@ -145,6 +151,7 @@ class _Trial:
     kind: type[Effect]
     given: dict[str, Any]
     moved: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -250,7 +257,9 @@ def _declarations(trial: _Trial) -> None:
     kind = trial.kind
     text = (kind.__doc__ or "").strip()
     assert text.split("\n")[0].endswith("."), "the docstring must begin with one sentence on one line"
-    assert "Source:" in text, "the docstring must say where the effect is known from (Source: ...)"
+    if "Source:" not in text:
+        where = f"{source_file(kind)}: the effect {kind.name}"
+        trial.warnings.append(f"{where}: its docstring does not say where it is known from; add a line Source: ...")
     have = [all(callable(getattr(kind, hook, None)) for hook in way.split("+")) for way in STAGES[kind.stage]]
     assert any(have), f"it must define {' or '.join(STAGES[kind.stage])}"
     unknown = sorted(set(kind.moves) - set(BLOCKS))

@@ -1,7 +1,8 @@
 """Quantities: SI floats inside, `"50 ns"` at the door.
 
 A quantity with a dimension is a number and a unit in one string; a bare number where a unit is needed is an
-error that shows what to write. A dimensionless quantity is bare or in per cent.
+error that shows what to write. A dimensionless quantity is bare or in per cent. The micro sign, as either of its two
+characters, may stand wherever a unit begins with `u`.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from decimal import Decimal
 _DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
     "s": (
         "time",
-        {"s": "1", "ms": "1e-3", "us": "1e-6", "µs": "1e-6", "μs": "1e-6", "ns": "1e-9", "ps": "1e-12"},
+        {"s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9", "ps": "1e-12"},
         "50 ns",
     ),
     "Hz": ("rate", {"Hz": "1", "mHz": "1e-3", "kHz": "1e3", "MHz": "1e6", "GHz": "1e9"}, "100 Hz"),
     "m": (
         "length",
-        {"m": "1", "mm": "1e-3", "um": "1e-6", "µm": "1e-6", "μm": "1e-6", "nm": "1e-9"},
+        {"m": "1", "mm": "1e-3", "um": "1e-6", "nm": "1e-9"},
         "555 nm",
     ),
     "m^2": (
         "area",
-        {"m^2": "1", "mm^2": "1e-6", "um^2": "1e-12", "µm^2": "1e-12", "μm^2": "1e-12"},
+        {"m^2": "1", "mm^2": "1e-6", "um^2": "1e-12"},
         "25 um^2",
     ),
     "lux": ("illuminance", {"lux": "1", "mlux": "1e-3", "ulux": "1e-6", "klux": "1e3"}, "5 mlux"),
@@ -49,6 +50,9 @@ _DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
 
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\S*)\s*", re.ASCII)
 
+
+# the micro sign and the Greek letter that looks like it, where a unit begins
+_MICRO = re.compile("(?<![A-Za-z])[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}](?=[A-Za-z])")
 
 _LONGEST = 60  # characters of a quantity
 
@@ -75,6 +79,11 @@ class Quantity(float):
         return self.text
 
 
+def plain(text: str) -> str:
+    """The text with `u` in place of each micro sign at the beginning of a unit: `5 µlux` -> `5 ulux`."""
+    return _MICRO.sub("u", text)
+
+
 def is_known(unit: str) -> bool:
     """Is there a dimension whose SI unit is `unit`?"""
     return unit in _DIMENSIONS
@@ -92,8 +101,7 @@ def example(unit: str) -> str:
 
 def allowed_units(unit: str) -> str:
     """The units one may write for the dimension, in a row."""
-    names = [u for u in _DIMENSIONS[unit][1] if u and not u.startswith(("µ", "μ"))]
-    return ", ".join(names)
+    return ", ".join(u for u in _DIMENSIONS[unit][1] if u)
 
 
 def parse(value: object, unit: str) -> Quantity:
@@ -117,7 +125,7 @@ def parse(value: object, unit: str) -> Quantity:
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"{value!r} is not {_a(name)}; write {_how(unit, sample)}")
-    number, written = match.groups()
+    number, written = match[1], plain(match[2])
     if written not in units:
         if not written:
             raise ValueError(_no_unit(value, unit))
@@ -153,7 +161,7 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     >>> show(5e-8, "s")
     '50 ns'
     """
-    units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if not u.startswith(("µ", "μ")) and u != "%"}
+    units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if u != "%"}
     if unit == "W/m^2":
         units = {u: f for u, f in units.items() if u.endswith("/cm^2")}
     if value == 0 or not math.isfinite(value) or len(units) == 1:

@@ -39,6 +39,7 @@ def switched() -> list[tuple[str, dict[str, Any]]]:
 def test_an_effect_keeps_the_contract(name: str) -> None:
     report = check_effect(name)
     assert report.checks["moves"] == "kept", "an effect of ours says what it moves"
+    assert not report.warnings, "an effect of ours says where it is known from"
     assert set(report.moved) == set(signatures.BLOCKS)
 
 
@@ -295,12 +296,18 @@ def test_a_fault_is_found(fault: str, planted: Any, tmp_path: Path) -> None:
 def test_what_says_nothing_of_itself_is_only_noted(planted: Any) -> None:
     report = check_effect(planted(FAULTS["an effect that does nothing"][1], "light"))
     assert report.checks["moves"] == "no `moves` is declared; it moved nothing"
+    assert not report.warnings and "warning" not in str(report)
 
 
-def test_an_effect_without_a_source(planted: Any) -> None:
+def test_an_effect_without_a_source_is_warned_of(planted: Any, tmp_path: Path) -> None:
     body = "    def apply(self, rate, conditions):\n        return rate\n"
-    with pytest.raises(AssertionError, match="declarations: the docstring must say where the effect is known from"):
-        check_effect(planted(body, "light", HEAD.replace("Source:", "From")))
+    report = check_effect(planted(body, "light", HEAD.replace("Source:", "From")))
+    (warning,) = report.warnings
+    assert warning == (
+        f"{tmp_path / 'mine.py'}: the effect mine: its docstring does not say where it is known from; "
+        "add a line Source: ..."
+    )
+    assert f"  warning: {warning}" in str(report).splitlines() and report.checks["declarations"] == "kept"
 
 
 def test_bounds_that_nobody_enforces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,7 +350,8 @@ def test_a_method_that_does_not_keep_it(answer: float, says: str) -> None:
 @pytest.mark.parametrize("stage", STAGES)
 def test_the_template_keeps_it(stage: str, planted: Any) -> None:
     name = f"mine_{stage}"
-    check_effect(planted("", head=template.text(name, stage).replace("{", "{{").replace("}", "}}"), name=name))
+    text = template.text(name, stage).replace("{", "{{").replace("}", "}}")
+    assert not check_effect(planted("", head=text, name=name)).warnings
 
 
 @pytest.mark.slow

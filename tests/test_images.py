@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import hashlib
 import http.server
 import io
+import lzma
 import math
 import struct
 import threading
@@ -16,8 +18,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numcodecs
 import numpy as np
 import pytest
+import scipy.io
+import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
@@ -197,7 +203,12 @@ def header(*shape: int) -> bytes:
         pytest.param(b"\n<!DOCTYPE html><html>", ["HTML page", "name the right file"], id="html"),
         pytest.param(b"\x89PNG\r\n", ["PNG"], id="png"),
         pytest.param(b"hello, world", ["68 65 6c 6c"], id="text"),
-        pytest.param(gzip.compress(PACKED), ["gzip packed twice"], id="packed twice"),
+        pytest.param(
+            gzip.compress(PACKED), ["gzip packed twice", "unpack it once (gunzip -k FILE)"], id="packed twice"
+        ),
+        pytest.param(gzip.compress(lzma.compress(GOOD)), ["xz packed, and then gzip", "unpack"], id="xz in gzip"),
+        pytest.param(bz2.compress(GOOD), ["is packed by bzip2; unpack it (bunzip2 -k FILE)"], id="bzip2"),
+        pytest.param(gzip.compress(b"MATLAB 5.0 MAT-file"), ["MATLAB file of version 5, not an IDX file"], id="matlab"),
         pytest.param(idx(LABELS), ["another kind", "1 dim"], id="labels as images"),
         pytest.param(GOOD[:9], ["ends inside its header"], id="short header"),
         pytest.param(GOOD[:-1], ["3 x 4 x 5", "more than the file can hold", "again"], id="truncated"),
@@ -216,6 +227,12 @@ def test_bad_idx(tmp_path: Path, data: bytes, parts: list[str]) -> None:
     path = tmp_path / "x-ubyte.gz"
     path.write_bytes(data)
     refused(lambda: read_idx(path, 3), path, *parts)
+
+
+def test_a_short_head_names_its_file(tmp_path: Path) -> None:
+    """The header of labels is shorter than the beginning by which a file is told."""
+    (tmp_path / "x").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
+    refused(lambda: read_idx(tmp_path / "x", 1), "this is a MATLAB file of version 7.3, not an IDX file")
 
 
 def test_gzip_bomb_stops_at_the_declared_size(tmp_path: Path) -> None:
@@ -547,7 +564,13 @@ def test_kinds_of_pixels(tmp_path: Path) -> None:
         ("rgb.png", RGB, None, RGB.transpose(2, 0, 1)),
         ("rgba.png", opaque, None, RGB.transpose(2, 0, 1)),
         ("la.png", GREY, "LA", GREY),
-        ("p.png", GREY, "P", np.stack([GREY] * 3)),
+        ("p.png", GREY, "P", GREY),
+        ("p.bmp", GREY, "P", GREY),
+        ("p.tif", GREY, "P", GREY),
+        ("l.gif", GREY, None, GREY),
+        ("p.gif", GREY, "P", GREY),
+        ("1.gif", GREY > 5, None, np.where(GREY > 5, 255, 0)),
+        ("grey_rgb.png", np.dstack([GREY] * 3), None, np.stack([GREY] * 3)),
     ]
     for name, array, mode, expected in cases:
         root = tmp_path / name.replace(".", "-")
@@ -562,6 +585,68 @@ def test_kinds_of_pixels(tmp_path: Path) -> None:
     assert np.array_equal(load_folder(tmp_path / "16-pgm")["train"].pixels[0], deep)
     assert load_folder(tmp_path / "16-png")["train"].white == 65535
     assert load_folder(tmp_path / "16-png", white=60000)["train"].white == 60000
+
+
+def palette(path: Path, colours: np.ndarray, indices: np.ndarray, **options: Any) -> np.ndarray:
+    """Writes a picture with a palette (colours: (n, 3) uint8); returns what it shows, (3, rows, columns)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(indices.astype(np.uint8), "L")
+    image.putpalette(colours.astype(np.uint8).tobytes())
+    image.save(path, **options)
+    return colours.astype(np.uint8)[indices].transpose(2, 0, 1)
+
+
+GREYS = np.stack([np.arange(12) * 20] * 3, axis=1)[::-1]  # in another order than the levels
+COLOURS = np.concatenate([GREYS, [[250, 0, 0]]])
+INDICES = np.arange(12).reshape(3, 4)
+
+
+@pytest.mark.parametrize("suffix", ["png", "gif", "bmp", "tif"])
+def test_a_palette_is_grey_where_all_colours_used_are(tmp_path: Path, suffix: str) -> None:
+    """Whatever else the palette holds; one pixel in colour makes a picture in colour."""
+    for name, colours, indices in (("g", GREYS, INDICES), ("h", COLOURS, INDICES), ("c", COLOURS, INDICES + 1)):
+        shown = palette(tmp_path / name / f"a.{suffix}", colours, indices)
+        part = load_folder(tmp_path / name)["train"]
+        assert np.array_equal(part.pixels[0], shown if name == "c" else shown[0]) and part.white == 255
+        assert part.pixels.dtype == np.uint8 and part.pixels.flags.c_contiguous
+
+
+def test_grey_pictures_with_and_without_palettes_in_one_folder(tmp_path: Path) -> None:
+    save(tmp_path / "f" / "a.png", GREY)
+    shown = palette(tmp_path / "f" / "b.gif", GREYS, INDICES)
+    palette(tmp_path / "f" / "c.png", COLOURS, INDICES)
+    save(tmp_path / "f" / "d.gif", GREY)
+    pixels = load_folder(tmp_path / "f")["train"].pixels
+    assert np.array_equal(pixels, [GREY, shown[0], shown[0], GREY])
+    save(tmp_path / "f" / "e.png", RGB)
+    refused(lambda: load_folder(tmp_path / "f"), tmp_path / "f" / "e.png", "8-bit colour", "but a.png is", "8-bit grey")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("train/a.gif", "train/b.gif"),
+        ("train/b.gif", "train/a.gif"),
+        ("train/a.gif", "test/b.gif"),
+        ("test/a.gif", "train/b.gif"),
+    ],
+)
+def test_a_picture_without_colour_among_pictures_in_colour(tmp_path: Path, names: tuple[str, str]) -> None:
+    """It stays as colour as the others, whichever comes first."""
+    grey = palette(tmp_path / "f" / names[0], GREYS, INDICES)
+    colour = palette(tmp_path / "f" / names[1], COLOURS, INDICES + 1)
+    splits = load_folder(tmp_path / "f")
+    found = {n: x for part in splits.values() for n, x in zip(part.names or (), part.pixels, strict=True)}
+    assert np.array_equal(found[names[0]], grey) and np.array_equal(found[names[1]], colour)
+
+
+@pytest.mark.parametrize("suffix", ["png", "gif"])
+def test_a_grey_palette_with_a_transparent_colour(tmp_path: Path, suffix: str) -> None:
+    """Refused where the picture shows it."""
+    palette(tmp_path / "f" / f"a.{suffix}", COLOURS, INDICES, transparency=3)
+    refused(lambda: load_folder(tmp_path / "f"), f"a.{suffix}", "transparent", "background")
+    palette(tmp_path / "g" / f"a.{suffix}", COLOURS, INDICES, transparency=12)
+    assert load_folder(tmp_path / "g")["train"].pixels.shape == (1, 3, 4)
 
 
 def png(columns: int, rows: int, depth: int, kind: int, data: bytes) -> bytes:
@@ -644,6 +729,8 @@ def test_images_that_differ(tmp_path: Path, array: np.ndarray, parts: list[str])
 def test_splits_that_differ(tmp_path: Path) -> None:
     save(tmp_path / "f" / "train" / "a.png", GREY)
     save(tmp_path / "f" / "test" / "a.png", RGB)
+    refused(lambda: load_folder(tmp_path / "f"), "folder f", "(3, 4)", "(3, 3, 4)", "both splits")
+    palette(tmp_path / "f" / "train" / "b.gif", GREYS, INDICES)
     refused(lambda: load_folder(tmp_path / "f"), "folder f", "(3, 4)", "(3, 3, 4)", "both splits")
 
 
@@ -835,6 +922,7 @@ def boasting() -> bytes:
         pytest.param(b"", ["empty", "np.save"], id="empty"),
         pytest.param(b"<html></html>", ["HTML", "np.save"], id="html"),
         pytest.param(b"\x89HDF\r\n\x1a\n", ["HDF5", "np.save"], id="hdf5"),
+        pytest.param(gzip.compress(npy_bytes()), ["is packed by gzip; unpack it (gunzip -k FILE)"], id="gzip"),
         pytest.param(npy_bytes()[:-1], ["60 bytes, but 59 follow", "store it again"], id="truncated"),
         pytest.param(npy_bytes() + b"!", ["60 bytes, but 61 follow", "store it again"], id="extra"),
         pytest.param(npy_bytes()[:20], ["header is damaged"], id="cut header"),
@@ -858,6 +946,59 @@ def test_damaged_array_file(tmp_path: Path, data: bytes, parts: list[str]) -> No
     path = tmp_path / "x.npy"
     path.write_bytes(data)
     refused(lambda: load_array(path), path, *parts)
+
+
+PACKERS: dict[str, Callable[[bytes], bytes]] = {
+    **{"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress},
+    "Zstandard": lambda data: bytes(numcodecs.Zstd().encode(data)),
+}
+
+
+@pytest.mark.parametrize("packer", PACKERS)
+def test_what_is_packed_is_told_to_be_unpacked(tmp_path: Path, packer: str) -> None:
+    """And nothing else: it may be the right file."""
+    path = tmp_path / "x.npy.packed"
+    path.write_bytes(PACKERS[packer](npy_bytes()))
+    message = refused(lambda: load_array(path), f"{path}: this is packed by {packer}; unpack it (")
+    assert "twice" not in message and "np.save" not in message
+    path.write_bytes(PACKERS[packer](idx(LABELS)))
+    if packer == "gzip":
+        assert np.array_equal(read_idx(path, 1), LABELS)
+    else:
+        refused(lambda: read_idx(path, 1), f"{path}: this is packed by {packer}; unpack it (")
+
+
+HEADS = {
+    "an HDF5 file": [b"\x89HDF\r\n\x1a\n\0\0"],
+    "a MATLAB file of version 5": [b"MATLAB 5.0 MAT-file, Platform: PCWIN64, Created on"],
+    "a MATLAB file of version 7.3": [b"MATLAB 7.3 MAT-file, Platform: GLNXA64"],
+    "a TIFF image": [b"II*\0\x08\0\0\0", b"MM\0*\0\0\0\x08", b"II+\0\x08\0\0\0", b"MM\0+\0\x08\0\0"],
+    "a PicoQuant PTU file": [b"PQTTTR\0\x001.0.00\0\0"],
+    "a Parquet file": [b"PAR1\x15\x04\x15\x10"],
+    "a GIF image": [b"GIF89a", b"GIF87a"],
+    "packed by gzip; unpack it (gunzip -k FILE)": [PACKERS["gzip"](b"1")],
+    "packed by bzip2; unpack it (bunzip2 -k FILE)": [PACKERS["bzip2"](b"1")],
+    "packed by xz; unpack it (unxz -k FILE)": [PACKERS["xz"](b"1")],
+    "packed by Zstandard; unpack it (unzstd FILE)": [PACKERS["Zstandard"](b"1")],
+    "an empty file": [b""],
+}
+
+
+@pytest.mark.parametrize("seems", HEADS)
+def test_a_file_is_named_by_its_first_bytes(seems: str) -> None:
+    for data in HEADS[seems]:
+        assert image_files.looks_like(data[: image_files.HEAD]) == seems
+
+
+def test_real_files_are_named(tmp_path: Path) -> None:
+    """As other libraries write them."""
+    scipy.io.savemat(tmp_path / "a.mat", {"a": PIXELS})
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["a"] = PIXELS
+    Image.fromarray(GREY).save(tmp_path / "a.tif")
+    tifffile.imwrite(tmp_path / "b.tif", GREY, bigtiff=True, byteorder=">")
+    for name, seems in (("a.mat", "a MATLAB file"), ("a.h5", "an HDF5"), ("a.tif", "a TIFF"), ("b.tif", "a TIFF")):
+        refused(lambda name=name: load_array(tmp_path / name), f"this is {seems}", "not a .npy or .npz file", "np.save")
 
 
 def test_zip_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,20 +8,24 @@ import re
 import time
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spadmnist import units
+import spadmnist
+from spadmnist import config, document, factory, importers, units, verify
+from spadmnist.errors import ConfigError
+from spadmnist.experiment import Level
+from spadmnist.recording import Light
 
 # every unit that may be written -> the SI unit of its dimension, and its size as an exact fraction
 SIZES = {
     "s": ("s", "1"),
     "ms": ("s", "1e-3"),
     "us": ("s", "1e-6"),
-    "\u00b5s": ("s", "1e-6"),  # micro sign
-    "\u03bcs": ("s", "1e-6"),  # Greek mu
     "ns": ("s", "1e-9"),
     "ps": ("s", "1e-12"),
     "mHz": ("Hz", "1e-3"),
@@ -32,14 +36,10 @@ SIZES = {
     "m": ("m", "1"),
     "mm": ("m", "1e-3"),
     "um": ("m", "1e-6"),
-    "\u00b5m": ("m", "1e-6"),
-    "\u03bcm": ("m", "1e-6"),
     "nm": ("m", "1e-9"),
     "m^2": ("m^2", "1"),
     "mm^2": ("m^2", "1e-6"),
     "um^2": ("m^2", "1e-12"),
-    "\u00b5m^2": ("m^2", "1e-12"),
-    "\u03bcm^2": ("m^2", "1e-12"),
     "ulux": ("lux", "1e-6"),
     "mlux": ("lux", "1e-3"),
     "lux": ("lux", "1"),
@@ -56,6 +56,7 @@ SIZES = {
     "%": ("", "1e-2"),
     "": ("", "1"),
 }
+MICRO = ("\u00b5", "\u03bc")  # micro sign, Greek mu
 DIMENSIONS = sorted({si for si, _ in SIZES.values()})
 
 
@@ -82,6 +83,23 @@ def test_there_are_no_other_units() -> None:
     """A unit that is added must be added above, with its size."""
     known = {u for _, table, _ in units._DIMENSIONS.values() for u in table}
     assert known == set(SIZES)
+
+
+@pytest.mark.parametrize("sign", MICRO, ids=ascii)
+@pytest.mark.parametrize("written", [unit for unit in SIZES if unit.startswith("u")])
+def test_the_micro_sign_stands_wherever_u_does(written: str, sign: str) -> None:
+    si, _ = SIZES[written]
+    for space in ("", " "):
+        text = f"1.5{space}{sign}{written[1:]}"
+        quantity = units.parse(text, si)
+        assert float(quantity) == float(units.parse(f"1.5 {written}", si)) and quantity.text == text
+
+
+@pytest.mark.parametrize("sign", MICRO, ids=ascii)
+@pytest.mark.parametrize("text", ["5 {}", "5 {}Hz", "5 u{}s", "5 {}{}s", "5 l{}x", "5 s{}", "{}5 s", "5 {} s"])
+def test_the_micro_sign_stands_nowhere_else(text: str, sign: str) -> None:
+    for unit in DIMENSIONS:
+        refused(text.replace("{}", sign), unit)
 
 
 @given(
@@ -238,5 +256,92 @@ def test_what_is_shown_can_be_read(unit: str, value: float) -> None:
     assert units.parse(units.show(value, unit, 17), unit) == pytest.approx(value, rel=1e-15)
 
 
+@pytest.mark.parametrize("unit", DIMENSIONS)
+def test_what_is_shown_is_ascii(unit: str) -> None:
+    """Also where people write the micro sign: a terminal or another program may not know it."""
+    assert units.allowed_units(unit).isascii()
+    assert all(units.show(1.5 * 10.0**k, unit).isascii() for k in range(-13, 10))
+    assert units.show(units.parse("5 \u00b5s", "s"), "s") == "5 us"
+
+
 def test_a_factor_of_little_is_not_nothing() -> None:
     assert [units.factor(x) for x in (1.02031, 0.0, 0.00041, 12.5)] == ["1.0203", "0.0000", "0.00041", "12.5000"]
+
+
+# --- where texts go -----------------------------------------------------------------------------------------------
+
+CONFIG = """\
+seed: 1
+scene: {images: {source: uniform, repetitions: 3}, wavelength: 0.5 um, lux: [5 ulux, 5 lux]}
+recording: {exposure: 1000 us, frames: 10, frame_time: 100 us}
+reconstruct: [counts]
+sensor:
+  layout: {rows: 2, columns: 3, pixel_area: 25 um^2}
+  effects: {detection: {pdp: 0.5}, dead_time: {duration: 0.05 us}, tdc: {resolution: 100 ps}}
+"""
+
+
+@pytest.mark.parametrize("sign", MICRO, ids=ascii)
+def test_a_config_with_the_micro_sign(sign: str, tmp_path: Path) -> None:
+    """Its dataset keeps the text, has folders of plain letters, and is checked and simulated from its own config."""
+    text = re.sub(r"(?<=\d )u", sign, CONFIG)
+    assert text.count(sign) == 6
+    (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+    experiment, plain = config.read(tmp_path / "c.yaml"), config.build(document.parse(CONFIG, "plain.yaml"), tmp_path)
+    assert experiment.conditions == plain.conditions and experiment.levels[0].key == plain.levels[0].key
+    assert experiment.resolved["recording"]["frame_time"] == f"100 {sign}s"
+    factory.generate(experiment, experiment.load_images(), tmp_path / "out", 1)
+    assert not verify.verify(tmp_path / "out")
+    assert document.read(tmp_path / "out" / "config.yaml").value["scene"]["lux"] == [f"5 {sign}lux", "5 lux"]
+    assert {p.name for p in (tmp_path / "out" / "data.zarr").iterdir() if p.is_dir()} == {"5_ulux", "5_lux", "images"}
+    stored, live = spadmnist.open(tmp_path / "out"), spadmnist.open(tmp_path / "out" / "config.yaml")
+    assert stored.levels == live.levels == (f"5 {sign}lux", "5 lux")
+    for spelling in ("5 ulux", *(f"5 {other}lux" for other in MICRO)):
+        assert stored[spelling] is stored[stored.levels[0]] and experiment.level(spelling) is experiment.levels[0]
+    assert stored["5 lux"].tr[:].ticks.tobytes() == live["5 lux"].tr[:].ticks.tobytes()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("other", ["5 ulux", "5\u00b5lux", "0.005 mlux"])
+def test_one_level_in_two_spellings_is_listed_once(other: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is the level 5 \u03bclux again; list it once"):
+        config.build(document.parse(CONFIG.replace("5 ulux, 5 lux", f"5 \u03bclux, {other}"), "c.yaml"), tmp_path)
+
+
+LEVELS = [(unit, si) for unit, (si, _) in SIZES.items() if si in ("lux", "W/m^2")]
+
+
+@given(
+    *[
+        st.tuples(
+            st.sampled_from(LEVELS), st.sampled_from(["5", "1.5", "0.5", "5e-2"]), st.sampled_from("u" + "".join(MICRO))
+        )
+    ]
+    * 2
+)
+def test_levels_share_a_folder_where_they_are_one(one: tuple[tuple[str, str], str, str], other: Any) -> None:
+    """Unlike texts of unlike light have unlike folders, and the spelling of the micro sign makes none."""
+    levels = []
+    for (unit, si), number, sign in (one, other):
+        value = units.parse(f"{number} {re.sub('^u', sign, unit)}", si)
+        levels.append(Level(value.text, "lux" if si == "lux" else "irradiance", float(value)))
+    same = one[:2] == other[:2]
+    assert (levels[0].folder == levels[1].folder) == same and all(level.folder.isascii() for level in levels)
+
+
+@pytest.mark.parametrize("sign", ["u", *MICRO], ids=ascii)
+def test_light_on_the_command_line(sign: str) -> None:
+    assert importers.light(f"500 nm 1.5 {sign}W/cm^2") == importers.light(f"0.5 {sign}m 1.5{sign}W/cm^2")
+    assert importers.light(f"500 nm 1.5 {sign}W/cm^2") == Light(500e-9, 0.015, "irradiance")
+    assert importers.light(f"5 {sign}lux") == Light(555e-9, 5e-6, "lux")
+
+
+@pytest.mark.parametrize("sign", ["u", *MICRO], ids=ascii)
+def test_the_header_of_positions(sign: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"x ({sign}m),Y({sign}m)\n0,0\n5,-1\n", encoding="utf-8")
+    assert config.read_positions(tmp_path / "a.csv").tolist() == [[0, 0], [5e-6, -1e-6]]
+
+
+@pytest.mark.parametrize("sign", MICRO, ids=ascii)
+def test_a_document_with_the_micro_sign_is_read_back(sign: str) -> None:
+    value = {"a": f"5 {sign}s", f"5 {sign}m": [f"1.5 {sign}W/cm^2", {f"0.5 {sign}m": 0.4}], "b": {"c": f"x ({sign}m)"}}
+    assert document.parse(document.dump(value), "c.yaml").value == value
