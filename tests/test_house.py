@@ -30,7 +30,7 @@ LAYERS = [
     {"config"},
     {"dataset"},
     {"measurement"},
-    {"factory", "reference", "template", "twin"},
+    {"factory", "look", "reference", "template", "twin"},
     {"criticism"},
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
