@@ -720,7 +720,11 @@ def _short(text: str) -> str:
 def _recorded(numbers: Mapping[str, Any]) -> str:
     if numbers["frames"] is None:
         return units.show(numbers["exposure"], "s")
-    return f"{numbers['frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    frames = f"{numbers['frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    if numbers["binary_frames"] == 1:
+        return frames
+    frames = f"{numbers['frames']:,} x {numbers['binary_frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    return f"{frames} = {units.show(numbers['live'], 's')}"
 
 
 def capture_sheet(measurement: Measurement, looks: Sequence[Look], path: str | Path) -> None:
