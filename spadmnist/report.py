@@ -33,8 +33,8 @@ _WIDTH = 100  # characters of a table
 def level_rows(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One row per light level and split, in the config's order; a number that was not recorded is None.
 
-    detections, mean_per_pixel: of TR, or of the count frames where there is no TR; empty_share: the same, or of the
-    frames. causes: detections of each cause, where the causes were stored.
+    detections: of TR, or of the count frames where there is no TR. mean_per_pixel, empty_share: the same, or where
+    there is neither, of the frames with a detection. causes: detections of each cause, where the causes were stored.
     ones, density: frames of a pixel with a detection, and their share.
     saturated_pixels, saturated_total: by method, and their sum.
     bytes, bytes_by_kind: on disk, without the original images.
@@ -64,7 +64,7 @@ def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
         "images": facts["images"],
         "pixels": pixels,
         "detections": detections,
-        "mean_per_pixel": _ratio(detections, pixels),
+        "mean_per_pixel": _ratio(detections if tr else ones, pixels),
         "empty_share": _ratio((tr or framed or {}).get("empty_pixels"), pixels),
         **({"causes": dict(facts["causes"])} if "causes" in facts else {}),
         "ones": ones,
@@ -113,8 +113,9 @@ def _about(manifest: Mapping[str, Any]) -> str:
 
 _HEADER = ("level", "images", "detections", "mean", "empty", "ones", "density", "saturated", "size", "bits")
 _LEGEND = """\
-mean: detections per pixel of an image. empty: pixels without any. ones: frames of a pixel with a
-detection. density: their share. size: without the originals. bits: stored per detection of TR."""
+mean: detections per pixel of an image; of STR and QIS alone, frames with one. empty: pixels without
+any. ones: frames of a pixel with a detection. density: their share. size: without the originals.
+bits: stored per detection of TR."""
 
 
 def _levels(manifest: Mapping[str, Any], by_split: bool) -> str:
