@@ -283,7 +283,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         click.echo(report.level_table(manifest))
     if plot is not None:
         with _writing(plot):
-            report.sheet(library.open(dataset), plot)
+            report.sheet(library.open(dataset), plot, places=report.places_of(manifest, dataset))
         _say(f"Drawn: {plot}")
 
 

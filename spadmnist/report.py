@@ -1,6 +1,6 @@
 """What a dataset holds, for people: the table of its light levels, and a sheet of its pictures.
 
-With `pages` the only module that imports matplotlib, and only where a picture is drawn.
+matplotlib is imported only where a picture is drawn.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from . import config as configs
 from . import dataset as datasets
-from . import look, reconstruct, units
+from . import look, pictures, reconstruct, units
 from .dataset import Dataset, Part
 from .errors import SpadError
 from .events import Events
@@ -249,8 +250,8 @@ _CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstr
 _SMALL, _LARGE = 168, 256  # points of the picture: images are magnified up to one, and reduced to the other
 _LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
 _PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
+_LETTER = 6.4  # points that one of the small print takes, at the most usual
 _TOP, _GAP, _CAPTION, _LINE = 92, 16, 34, 18  # above the cells, between them, below each; small print
-_DPI = 128  # a power of two: the size in points comes out whole
 _PAGE = (214, 223, 236)  # no grey, so that every cell stands out from it
 
 
@@ -297,12 +298,24 @@ class _Cell:
     caption: str
 
 
-def sheet(dataset: Dataset, path: str | Path, levels: Sequence[str] | None = None, count: int | None = None) -> None:
+def places_of(manifest: Mapping[str, Any], root: Path) -> np.ndarray | None:
+    """(pixels, 2) m, where the pixels of a dataset's sensor lie; None on a grid. Raises InputError as the file's."""
+    file = manifest["config"]["sensor"]["layout"].get("positions")
+    return None if file is None else configs.read_positions(root / file)
+
+
+def sheet(
+    dataset: Dataset,
+    path: str | Path,
+    levels: Sequence[str] | None = None,
+    count: int | None = None,
+    places: np.ndarray | None = None,
+) -> None:
     """Draw some training images in all readouts and reconstructions, a row for each light level, as a PNG.
 
     levels: as written in the config, all by default. count: images in a cell, with different labels as far as
-    there are; by default four, or one where they are large. Raises KeyError with a sentence where there is no
-    such level, SpadError where the picture cannot be written.
+    there are; by default four, or one where they are large. places: (pixels, 2) m, where pixels lie that are no grid.
+    Raises KeyError with a sentence where there is no such level, SpadError where the picture cannot be written.
     """
     brightness = dict(zip(dataset.levels, _brightness(dataset), strict=True))
     split = "train" if "train" in dataset.splits else dataset.splits[0]
@@ -313,10 +326,15 @@ def sheet(dataset: Dataset, path: str | Path, levels: Sequence[str] | None = Non
     shown = {level: _show(part, indices) for level, part in parts.items()}
     times = _time_scale([s.first for s in shown.values() if s.first is not None])
     rows = {level: _cells_of(s, times) for level, s in shown.items()}
+    if places is not None:
+        pixel, _ = pictures.pixel_at(places, _LARGE // math.ceil(math.sqrt(len(indices))))
+        page = np.array(_PAGE, np.uint8)
+        for cells in rows.values():
+            cells[:] = [replace(c, pixels=pictures.placed(c.pixels[:, 0], pixel, page)) for c in cells]
     which = f"{split} image{'s' if len(indices) > 1 else ''} {', '.join(map(str, indices))}"
     if one.labels is not None:
         which += f" (label{'s' if len(indices) > 1 else ''} {', '.join(str(one.labels[i]) for i in indices)})"
-    _save(_draw(rows, which, _basis(one, split), times), Path(path))
+    pictures.save(_draw(rows, which, _basis(one, split), times), Path(path))
 
 
 def _brightness(dataset: Dataset) -> tuple[float, ...]:
@@ -562,6 +580,7 @@ def _draw(
     _, _, factor = _arranged(columns[0].pixels)
     if factor > 1:
         foot.append(f"Every point is the mean of {factor} x {factor} pixels.")
+    foot = [line for words in foot for line in textwrap.wrap(words, int((full - left) / _LETTER))]
     lines = len(foot) + (times is not None)
     tall = _TOP + len(rows) * (height + _CAPTION) + _LINE * lines + 2 * _GAP
     if max(full, tall) >= 1 << 16:
@@ -569,10 +588,12 @@ def _draw(
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor="#" + bytes(_PAGE).hex())
+        figure = Figure(
+            figsize=(full / pictures.DPI, tall / pictures.DPI), dpi=pictures.DPI, facecolor="#" + bytes(_PAGE).hex()
+        )
 
         def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
-            points = size * 72 / _DPI
+            points = size * 72 / pictures.DPI
             figure.text(x / full, 1 - y / tall, words, fontsize=points, color=color, va="top", **style)
 
         def picture(x: int, y: int, pixels: np.ndarray) -> None:
@@ -602,13 +623,6 @@ def _draw(
         buffer = io.BytesIO()
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})
     return buffer.getvalue()
-
-
-def _save(png: bytes, path: Path) -> None:
-    try:
-        path.write_bytes(png)
-    except OSError as error:
-        raise SpadError(f"{path}: the picture cannot be written there ({error.strerror})") from None
 
 
 # --- measurements -------------------------------------------------------------------------------------------
@@ -735,19 +749,11 @@ def capture_sheet(measurement: Measurement, looks: Sequence[Look], path: str | P
     shown = [one for one in looks if one.totals is not None]
     if not shown:
         raise SpadError(f"{measurement.source}: of no capture are there data to draw; only means are known")
-    _save(_draw_captures(measurement, shown, len(looks)), Path(path))
+    pictures.save(_draw_captures(measurement, shown, len(looks)), Path(path))
 
 
 def _draw_captures(measurement: Measurement, looks: Sequence[Look], captures: int) -> bytes:
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.labelsize": 8, "xtick.labelsize": 8})
-        matplotlib.rcParams.update({"ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False})
-        figure = Figure(figsize=(13, 0.9 + 2.7 * len(looks)), dpi=_DPI, layout="constrained")
+    def draw(figure: Any) -> None:
         rest = f", {len(looks)} of {captures} captures" if len(looks) < captures else ""
         figure.suptitle(f"{measurement.name}: {_size_of(measurement)} pixels{rest}", fontsize=13)
         cells = figure.subplots(len(looks), 3, squeeze=False, width_ratios=(1, 1.2, 1.6))
@@ -758,9 +764,8 @@ def _draw_captures(measurement: Measurement, looks: Sequence[Look], captures: in
                 _interval_plot(row[2], one)
             else:
                 _course_plot(row[2], one)
-        buffer = io.BytesIO()
-        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})
-    return buffer.getvalue()
+
+    return pictures.png(13, 0.9 + 2.7 * len(looks), draw)
 
 
 def _size_of(measurement: Measurement) -> str:
@@ -769,29 +774,15 @@ def _size_of(measurement: Measurement) -> str:
 
 def _rate_map(axes: Any, measurement: Measurement, one: Look) -> None:
     assert one.totals is not None
-    layout = measurement.layout
     rates = one.totals / one.numbers["live"]
     # a few hot or dead pixels must not take the colours from the rest
     below, median, above = np.quantile(rates, [0.16, 0.5, 0.84])
     spread = max(float(above - below) / 2, 1 / one.numbers["live"])
     low, high = max(float(rates.min()), median - 4 * spread), min(float(rates.max()), median + 4 * spread)
     scale, unit = _scaled(float(high))
-    style: dict[str, Any] = {"cmap": "viridis", "vmin": low * scale, "vmax": high * scale}
-    if layout.positions is not None:
-        x, y = layout.positions.T * 1e6
-        size = float(np.clip(20_000 / len(x), 2, 300))
-        drawn = axes.scatter(x, y, c=rates * scale, s=size, marker="h", **style)
-        axes.margins(0.15)
-        axes.set(aspect="equal", xlabel="um")
-    else:
-        flat = min(layout.shape) * 8 < max(layout.shape)
-        drawn = axes.imshow(
-            (rates * scale).reshape(layout.shape), aspect="auto" if flat else "equal", interpolation="nearest", **style
-        )
     axes.set_title(f"{_short(one.capture.id)}: {one.numbers['light']}, {_recorded(one.numbers)}", loc="left")
-    beyond = rates.min() < low, rates.max() > high
-    extend = {(False, True): "max", (True, False): "min", (True, True): "both"}.get(beyond, "neither")
-    axes.figure.colorbar(drawn, ax=axes, shrink=0.9, label=f"detections / pixel, {unit}", extend=extend)
+    label = f"detections / pixel, {unit}"
+    pictures.draw_map(axes, measurement.layout, rates * scale, low * scale, high * scale, label)
 
 
 def _scaled(value: float) -> tuple[float, str]:

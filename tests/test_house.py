@@ -23,7 +23,7 @@ LAYERS = [
     {"errors", "heap", "units", "streams", "light"},
     {"disk", "kernels"},
     {"document", "plugins", "events", "image_files", "digits", "store"},
-    {"effects", "readout", "images"},
+    {"effects", "readout", "images", "pictures"},
     {"recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
@@ -116,7 +116,10 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
 @pytest.mark.parametrize(
     ("package", "owners"),
     [
-        ("matplotlib", {"report.py", *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis"))}),
+        (
+            "matplotlib",
+            {"report.py", "pictures.py", *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis"))},
+        ),
         ("jinja2", {"pages/_frame.py"}),
         ("click", {"cli.py"}),
         ("tqdm", {"cli.py"}),
