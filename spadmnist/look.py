@@ -46,7 +46,7 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
     row: dict[str, Any] = {
         "capture": capture.id,
         "modality": capture.modality,
-        "light": _light_text(capture.light),
+        "light": light_text(capture.light),
         "exposure": c.exposure,
         "frames": None if capture.modality == "tr" else c.count_frames if counted else c.frames,
         "binary_frames": None if capture.modality == "tr" else summed,
@@ -86,7 +86,8 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
     return row
 
 
-def _light_text(lit: Light) -> str:
+def light_text(lit: Light) -> str:
+    """What fell on the sensor, for people: `500 nm, 3 nW/cm^2`."""
     if lit.wavelength is None:
         return "dark"
     unit = "lux" if lit.kind_of_level == "lux" else "W/m^2"

@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 128  # a power of two: a size in points comes out whole
+PAGE = "#d6dfec"  # behind pictures in grey: no grey, so that every pixel stands out from it
 _REACH = 0.5**0.5  # pitches from its centre to where a pixel ends at the latest: the corner of a square
 _SAME = 50  # parts of a pitch, to which two steps to a neighbour are the same
 _POINTS = 480  # of the longer side of a map of pixels that are no grid
+_AROUND = 7  # a pixel and its neighbours in a hexagonal array
 _ALONE = 1e-6  # m, the pitch of an array of one pixel
 _STYLE: Any = {
     "font.size": 9,
@@ -63,6 +65,28 @@ def placed(values: np.ndarray, pixel: np.ndarray, empty: Any) -> np.ndarray:
     return np.where((pixel >= 0)[..., None], values[..., np.maximum(pixel, 0), :], empty)
 
 
+def white_of(layout: Layout, values: np.ndarray) -> tuple[float, int]:
+    """(what is drawn white where 0 is black, how many pixels are brighter) of (pixels,) values.
+
+    The largest value, but no more than twice the median of a pixel and its neighbours where that is largest (in one of
+    a hundred places): a hot pixel stands alone, and what is seen does not. Nor less than twice the median of those that
+    are not 0.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.spatial import cKDTree
+
+    some = values[values > 0]
+    if not len(some):
+        return 1.0, 0
+    if layout.positions is None:
+        around = median_filter(values.reshape(layout.shape), size=3, mode="nearest")
+    else:
+        nearest = cKDTree(layout.positions).query(layout.positions, k=min(_AROUND, len(values)))[1]
+        around = np.median(values[nearest.reshape(len(values), -1)], axis=1)
+    white = min(float(some.max()), 2 * max(float(np.quantile(around, 0.99)), float(np.median(some))))
+    return white, int((values > white).sum())
+
+
 def draw_map(
     axes: Axes, layout: Layout, values: np.ndarray, low: float, high: float, label: str, colours: str = "viridis"
 ) -> None:
@@ -82,8 +106,11 @@ def draw_map(
     axes.figure.colorbar(drawn, ax=axes, shrink=0.9, label=label, extend=extend)
 
 
-def png(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
-    """The PNG of a figure (inches) that `draw` fills: the same bytes for the same, whatever the user's settings."""
+def png(width: float, height: float, draw: Callable[[Figure], None], fitted: bool = True) -> bytes:
+    """The PNG of a figure (inches) that `draw` fills: the same bytes for the same, whatever the user's settings.
+
+    fitted: matplotlib makes room for all words, which takes seconds where there are many axes.
+    """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -91,7 +118,7 @@ def png(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
-        figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained" if fitted else None)
         draw(figure)
         buffer = io.BytesIO()
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})

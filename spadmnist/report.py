@@ -252,7 +252,7 @@ _LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
 _PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
 _LETTER = 6.4  # points that one of the small print takes, at the most usual
 _TOP, _GAP, _CAPTION, _LINE = 92, 16, 34, 18  # above the cells, between them, below each; small print
-_PAGE = (214, 223, 236)  # no grey, so that every cell stands out from it
+_PAGE = tuple(bytes.fromhex(pictures.PAGE[1:]))
 
 
 @dataclass(frozen=True)
@@ -588,9 +588,7 @@ def _draw(
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        figure = Figure(
-            figsize=(full / pictures.DPI, tall / pictures.DPI), dpi=pictures.DPI, facecolor="#" + bytes(_PAGE).hex()
-        )
+        figure = Figure(figsize=(full / pictures.DPI, tall / pictures.DPI), dpi=pictures.DPI, facecolor=pictures.PAGE)
 
         def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
             points = size * 72 / pictures.DPI
@@ -726,6 +724,24 @@ _LOOK_LEGEND = """\
 a pixel: mean detections. ones: frames with a detection. rates: of a pixel, as recorded, while it is
 live. empty: pixels without a detection. dead: those, where the median pixel has 20 or more.
 hot: more than 5 times the median, beyond noise. shortest interval: within a pixel."""
+
+
+def flux_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Flux images (see `fluxes.Fluxes.rows`), one row each, and what the methods were told of their captures."""
+    made, told = [], {}
+    for row in rows:
+        numbers = (_number(row[what]) for what in ("mean", "median", "min", "max"))
+        made.append((_short(row["capture"]), row["method"], *numbers, _integer(row["saturated_pixels"]), row["unit"]))
+        clock = (units.show(row[what], "s") for what in ("time", "dead_time"))
+        told[row["capture"]] = (_short(row["capture"]), row["modality"], f"{row['pdp']:.4g}", *clock)
+    head = ("capture", "method", "mean", "median", "min", "max", "saturated", "unit")
+    blocks = [_aligned(head, made), _aligned(("capture", "modality", "q", "T", "dead time"), list(told.values()))]
+    return "\n\n".join([*blocks, _FLUX_LEGEND])
+
+
+_FLUX_LEGEND = """\
+mean to max: over the pixels. saturated: pixels in which a rule stands in for the formula of the
+method (spadmnist methods NAME tells it). q: nominal PDP. T: exposure, or frames x frame time."""
 
 
 def _short(text: str) -> str:

@@ -34,7 +34,7 @@ LAYERS = [
     {"criticism"},
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
-    {"exporters"},
+    {"exporters", "fluxes"},
     {"cli"},
 ]
 LEVEL = {name: level for level, layer in enumerate(LAYERS) for name in layer}
