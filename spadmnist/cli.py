@@ -198,8 +198,8 @@ def generate(
         _say(f"Look at it:  spadmnist inspect {root} --plot {root.name}.png")
 
 
-@cli.command("reconstruct", short_help="Add flux images to a dataset.")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@cli.command("reconstruct", short_help="Make flux images of a dataset or a measurement.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--method",
     "methods",
@@ -207,20 +207,42 @@ def generate(
     metavar="METHOD",
     help="A method (repeatable).  [default: all that the readouts allow]",
 )
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Of a measurement: folder of its images.  [default: NAME-flux, here]",
+)
+@click.option(
+    "--sensor",
+    type=click.Path(path_type=Path),
+    metavar="SENSOR",
+    help="Of a measurement: whose PDP and dead time the methods are told.  [default: 1, and 0 s]",
+)
 @_jobs
 @_plugin
 @_json
 def reconstruct_(
-    dataset: Path, methods: tuple[str, ...], jobs: int | None, plugin_files: tuple[Path, ...], as_json: bool
+    dataset: Path,
+    methods: tuple[str, ...],
+    output: Path | None,
+    sensor: Path | None,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
 ) -> None:
-    """Make flux images from the raw streams of DATASET, and add them to it.
+    """Make flux images from the raw streams of DATASET, and add them to it; or from the captures of MEASUREMENT, and
+    write them to a folder: <capture>.<method>.npy, and sheet.png.
 
-    The dataset is then, byte for byte, what `generate` makes of a config that lists these methods.
+    The dataset is then, byte for byte, what `generate` makes of a config that lists these methods. A measurement's
+    images are photons/s where SENSOR (a sensor file, or a config) is given, otherwise detections/s.
 
     \b
     spadmnist reconstruct out --method inter_photon
+    spadmnist reconstruct lab --sensor sensor.yaml -o flux
     """
-    from . import factory, report
+    from . import factory, measurement, report
     from . import reconstruct as library
     from .errors import SpadError
 
@@ -230,6 +252,19 @@ def reconstruct_(
             library.find(name)
         except KeyError as error:
             raise SpadError(f"--method: {error.args[0]}") from None
+    if measurement.is_measurement(dataset):
+        if jobs is not None:
+            raise SpadError(
+                f"--jobs: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
+            )
+        _reconstruct_measurement(dataset, methods, output, sensor, as_json)
+        return
+    for option, given in (("--output", output), ("--sensor", sensor)):
+        if given is not None:
+            raise SpadError(
+                f"{option}: belongs to a measurement, and {dataset} is none; a dataset keeps its images and knows its "
+                "sensor: leave it out"
+            )
     with _terminal() as progress:
         added, manifest = factory.add_reconstructions(dataset, methods, jobs or _processors(), progress)
     if as_json:
@@ -240,6 +275,29 @@ def reconstruct_(
     else:
         _say(f"{dataset} holds these reconstructions already; nothing was done.\n")
     click.echo(report.level_table(manifest))
+
+
+def _reconstruct_measurement(
+    path: Path, methods: tuple[str, ...], output: Path | None, sensor: Path | None, as_json: bool
+) -> None:
+    from . import config, fluxes, measurement, report
+
+    opened = measurement.open(path)
+    folder = output if output is not None else fluxes.place_of(opened)
+    fluxes.check_place(folder)
+    model = None if sensor is None else config.read_sensor(sensor)
+    with _terminal() as progress:
+        found = fluxes.of_measurement(opened, methods, model, progress)
+    fluxes.write(found, folder)
+    for note in found.notes:
+        _say(f"Note: {note}")
+    rows = found.rows()
+    if as_json:
+        answer = {"measurement": opened.name, "folder": str(folder), "images": rows, "notes": found.notes}
+        click.echo(json.dumps(answer))
+        return
+    click.echo(report.flux_table(rows))
+    _say(f"\nMade {len(rows)} image{'s' if len(rows) > 1 else ''}: {folder}. Look at {folder / fluxes.SHEET}")
 
 
 @cli.command(short_help="Say and show what a dataset or a measurement holds.")
@@ -283,7 +341,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         click.echo(report.level_table(manifest))
     if plot is not None:
         with _writing(plot):
-            report.sheet(library.open(dataset), plot)
+            report.sheet(library.open(dataset), plot, places=report.places_of(manifest, dataset))
         _say(f"Drawn: {plot}")
 
 

@@ -16,7 +16,7 @@ from . import kernels
 from .plugins import Plugin, Registry
 from .readout import Recorded
 
-_ROWS_AT_ONCE = 1 << 15  # pixels whose arithmetic stays in the processor's cache
+_ROWS_AT_ONCE = 1 << 15  # numbers whose arithmetic stays in the processor's cache
 
 # what a method may ask for (columns of Recorded) -> the readout that it comes from
 COLUMNS = {"counts": "tr", "span": "tr", "ones": "qis", "waited": "str"}
@@ -70,9 +70,10 @@ class Method(Plugin, abstract=True):
         """What a dataset stores: ((rows,) float32, how many of them were saturated)."""
         columns = [getattr(recorded, name) for name in self.columns]
         values, saturated = np.empty(columns[0].shape, np.float32), 0
-        if len(columns) == 1 and columns[0].dtype.kind in "iu":
+        largest = int(columns[0].max(initial=0)) if len(columns) == 1 and columns[0].dtype.kind in "iu" else None
+        if largest is not None and largest < _ROWS_AT_ONCE:
             # a function of one small integer is worked out once for each value that occurs
-            whole = np.arange(int(columns[0].max(initial=0)) + 1)
+            whole = np.arange(largest + 1)
             values = kernels.lookup(self._finite(settings, whole).astype(np.float32), columns[0])
             # where no value is saturated no pixel need be looked at again
             return values, self.saturated(settings, *columns) if self.saturated(settings, whole) else 0

@@ -1,6 +1,6 @@
 """What a dataset holds, for people: the table of its light levels, and a sheet of its pictures.
 
-With `pages` the only module that imports matplotlib, and only where a picture is drawn.
+matplotlib is imported only where a picture is drawn.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from . import config as configs
 from . import dataset as datasets
-from . import measurement as measurements
-from . import reconstruct, units
+from . import look, pictures, reconstruct, units
 from .dataset import Dataset, Part
 from .errors import SpadError
 from .events import Events
@@ -34,8 +34,8 @@ _WIDTH = 100  # characters of a table
 def level_rows(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One row per light level and split, in the config's order; a number that was not recorded is None.
 
-    detections, mean_per_pixel: of TR, or of the count frames where there is no TR; empty_share: the same, or of the
-    frames. causes: detections of each cause, where the causes were stored.
+    detections: of TR, or of the count frames where there is no TR. mean_per_pixel, empty_share: the same, or where
+    there is neither, of the frames with a detection. causes: detections of each cause, where the causes were stored.
     ones, density: frames of a pixel with a detection, and their share.
     saturated_pixels, saturated_total: by method, and their sum.
     bytes, bytes_by_kind: on disk, without the original images.
@@ -65,7 +65,7 @@ def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
         "images": facts["images"],
         "pixels": pixels,
         "detections": detections,
-        "mean_per_pixel": _ratio(detections, pixels),
+        "mean_per_pixel": _ratio(detections if tr else ones, pixels),
         "empty_share": _ratio((tr or framed or {}).get("empty_pixels"), pixels),
         **({"causes": dict(facts["causes"])} if "causes" in facts else {}),
         "ones": ones,
@@ -114,8 +114,9 @@ def _about(manifest: Mapping[str, Any]) -> str:
 
 _HEADER = ("level", "images", "detections", "mean", "empty", "ones", "density", "saturated", "size", "bits")
 _LEGEND = """\
-mean: detections per pixel of an image. empty: pixels without any. ones: frames of a pixel with a
-detection. density: their share. size: without the originals. bits: stored per detection of TR."""
+mean: detections per pixel of an image; of STR and QIS alone, frames with one. empty: pixels without
+any. ones: frames of a pixel with a detection. density: their share. size: without the originals.
+bits: stored per detection of TR."""
 
 
 def _levels(manifest: Mapping[str, Any], by_split: bool) -> str:
@@ -249,9 +250,9 @@ _CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstr
 _SMALL, _LARGE = 168, 256  # points of the picture: images are magnified up to one, and reduced to the other
 _LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
 _PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
+_LETTER = 6.4  # points that one of the small print takes, at the most usual
 _TOP, _GAP, _CAPTION, _LINE = 92, 16, 34, 18  # above the cells, between them, below each; small print
-_DPI = 128  # a power of two: the size in points comes out whole
-_PAGE = (214, 223, 236)  # no grey, so that every cell stands out from it
+_PAGE = tuple(bytes.fromhex(pictures.PAGE[1:]))
 
 
 @dataclass(frozen=True)
@@ -297,12 +298,24 @@ class _Cell:
     caption: str
 
 
-def sheet(dataset: Dataset, path: str | Path, levels: Sequence[str] | None = None, count: int | None = None) -> None:
+def places_of(manifest: Mapping[str, Any], root: Path) -> np.ndarray | None:
+    """(pixels, 2) m, where the pixels of a dataset's sensor lie; None on a grid. Raises InputError as the file's."""
+    file = manifest["config"]["sensor"]["layout"].get("positions")
+    return None if file is None else configs.read_positions(root / file)
+
+
+def sheet(
+    dataset: Dataset,
+    path: str | Path,
+    levels: Sequence[str] | None = None,
+    count: int | None = None,
+    places: np.ndarray | None = None,
+) -> None:
     """Draw some training images in all readouts and reconstructions, a row for each light level, as a PNG.
 
     levels: as written in the config, all by default. count: images in a cell, with different labels as far as
-    there are; by default four, or one where they are large. Raises KeyError with a sentence where there is no
-    such level, SpadError where the picture cannot be written.
+    there are; by default four, or one where they are large. places: (pixels, 2) m, where pixels lie that are no grid.
+    Raises KeyError with a sentence where there is no such level, SpadError where the picture cannot be written.
     """
     brightness = dict(zip(dataset.levels, _brightness(dataset), strict=True))
     split = "train" if "train" in dataset.splits else dataset.splits[0]
@@ -313,10 +326,15 @@ def sheet(dataset: Dataset, path: str | Path, levels: Sequence[str] | None = Non
     shown = {level: _show(part, indices) for level, part in parts.items()}
     times = _time_scale([s.first for s in shown.values() if s.first is not None])
     rows = {level: _cells_of(s, times) for level, s in shown.items()}
+    if places is not None:
+        pixel, _ = pictures.pixel_at(places, _LARGE // math.ceil(math.sqrt(len(indices))))
+        page = np.array(_PAGE, np.uint8)
+        for cells in rows.values():
+            cells[:] = [replace(c, pixels=pictures.placed(c.pixels[:, 0], pixel, page)) for c in cells]
     which = f"{split} image{'s' if len(indices) > 1 else ''} {', '.join(map(str, indices))}"
     if one.labels is not None:
         which += f" (label{'s' if len(indices) > 1 else ''} {', '.join(str(one.labels[i]) for i in indices)})"
-    _save(_draw(rows, which, _basis(one, split), times), Path(path))
+    pictures.save(_draw(rows, which, _basis(one, split), times), Path(path))
 
 
 def _brightness(dataset: Dataset) -> tuple[float, ...]:
@@ -562,6 +580,7 @@ def _draw(
     _, _, factor = _arranged(columns[0].pixels)
     if factor > 1:
         foot.append(f"Every point is the mean of {factor} x {factor} pixels.")
+    foot = [line for words in foot for line in textwrap.wrap(words, int((full - left) / _LETTER))]
     lines = len(foot) + (times is not None)
     tall = _TOP + len(rows) * (height + _CAPTION) + _LINE * lines + 2 * _GAP
     if max(full, tall) >= 1 << 16:
@@ -569,10 +588,10 @@ def _draw(
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        figure = Figure(figsize=(full / _DPI, tall / _DPI), dpi=_DPI, facecolor="#" + bytes(_PAGE).hex())
+        figure = Figure(figsize=(full / pictures.DPI, tall / pictures.DPI), dpi=pictures.DPI, facecolor=pictures.PAGE)
 
         def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
-            points = size * 72 / _DPI
+            points = size * 72 / pictures.DPI
             figure.text(x / full, 1 - y / tall, words, fontsize=points, color=color, va="top", **style)
 
         def picture(x: int, y: int, pixels: np.ndarray) -> None:
@@ -604,13 +623,6 @@ def _draw(
     return buffer.getvalue()
 
 
-def _save(png: bytes, path: Path) -> None:
-    try:
-        path.write_bytes(png)
-    except OSError as error:
-        raise SpadError(f"{path}: the picture cannot be written there ({error.strerror})") from None
-
-
 # --- measurements -------------------------------------------------------------------------------------------
 
 _MOST_CAPTURES = 16  # of a picture
@@ -620,7 +632,7 @@ _PER_DECADE = 10  # bins of intervals
 
 @dataclass(frozen=True)
 class Look:
-    """What is shown of a capture. numbers: see `measurement.look`; the others only for a picture, of what was recorded.
+    """What is shown of a capture. numbers: see `look.look`; the others only for a picture, of what was recorded.
 
     totals: (pixels,) detections; intervals: (edges, s; counts) of TR; course: (time, s; ones or counts of a frame,
     their standard error) of frames.
@@ -638,7 +650,7 @@ def looks(measurement: Measurement, drawn: bool) -> list[Look]:
     found = []
     for i, capture in enumerate(measurement.captures):
         recorded = None if capture.mean is not None else measurement.recording(capture.id)
-        numbers = measurements.look(measurement, capture, recorded)
+        numbers = look.look(measurement, capture, recorded)
         if recorded is None or not drawn or i >= _MOST_CAPTURES:
             found.append(Look(capture, numbers))
         elif recorded.events is not None:
@@ -656,7 +668,7 @@ def _histogram_of_intervals(recorded: Recording) -> tuple[np.ndarray, np.ndarray
     # edges between ticks, so that each bin holds the whole ones it covers
     edges = np.unique(np.round(edges / tick)) * tick - tick / 2
     counts = np.zeros(len(edges) - 1, np.int64)
-    for piece in measurements.intervals(recorded.events):
+    for piece in look.intervals(recorded.events):
         counts += np.histogram(piece, edges)[0]
     return edges, counts
 
@@ -714,6 +726,24 @@ live. empty: pixels without a detection. dead: those, where the median pixel has
 hot: more than 5 times the median, beyond noise. shortest interval: within a pixel."""
 
 
+def flux_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Flux images (see `fluxes.Fluxes.rows`), one row each, and what the methods were told of their captures."""
+    made, told = [], {}
+    for row in rows:
+        numbers = (_number(row[what]) for what in ("mean", "median", "min", "max"))
+        made.append((_short(row["capture"]), row["method"], *numbers, _integer(row["saturated_pixels"]), row["unit"]))
+        clock = (units.show(row[what], "s") for what in ("time", "dead_time"))
+        told[row["capture"]] = (_short(row["capture"]), row["modality"], f"{row['pdp']:.4g}", *clock)
+    head = ("capture", "method", "mean", "median", "min", "max", "saturated", "unit")
+    blocks = [_aligned(head, made), _aligned(("capture", "modality", "q", "T", "dead time"), list(told.values()))]
+    return "\n\n".join([*blocks, _FLUX_LEGEND])
+
+
+_FLUX_LEGEND = """\
+mean to max: over the pixels. saturated: pixels in which a rule stands in for the formula of the
+method (spadmnist methods NAME tells it). q: nominal PDP. T: exposure, or frames x frame time."""
+
+
 def _short(text: str) -> str:
     return text if len(text) <= 24 else f"{text[:21]}..."
 
@@ -721,7 +751,11 @@ def _short(text: str) -> str:
 def _recorded(numbers: Mapping[str, Any]) -> str:
     if numbers["frames"] is None:
         return units.show(numbers["exposure"], "s")
-    return f"{numbers['frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    frames = f"{numbers['frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    if numbers["binary_frames"] == 1:
+        return frames
+    frames = f"{numbers['frames']:,} x {numbers['binary_frames']:,} x {units.show(numbers['frame_time'], 's')}"
+    return f"{frames} = {units.show(numbers['live'], 's')}"
 
 
 def capture_sheet(measurement: Measurement, looks: Sequence[Look], path: str | Path) -> None:
@@ -731,19 +765,11 @@ def capture_sheet(measurement: Measurement, looks: Sequence[Look], path: str | P
     shown = [one for one in looks if one.totals is not None]
     if not shown:
         raise SpadError(f"{measurement.source}: of no capture are there data to draw; only means are known")
-    _save(_draw_captures(measurement, shown, len(looks)), Path(path))
+    pictures.save(_draw_captures(measurement, shown, len(looks)), Path(path))
 
 
 def _draw_captures(measurement: Measurement, looks: Sequence[Look], captures: int) -> bytes:
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.labelsize": 8, "xtick.labelsize": 8})
-        matplotlib.rcParams.update({"ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False})
-        figure = Figure(figsize=(13, 0.9 + 2.7 * len(looks)), dpi=_DPI, layout="constrained")
+    def draw(figure: Any) -> None:
         rest = f", {len(looks)} of {captures} captures" if len(looks) < captures else ""
         figure.suptitle(f"{measurement.name}: {_size_of(measurement)} pixels{rest}", fontsize=13)
         cells = figure.subplots(len(looks), 3, squeeze=False, width_ratios=(1, 1.2, 1.6))
@@ -754,9 +780,8 @@ def _draw_captures(measurement: Measurement, looks: Sequence[Look], captures: in
                 _interval_plot(row[2], one)
             else:
                 _course_plot(row[2], one)
-        buffer = io.BytesIO()
-        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})
-    return buffer.getvalue()
+
+    return pictures.png(13, 0.9 + 2.7 * len(looks), draw)
 
 
 def _size_of(measurement: Measurement) -> str:
@@ -765,29 +790,15 @@ def _size_of(measurement: Measurement) -> str:
 
 def _rate_map(axes: Any, measurement: Measurement, one: Look) -> None:
     assert one.totals is not None
-    layout = measurement.layout
     rates = one.totals / one.numbers["live"]
     # a few hot or dead pixels must not take the colours from the rest
     below, median, above = np.quantile(rates, [0.16, 0.5, 0.84])
     spread = max(float(above - below) / 2, 1 / one.numbers["live"])
     low, high = max(float(rates.min()), median - 4 * spread), min(float(rates.max()), median + 4 * spread)
     scale, unit = _scaled(float(high))
-    style: dict[str, Any] = {"cmap": "viridis", "vmin": low * scale, "vmax": high * scale}
-    if layout.positions is not None:
-        x, y = layout.positions.T * 1e6
-        size = float(np.clip(20_000 / len(x), 2, 300))
-        drawn = axes.scatter(x, y, c=rates * scale, s=size, marker="h", **style)
-        axes.margins(0.15)
-        axes.set(aspect="equal", xlabel="um")
-    else:
-        flat = min(layout.shape) * 8 < max(layout.shape)
-        drawn = axes.imshow(
-            (rates * scale).reshape(layout.shape), aspect="auto" if flat else "equal", interpolation="nearest", **style
-        )
     axes.set_title(f"{_short(one.capture.id)}: {one.numbers['light']}, {_recorded(one.numbers)}", loc="left")
-    beyond = rates.min() < low, rates.max() > high
-    extend = {(False, True): "max", (True, False): "min", (True, True): "both"}.get(beyond, "neither")
-    axes.figure.colorbar(drawn, ax=axes, shrink=0.9, label=f"detections / pixel, {unit}", extend=extend)
+    label = f"detections / pixel, {unit}"
+    pictures.draw_map(axes, measurement.layout, rates * scale, low * scale, high * scale, label)
 
 
 def _scaled(value: float) -> tuple[float, str]:

@@ -88,6 +88,14 @@ def test_nothing_to_do_is_said_on_standard_error(made: tuple[Path, Path]) -> Non
     assert "2560 mlux" in result.stdout
 
 
+@pytest.mark.parametrize("option", ["--output", "--sensor"])
+def test_what_belongs_to_a_measurement_is_no_option_of_a_dataset(made: tuple[Path, Path], option: str) -> None:
+    before = tree(made[1])
+    result = run("reconstruct", made[1], option, made[0])
+    assert_sentence(result, option, "belongs to a measurement", "leave it out")
+    assert tree(made[1]) == before and result.stdout == ""
+
+
 def test_json_is_all_that_stands_on_standard_output(made: tuple[Path, Path], tmp_path: Path) -> None:
     file, root = made
     commands: list[tuple[Any, ...]] = [

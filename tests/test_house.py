@@ -24,18 +24,18 @@ LAYERS = [
     {"import_options"},
     {"disk", "kernels"},
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
-    {"effects", "readout", "images"},
+    {"effects", "readout", "images", "pictures"},
     {"recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
     {"config"},
     {"dataset"},
     {"measurement"},
-    {"factory", "reference", "template", "twin"},
+    {"factory", "look", "reference", "template", "twin"},
     {"criticism"},
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
-    {"exporters"},
+    {"exporters", "fluxes"},
     {"cli"},
 ]
 LEVEL = {name: level for level, layer in enumerate(LAYERS) for name in layer}
@@ -117,7 +117,10 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
 @pytest.mark.parametrize(
     ("package", "owners"),
     [
-        ("matplotlib", {"report.py", *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis"))}),
+        (
+            "matplotlib",
+            {"report.py", "pictures.py", *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis"))},
+        ),
         ("jinja2", {"pages/_frame.py"}),
         ("click", {"cli.py"}),
         ("tqdm", {"cli.py"}),

@@ -22,7 +22,7 @@ from click.testing import CliRunner
 
 import spadmnist
 import spadmnist.cli as command_line
-from spadmnist import capture_files, config, document, factory, measurement, report, twin
+from spadmnist import capture_files, config, document, factory, look, measurement, report, twin
 from spadmnist.cli import cli, main
 from spadmnist.criticism import compare
 from spadmnist.effects import Conditions
@@ -1153,17 +1153,17 @@ def lab(tmp_path: Path) -> Path:
 def test_a_look_counts_what_is_odd(lab: Path) -> None:
     opened = measurement.open(lab)
     recorded = opened.recording("tr flat")
-    row = measurement.look(opened, recorded.capture, recorded)
+    row = look.look(opened, recorded.capture, recorded)
     assert row["detections"] == recorded.totals.sum() and row["hot_pixels"] == 0 and row["dead_pixels"] == 0
     assert 50e-9 <= row["shortest_interval"] < 1e-6 and row["rate_max"] > row["rate_median"] > row["rate_min"]
     assert recorded.events is not None
-    found = np.concatenate(list(measurement.intervals(recorded.events)))
+    found = np.concatenate(list(look.intervals(recorded.events)))
     rows = [np.diff(recorded.events.times[a:b]) for a, b in itertools.pairwise(recorded.events.offsets)]
     assert np.allclose(found, np.concatenate(rows))
     odd = recorded.totals.copy()
     odd[3], odd[4] = 0, 20 * odd[4]
     recorded._kept["totals"] = odd
-    row = measurement.look(opened, recorded.capture, recorded)
+    row = look.look(opened, recorded.capture, recorded)
     assert (row["hot_pixels"], row["dead_pixels"], row["empty_pixels"]) == (1, 1, 1)
 
 

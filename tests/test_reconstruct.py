@@ -266,6 +266,27 @@ def test_large_batches_are_worked_out_in_pieces() -> None:
         assert sum(number for _, number in pieces) == saturated
 
 
+def test_no_more_is_worked_out_than_there_are_numbers() -> None:
+    """Few pixels with many detections each: no table up to the largest count; and the same as in a table."""
+    asked: list[int] = []
+
+    class Watched(type(reconstruct.find("counts")), abstract=True):  # type: ignore[misc]
+        def estimate(self, settings: Settings, counts: np.ndarray) -> np.ndarray:
+            asked.append(counts.size)
+            return np.asarray(super().estimate(settings, counts))
+
+    long = Settings(pdp=0.5, exposure=3.6e4, dead_time=50e-9, tick=1e-12, frames=50_000, frame_time=0.72)
+    counts = [0, 5, 10**6, 10**5]
+    values, _ = Watched().image(recorded(counts=counts), long)
+    assert values.tolist() == close([n / 1.8e4 for n in counts]) and max(asked) <= 4
+    small = list(range(40_000))
+    for name in ("counts", "passive_free_running", "qis_counts", "qis_linear"):
+        method = reconstruct.find(name)
+        apart = np.concatenate([method.image(recorded(small[i : i + 20_000], ones=small[i : i + 20_000]), long)[0]
+                                for i in (0, 20_000)])  # fmt: skip
+        assert np.array_equal(apart, method.image(recorded(small, ones=small), long)[0]), name
+
+
 # ---- the training median ----------------------------------------------------------------------------------
 
 

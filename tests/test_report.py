@@ -144,6 +144,22 @@ def test_what_was_not_recorded_is_none(tmp_path: Path, readouts: str, absent: st
     assert " - " in report.level_table(manifest)
 
 
+def test_the_mean_of_frames_is_that_of_frames_with_a_detection(tmp_path: Path) -> None:
+    """The mean count per pixel that papers state of QIS; with TR the mean is that of its detections."""
+    manifest = generated(tmp_path / "qis", readouts="[qis]", lux="[2560 mlux]")
+    (row, _), frames = report.level_rows(manifest), spadmnist.open(tmp_path / "qis")["2560 mlux", "train"].qis[:]
+    assert row["mean_per_pixel"] == pytest.approx(frames.sum(axis=1).mean(), rel=1e-12) and row["detections"] is None
+    both = generated(tmp_path / "both", readouts="[tr, qis]", lux="[2560 mlux]")
+    (row, _), events = report.level_rows(both), spadmnist.open(tmp_path / "both")["2560 mlux", "train"].tr[:]
+    assert row["mean_per_pixel"] == pytest.approx(events.counts.mean(), rel=1e-12)
+    assert row["mean_per_pixel"] > row["ones"] / row["pixels"]
+    for made, what in ((manifest, "ones"), (both, "detections")):
+        rows = report.level_rows(made)
+        mean = sum(row[what] for row in rows) / sum(row["pixels"] for row in rows)
+        line = next(x for x in report.level_table(made).splitlines() if x.startswith("2560 mlux"))
+        assert f" {mean:#.4g} " in line
+
+
 # --- the sheet ----------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,176 @@
+"""A first look at a capture: the numbers that `inspect` says of it, and whether it seems to have been interrupted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from . import units
+from .events import Events
+from .measurement import Measurement
+from .recording import Capture, Light, Recording
+
+_CHANCE = 1e-6  # a silence at the end is told where a constant rate leaves one as long less often
+_LONGER = 3  # times the longest silence inside, which the one at the end must exceed: light may come in bursts
+_FRAMES_AT_ONCE = 64  # from the end, to begin with
+
+
+def intervals(events: Events) -> Iterator[np.ndarray]:
+    """s between the detections of a pixel, in pieces."""
+    stamps = events.times if events.ticks is None else events.ticks
+    tick = events.tick or 1.0
+    piece = 1 << 20
+    for start in range(0, len(stamps) - 1, piece):
+        apart = np.diff(stamps[start : start + piece + 1])
+        inside = np.ones(len(apart), bool)
+        firsts = events.offsets[np.searchsorted(events.offsets, start + 1) :]
+        inside[firsts[firsts <= start + len(apart)] - start - 1] = False
+        yield apart[inside] * tick
+
+
+def look(measurement: Measurement, capture: Capture, recorded: Recording | None) -> dict[str, Any]:
+    """Numbers of a capture, for the table and the picture. recorded: its data, None where only the mean is known.
+
+    frames: of the readout, each of `binary_frames` frames of `frame_time` s (counts may be sums of them); None of TR.
+    live: s in which detections could be made; rates: 1/s of live time, as they are recorded. hot: pixels with more than
+    five times the median, beyond noise; dead: without a detection where the median pixel has 20 or more (None where
+    that cannot be told). shortest_interval: s, within a pixel (TR). ones_share: of a pixel's frames. notes: what is to
+    be known of the data, an interruption that shows in them among it.
+    """
+    c = capture.conditions
+    counted = capture.modality == "counts"
+    summed = c.largest_count if counted and c.counting == "frames" else 1
+    row: dict[str, Any] = {
+        "capture": capture.id,
+        "modality": capture.modality,
+        "light": light_text(capture.light),
+        "exposure": c.exposure,
+        "frames": None if capture.modality == "tr" else c.count_frames if counted else c.frames,
+        "binary_frames": None if capture.modality == "tr" else summed,
+        "frame_time": None if capture.modality == "tr" else c.frame_time,
+        "live": c.exposure if capture.modality == "tr" else c.frames * c.frame_time,
+        "pixels": measurement.layout.pixels,
+        "mean": capture.mean,
+        **dict.fromkeys(("detections", "rate_median", "rate_mean", "rate_min", "rate_max", "empty_pixels")),
+        **dict.fromkeys(("hot_pixels", "dead_pixels", "ones_share", "shortest_interval")),
+        "notes": list(measurement.notes.get(capture.id, [])),
+    }
+    frames = capture.modality in ("qis", "str")
+    if capture.mean is not None:
+        row |= {"rate_mean": capture.mean / row["live"], "ones_share": capture.mean / c.frames if frames else None}
+    if recorded is None:
+        return row
+    totals = recorded.totals
+    median = float(np.median(totals))
+    largest = 5 * median
+    rates = np.array([median, totals.mean(), totals.min(), totals.max()]) / row["live"]
+    row |= {
+        "mean": float(totals.mean()),
+        "detections": int(totals.sum()),
+        **dict(zip(("rate_median", "rate_mean", "rate_min", "rate_max"), map(float, rates), strict=True)),
+        "empty_pixels": int((totals == 0).sum()),
+        "hot_pixels": int((totals > largest + 5 * np.sqrt(largest) + 10).sum()),
+        "dead_pixels": int((totals == 0).sum()) if median >= 20 else None,
+    }
+    if frames:
+        row["ones_share"] = float(totals.mean() / c.frames)
+    if recorded.events is not None:
+        shortest = [float(piece.min()) for piece in intervals(recorded.events) if len(piece)]
+        row["shortest_interval"] = min(shortest, default=None)
+    interrupted = silence(recorded)
+    if interrupted is not None:
+        row["notes"].append(interrupted)
+    return row
+
+
+def light_text(lit: Light) -> str:
+    """What fell on the sensor, for people: `500 nm, 3 nW/cm^2`."""
+    if lit.wavelength is None:
+        return "dark"
+    unit = "lux" if lit.kind_of_level == "lux" else "W/m^2"
+    level = "level free" if lit.level is None else units.show(lit.level, unit)
+    return f"{units.show(lit.wavelength, 'm')}, {level}"
+
+
+# --- an interruption ----------------------------------------------------------------------------------------------
+
+
+def silence(recorded: Recording) -> str | None:
+    """A sentence without its full stop where the recording seems to have broken off before its end; None otherwise.
+
+    The silence behind the last detection of all pixels is longer than three times the longest one between two
+    detections, and less likely than 1e-6 under a constant rate: of N detections anywhere in [0, T) all lie before t
+    with the probability (t / T)^N. A time stamp lies anywhere in its tick. Of frames, those with a detection take the
+    place of the detections, and their numbers that of the time; frames are read from the end, and no further than they
+    are empty where that is nothing unusual.
+    """
+    return _silent_frames(recorded) if recorded.events is None else _silent_end(recorded, recorded.events)
+
+
+def _chance(count: int, last: float, end: float) -> float:
+    """Of so many moments anywhere in [0, end), how often all lie before `last`."""
+    return min(last / end, 1.0) ** count
+
+
+def _is_broken_off(quiet: float, moments: np.ndarray, width: float) -> bool:
+    """Is the silence at the end too long for the moments of the detections? Each moment lasts `width`."""
+    return quiet > _LONGER * (float(np.diff(moments).max(initial=0)) - width)
+
+
+def _silent_end(recorded: Recording, events: Events) -> str | None:
+    stamps, tick = (events.times, 1.0) if events.ticks is None else (events.ticks, float(events.tick or 1.0))
+    width = 0.0 if events.ticks is None else 1.0
+    exposure = recorded.conditions.exposure
+    end, count = exposure / tick, len(stamps)
+    last = float(stamps.max()) + width if count else 0.0
+    quiet = end - last
+    if count < 2 or _chance(count, last, end) >= _CHANCE or not _is_broken_off(quiet, np.unique(stamps), width):
+        return None
+    step = 10.0 ** (math.floor(math.log10(quiet * tick)) - 2)  # three digits of the silence
+    at = units.show(math.ceil(last * tick / step) * step, "s", 12)
+    return (
+        f"nothing was recorded in the last {units.show(quiet * tick, 's', 3)} of {units.show(exposure, 's')}; "
+        f'if the recording broke off at {at}, import it again with --exposure "{at}"'
+    )
+
+
+def _silent_frames(recorded: Recording) -> str | None:
+    end = recorded.n_frames
+    last = _behind_the_last_detection(recorded)
+    # the frames with a detection are no more than those before, nor than all detections
+    if last < 2 or _chance(last, last, end) >= _CHANCE or _chance(int(recorded.totals.sum()), last, end) >= _CHANCE:
+        return None
+    some = np.concatenate([_with_a_detection(recorded, part) for _, part in recorded.chunks()])
+    moments = np.flatnonzero(some)
+    if len(moments) < 2 or _chance(len(moments), last, end) >= _CHANCE:
+        return None
+    if not _is_broken_off(end - last, moments, 1.0):
+        return None
+    c = recorded.conditions
+    return (
+        f"nothing was recorded in the last {end - last:,} of {end:,} frames "
+        f"({units.show((end - last) * c.exposure / end, 's', 3)}); if the recording broke off there, import its first "
+        f"{last:,} frames alone"
+    )
+
+
+def _behind_the_last_detection(recorded: Recording) -> int:
+    """The number of the frame behind the last one with a detection; 0 without any. Read from the end."""
+    assert recorded.frames is not None
+    stop, step = recorded.n_frames, _FRAMES_AT_ONCE
+    while stop > 0:
+        start = max(0, stop - step)
+        some = np.flatnonzero(_with_a_detection(recorded, np.asarray(recorded.frames[start:stop])))
+        if len(some):
+            return start + int(some[-1]) + 1
+        stop, step = start, 2 * step
+    return 0
+
+
+def _with_a_detection(recorded: Recording, frames: np.ndarray) -> np.ndarray:
+    """(frames,) Has any pixel a detection?"""
+    seen = frames < recorded.none if recorded.modality == "str" else frames
+    return np.asarray(seen.reshape(len(frames), -1).any(axis=1))
