@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 
 from . import dataset as datasets
-from . import measurement as measurements
 from . import reconstruct, units
 from .dataset import Dataset, Part
 from .errors import SpadError
 from .events import Events
-from .measurement import Measurement
+from .measurement import Measurement, look
 from .readout import Frames
 from .recording import Capture, Recording
 
@@ -620,7 +619,7 @@ _PER_DECADE = 10  # bins of intervals
 
 @dataclass(frozen=True)
 class Look:
-    """What is shown of a capture. numbers: see `measurement.look`; the others only for a picture, of what was recorded.
+    """What is shown of a capture. numbers: see `look.look`; the others only for a picture, of what was recorded.
 
     totals: (pixels,) detections; intervals: (edges, s; counts) of TR; course: (time, s; ones or counts of a frame,
     their standard error) of frames.
@@ -638,7 +637,7 @@ def looks(measurement: Measurement, drawn: bool) -> list[Look]:
     found = []
     for i, capture in enumerate(measurement.captures):
         recorded = None if capture.mean is not None else measurement.recording(capture.id)
-        numbers = measurements.look(measurement, capture, recorded)
+        numbers = look.look(measurement, capture, recorded)
         if recorded is None or not drawn or i >= _MOST_CAPTURES:
             found.append(Look(capture, numbers))
         elif recorded.events is not None:
@@ -656,7 +655,7 @@ def _histogram_of_intervals(recorded: Recording) -> tuple[np.ndarray, np.ndarray
     # edges between ticks, so that each bin holds the whole ones it covers
     edges = np.unique(np.round(edges / tick)) * tick - tick / 2
     counts = np.zeros(len(edges) - 1, np.int64)
-    for piece in measurements.intervals(recorded.events):
+    for piece in look.intervals(recorded.events):
         counts += np.histogram(piece, edges)[0]
     return edges, counts
 

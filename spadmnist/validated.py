@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, PlainValidator, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from . import units
@@ -26,7 +26,6 @@ class Model(BaseModel):
         frozen=True,
         validate_default=True,
         allow_inf_nan=False,
-        arbitrary_types_allowed=True,
     )
 
 
@@ -43,7 +42,7 @@ def quantity(unit: str, zero: bool = False, most: float = math.inf) -> Any:
             raise ValueError(f"{value} is not possible; it must be {'at least' if zero else 'more than'} 0{upper}")
         return value
 
-    return BeforeValidator(read)
+    return PlainValidator(read)
 
 
 Time = Annotated[units.Quantity, quantity("s")]
@@ -88,7 +87,7 @@ class Reader:
         """
         for key in raw:
             if key not in kinds:
-                self.problems.append(f"{self.source.place((key,))} is not an entry here.{_allowed(key, kinds)}")
+                self._no_entry((key,), kinds)
         found = {}
         for name, kind in kinds.items():
             if name not in raw and name not in defaults:
@@ -102,7 +101,7 @@ class Reader:
     def valid(self, kind: Any, raw: Any, path: Path_) -> Any:
         """`raw` as pydantic's `kind`, or None after its mistakes were noted."""
         try:
-            return TypeAdapter(kind).validate_python(raw, strict=True, context=self.base)
+            return TypeAdapter(_whole(kind)).validate_python(raw, strict=True, context=self.base)
         except ValidationError as error:
             for item in error.errors():
                 self._note(item, kind, path)
@@ -114,13 +113,30 @@ class Reader:
         where = _follow(kind, item["loc"])
         self.problems.append(self._sentence(item, where, path))
         if item["type"].startswith("union_tag"):
-            self.valid(_whichever(where), item["input"], (*path, *where.path))
+            self._note_whichever(item["input"], where, (*path, *where.path))
+
+    def _note_whichever(self, raw: Mapping[Any, Any], where: _Place, path: Path_) -> None:
+        """What is wrong with a group whichever member of a union it is, for it does not say so."""
+        members = [member.model_fields for member in dict.fromkeys(where.members.values())]
+        for name, value in raw.items():
+            found = [fields[name] for fields in members if name in fields]
+            if not found:
+                self._no_entry((*path, name), where.fields)
+            elif name != where.discriminator and all(_declared(one) == _declared(found[0]) for one in found):
+                self.valid(found[0], value, (*path, name))
+        for name in where.fields:
+            needed = all(name in fields and fields[name].is_required() for fields in members)
+            if needed and name not in raw and name != where.discriminator:
+                self.say(path, self.missing(name))
+
+    def _no_entry(self, path: Path_, allowed: Iterable[str]) -> None:
+        self.problems.append(f"{self.source.place(path)} is not an entry here.{_allowed(path[-1], allowed)}")
 
     def _sentence(self, item: Any, where: _Place, path: Path_) -> str:
         full = (*path, *where.path)
         place, value, what = self.source.place(full), item.get("input"), item["type"]
         context, name = item.get("ctx", {}), str(full[-1]) if full else ""
-        if what == "extra_forbidden":
+        if what in ("extra_forbidden", "invalid_key"):
             if others := [tag for tag, member in where.members.items() if name in member.model_fields]:
                 which = where.discriminator
                 return (
@@ -204,23 +220,19 @@ def _plain(kind: Any) -> tuple[Any, str]:
             return kind, discriminator
 
 
+def _whole(kind: Any) -> Any:
+    """A type with what a model says of its entry."""
+    return Annotated[kind.annotation, kind] if isinstance(kind, FieldInfo) else kind
+
+
+def _declared(kind: FieldInfo) -> Any:
+    return kind.annotation, kind.metadata
+
+
 def _members(kind: Any, discriminator: str) -> dict[str, type[BaseModel]]:
     if not discriminator:
         return {}
     return {tag: one for one in get_args(kind) for tag in get_args(one.model_fields[discriminator].annotation)}
-
-
-def _whichever(where: _Place) -> type[BaseModel]:
-    """What all members of a union share, for a group that does not say which of them it is; the rest is not read."""
-    fields: dict[str, Any] = {}
-    for name in where.fields:
-        found = [member.model_fields.get(name) for member in where.members.values()]
-        first = found[0]
-        same = first and all(
-            one and (one.annotation, one.metadata) == (first.annotation, first.metadata) for one in found
-        )
-        fields[name] = (first.annotation, first) if first and same else (Any, None)
-    return create_model("Whichever", __base__=Model, **fields)
 
 
 # --- words --------------------------------------------------------------------------------------------------------
