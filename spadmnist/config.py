@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import io
 import os
 import re
@@ -15,13 +16,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from . import document, plugins, reconstruct, units
-from .document import Document
+from . import disk, document, plugins, reconstruct, units
+from .document import Document, Path_
 from .effects import Conditions, Effect, in_order
 from .errors import ConfigError, InputError, SpadError, did_you_mean
 from .events import Layout
@@ -31,47 +32,21 @@ from .readout import READOUTS, no_detection, unsigned_for
 from .reconstruct import Method
 from .section import LATER, Section
 from .sensor import Sensor
-
-Path_ = tuple[Any, ...]
-
-
-def _quantity(unit: str) -> Any:
-    return BeforeValidator(lambda value: units.parse(value, unit))
-
-
-def _positive(value: units.Quantity) -> units.Quantity:
-    if value <= 0:
-        raise ValueError(f"{value} is not possible; it must be more than 0")
-    return value
-
-
-def _at_most_all(value: units.Quantity) -> units.Quantity:
-    if not 0 < value <= 1:
-        raise ValueError(f"{value} is not possible; it must be more than 0 and at most 1 (100 %)")
-    return value
-
-
-_Q = units.Quantity
-_Time = Annotated[_Q, _quantity("s"), AfterValidator(_positive)]
-_Length = Annotated[_Q, _quantity("m"), AfterValidator(_positive)]
-_Area = Annotated[_Q, _quantity("m^2"), AfterValidator(_positive)]
-_Lux = Annotated[_Q, _quantity("lux"), AfterValidator(_positive)]
-_Irradiance = Annotated[_Q, _quantity("W/m^2"), AfterValidator(_positive)]
-_Share = Annotated[_Q, _quantity(""), AfterValidator(_at_most_all)]
+from .validated import Area, Irradiance, Length, Lux, Reader, Share, Time, brief
 
 
 class _Scene(Section):
     images: ImageSource
-    wavelength: _Length = Field(default="555 nm")  # type: ignore[assignment]
-    lux: list[_Lux] | None = Field(default=None, min_length=1)
-    irradiance: list[_Irradiance] | None = Field(default=None, min_length=1)
+    wavelength: Length = Field(default="555 nm")  # type: ignore[assignment]
+    lux: list[Lux] | None = Field(default=None, min_length=1)
+    irradiance: list[Irradiance] | None = Field(default=None, min_length=1)
 
 
 class _Recording(Section):
-    exposure: _Time
+    exposure: Time
     frames: int | None = Field(default=None, ge=1, le=10**9)
-    frame_time: _Time | None = None
-    frame_period: _Time | None = None
+    frame_time: Time | None = None
+    frame_period: Time | None = None
     readouts: list[Literal["tr", "str", "qis", "counts"]] = Field(default=["tr", "str", "qis"], min_length=1)
     bits: int | None = Field(default=None, ge=1, le=12)
     counting: Literal["frames", "counter"] | None = None
@@ -85,8 +60,8 @@ class _Layout(Section):
     rows: int | None = Field(default=None, ge=1, le=100_000)
     columns: int | None = Field(default=None, ge=1, le=100_000)
     positions: str | None = None  # a CSV file, instead of rows and columns
-    pixel_area: _Area
-    fill_factor: _Share = Field(default="1")  # type: ignore[assignment]
+    pixel_area: Area
+    fill_factor: Share = Field(default="1")  # type: ignore[assignment]
 
 
 class _Sensor(Section):
@@ -193,7 +168,7 @@ def build(
         output = raw.get("output")
         raw["output"] = {**(output if isinstance(output, Mapping) else {}), "format": format}
     reader = _Reader(source, base, [])
-    parts = reader.sections(raw)
+    parts = reader.sections(raw, _SECTIONS, _DEFAULTS)
     scene, recording = parts.get("scene"), parts.get("recording")
     levels = reader.levels(scene) if scene else ()
     conditions = reader.conditions(recording, scene) if recording else None
@@ -231,77 +206,10 @@ def _notes(scene: _Scene, source: Document) -> tuple[str, ...]:
     return ()
 
 
-@dataclass
-class _Reader:
-    """Reads the parts of one file; every mistake goes to `problems`, which several readers may share."""
+class _Reader(Reader):
+    """Reads the parts of one file, a config or a sensor."""
 
-    source: Document
-    base: Path
-    problems: list[str]
-
-    def say(self, path: Path_, sentence: str) -> None:
-        self.problems.append(f"{self.source.place(path)}: {sentence}")
-
-    # --- sections -------------------------------------------------------------------------------------------------
-
-    def sections(self, raw: Mapping[str, Any]) -> dict[str, Any]:
-        """The sections that are well formed."""
-        for key in raw:
-            if key not in _SECTIONS:
-                hint = did_you_mean(str(key), _SECTIONS)
-                self.problems.append(
-                    f"{self.source.place((key,))} is not an entry here.{hint} Allowed are {', '.join(_SECTIONS)}"
-                )
-        found = {}
-        for name, kind in _SECTIONS.items():
-            if name not in raw and name not in _DEFAULTS:
-                self.problems.append(f"{self.source.place(())}: {name} is missing; write for example {_EXAMPLES[name]}")
-                continue
-            value = self.valid(kind, raw.get(name, _DEFAULTS.get(name)), (name,))
-            if value is not None or (name in _DEFAULTS and raw.get(name) is None):
-                found[name] = value
-        return found
-
-    def valid(self, kind: Any, raw: Any, path: Path_) -> Any:
-        """`raw` as pydantic's `kind`, or None after its mistakes were noted."""
-        try:
-            return TypeAdapter(kind).validate_python(raw, strict=True)
-        except ValidationError as error:
-            for item in error.errors():
-                self.problems.append(self._sentence(item, kind, path))
-        except RecursionError:
-            self.say(path, "is nested too deeply")
-        return None
-
-    def _sentence(self, item: Any, kind: Any, path: Path_) -> str:
-        location = list(item["loc"])
-        fields = _fields_at(kind, location[:-1])
-        # pydantic names the member of a union in the path; the file does not
-        if path == ("scene",) and location[:1] == ["images"] and len(location) > 1:
-            del location[1]
-        full = (*path, *location)
-        place, value, what = self.source.place(full), item.get("input"), item["type"]
-        context = item.get("ctx", {})
-        if what == "extra_forbidden":
-            return (
-                f"{place} is not an entry here.{did_you_mean(str(location[-1]), fields)} "
-                f"Allowed are {', '.join(fields)}"
-            )
-        if what == "missing":
-            name = str(location[-1])
-            above = self.source.place(full[:-1])
-            example = f"; write for example {_EXAMPLES[name]}" if name in _EXAMPLES else ""
-            return f"{above}: {name} is missing{example}"
-        if what == "value_error":
-            return f"{place}: {context['error']}"
-        if what in ("literal_error", "union_tag_invalid"):
-            names = _literals(kind, list(item["loc"])) or list(_SOURCES)
-            given = context.get("tag", value)
-            where = f"{place}.source" if what == "union_tag_invalid" else place
-            return f"{where}: {_brief(given)} is not one of {', '.join(names)}.{did_you_mean(str(given), names)}"
-        if what == "union_tag_not_found":
-            return f"{place} needs a source: one of {', '.join(_SOURCES)}"
-        return f"{place}: {_brief(value)} is not possible; {_expected(what, context, fields)}"
+    examples: ClassVar[Mapping[str, str]] = _EXAMPLES
 
     # --- scene and recording --------------------------------------------------------------------------------------
 
@@ -419,7 +327,7 @@ class _Reader:
         wavelength: of the scene, m, where it is known: tables are looked up there.
         """
         if not isinstance(raw, Mapping):
-            self.say(path, f"{_brief(raw)} is neither a sensor file's name nor a sensor")
+            self.say(path, f"{brief(raw)} is neither a sensor file's name nor a sensor")
             return None
         model = self.valid(_Sensor, raw, path)
         whole = self.check_array(raw.get("layout"), (*path, "layout"))
@@ -450,7 +358,7 @@ class _Reader:
             example = f"{_EXAMPLES['rows']}, {_EXAMPLES['columns']}, or positions: FILE.csv (x, y in um)"
             self.say(path, f"rows is missing, and so is columns; write for example {example}")
         elif lacking:
-            self.say(path, f"{lacking[0]} is missing; write for example {_EXAMPLES[lacking[0]]}")
+            self.say(path, self.missing(lacking[0]))
         return not lacking
 
     def layout(self, model: _Layout, path: Path_) -> Layout | None:
@@ -459,7 +367,7 @@ class _Reader:
             assert model.rows is not None and model.columns is not None
             return Layout(model.rows, model.columns, area, share)
         try:
-            positions = read_positions((self.base / model.positions).resolve())
+            positions = read_positions(self.base / model.positions)
         except InputError as error:
             self.say((*path, "positions"), str(error))
             return None
@@ -473,7 +381,7 @@ class _Reader:
             return None
         values = {} if values is None else values
         if not isinstance(values, Mapping):
-            self.say(path, f"{_brief(values)} is not a group of parameters such as {{rate: 100 Hz}}")
+            self.say(path, f"{brief(values)} is not a group of parameters such as {{rate: 100 Hz}}")
             return None
         read: dict[str, Any] = {}
         before = len(self.problems)
@@ -566,63 +474,6 @@ class _Described:
             )
 
 
-# --- words --------------------------------------------------------------------------------------------------------
-
-_SOURCES = {one.model_fields["source"].default: one for one in get_args(get_args(ImageSource)[0])}
-
-
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _expected(what: str, context: Mapping[str, Any], fields: list[str]) -> str:
-    """What pydantic's kind of error asks for, in our words."""
-    if what in ("greater_than_equal", "greater_than", "less_than_equal", "less_than"):
-        bound = next(iter(context.values()))
-        words = {"greater_than_equal": "at least", "greater_than": "more than", "less_than_equal": "at most"}
-        return f"it must be {words.get(what, 'less than')} {bound}"
-    if what == "too_short":
-        return "it must have at least one entry"
-    names = {
-        "int": "a whole number",
-        "float": "a number",
-        "string": "text",
-        "bool": "true or false",
-        "list": "a list, [...]",
-    }
-    for kind, name in names.items():
-        if what.startswith(kind):
-            return f"it must be {name}"
-    if what.startswith(("model", "dict")):
-        return f"it must be a group of entries{f' ({chr(44).join(fields)})' if fields else ''}"
-    return "see the examples in configs/"
-
-
-def _model_at(kind: Any, location: list[Any]) -> Any:
-    current: Any = kind
-    for part in location:
-        info = getattr(current, "model_fields", {}).get(part)
-        if info is not None:
-            current = info.annotation
-        elif part in _SOURCES:
-            current = _SOURCES[part]
-    return current
-
-
-def _fields_at(kind: Any, location: list[Any]) -> list[str]:
-    """The entries that a part of the config may have."""
-    return list(getattr(_model_at(kind, location), "model_fields", {}))
-
-
-def _literals(kind: Any, location: list[Any]) -> list[str]:
-    """The words that may stand at a place."""
-    current = _model_at(kind, [part for part in location if not isinstance(part, int)])
-    while current is not None and not all(isinstance(word, str) for word in get_args(current) or [None]):
-        current = next(iter(get_args(current)), None)
-    return list(get_args(current))
-
-
 # --- positions ----------------------------------------------------------------------------------------------------
 
 _HEADERS = (["x", "y"], ["x(um)", "y(um)"])
@@ -648,7 +499,7 @@ def read_positions(path: Path) -> np.ndarray:
                 continue
             if not headed:
                 if [re.sub(r"\s", "", units.plain(cell)).lower() for cell in cells] not in _HEADERS:
-                    raise InputError(f"{place}: {_brief(','.join(cells))} is no header; the first line is x,y (in um)")
+                    raise InputError(f"{place}: {brief(','.join(cells))} is no header; the first line is x,y (in um)")
                 headed = True
                 continue
             if len(cells) != 2:
@@ -673,16 +524,18 @@ def read_positions(path: Path) -> np.ndarray:
 
 def _text_of(path: Path) -> str:
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: is no file; positions is the name of a CSV file")
-        with open(path, "rb") as file:
-            raw = file.read(_LARGEST_POSITIONS + 1)
+        raw = disk.read_file(os.path.realpath(path), _LARGEST_POSITIONS)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; the positions of the pixels are read from there") from None
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            most = f"{_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_PIXELS} pixels"
+            raise InputError(f"{path}: is larger than {most}") from None
+        if error.errno in (errno.EINVAL, errno.EISDIR):
+            raise InputError(f"{path}: is no file; positions is the name of a CSV file") from None
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    if len(raw) > _LARGEST_POSITIONS:
-        raise InputError(f"{path}: is larger than {_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_PIXELS} pixels")
+    except ValueError:
+        raise InputError(f"{brief(str(path))} is not the name of a file; positions names a CSV file") from None
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -694,8 +547,8 @@ def _micrometres(text: str, place: str) -> float:
     if not _NUMBER.fullmatch(text) or len(text) > 60:
         with contextlib.suppress(ValueError):
             if not np.isfinite(float(text)):
-                raise InputError(f"{place}: {_brief(text)} is not possible; every pixel needs a finite place")
-        raise InputError(f"{place}: {_brief(text)} is not a number; write x and y in um, as in 23.0,-11.5")
+                raise InputError(f"{place}: {brief(text)} is not possible; every pixel needs a finite place")
+        raise InputError(f"{place}: {brief(text)} is not a number; write x and y in um, as in 23.0,-11.5")
     value = float(Decimal(text).scaleb(-6)) + 0.0
     if abs(value) > _FARTHEST:
         raise InputError(f"{place}: {text} um is not possible; a pixel lies within {_FARTHEST:g} m of the middle")

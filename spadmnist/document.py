@@ -88,8 +88,19 @@ def read(path: Path) -> Document:
 
 def parse(text: str, name: str) -> Document:
     """Read YAML text; `name` stands for the file in errors."""
+    node = _compose(text, name)
+    document = Document(name, None)
+    problems: list[str] = []
+    if node is not None:
+        document.value = _value(node, (), document, problems, set())
+    if problems:
+        raise ConfigError(problems)
+    return document
+
+
+def _compose(text: str, name: str) -> Any:
     try:
-        node = yaml.compose(text, Loader=_Loader)
+        return yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f":{mark.line + 1}" if mark else ""
@@ -98,13 +109,6 @@ def parse(text: str, name: str) -> Document:
         raise ConfigError([f"{name}: is not well-formed YAML: {' '.join(str(error).split())}"]) from None
     except RecursionError:
         raise ConfigError([f"{name}: is nested too deeply"]) from None
-    document = Document(name, None)
-    problems: list[str] = []
-    if node is not None:
-        document.value = _value(node, (), document, problems, set())
-    if problems:
-        raise ConfigError(problems)
-    return document
 
 
 def _value(node: Any, path: Path_, document: Document, problems: list[str], seen: set[int]) -> Any:
@@ -222,3 +226,79 @@ def _escaped(character: str) -> str:
     if shown and code not in (0x2028, 0x2029, 0xFEFF):
         return character
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+# --- one entry more -----------------------------------------------------------------------------------------------
+
+_BREAK = "\r\n|[\r\n\x85\u2028\u2029]"
+_BREAK_BEFORE = re.compile(rf"({_BREAK})\Z")
+_REST_OF_LINE = re.compile(rf"[^\r\n\x85\u2028\u2029]*({_BREAK})?")
+
+
+def insert(text: str, path: Path_, after: Any, key: Any, value: Any, name: str = "the text") -> str:
+    """YAML text with one entry more; all else stays as it is: comments, order, quotes, ends of lines.
+
+    path: of a group of entries, as ("captures", 2). The entry `key: value` comes right behind the entry `after` of that
+    group, as the group is written: on a line of its own, or within the braces. Where `key` stands there with nothing
+    behind it, the value comes there. name: stands for the file in errors.
+
+    Raises ConfigError where the text is not well formed; InputError where it has no such group or no `after`, where
+    `key` has a value already, and where an entry cannot be put there in this way.
+    """
+    read, group = parse(text, name), _compose(text, name)
+    held = read.value
+    for part in path:
+        if part not in (range(len(held)) if isinstance(held, list) else held if isinstance(held, dict) else ()):
+            raise InputError(f"{read.place(path)} is not there; name a group of entries")
+        group = group.value[part] if isinstance(held, list) else _entries(group)[part][1]
+        held = held[part]
+    if not isinstance(held, dict) or after not in held:
+        raise InputError(f"{read.place(path)} has no entry {after}; name one that it has")
+    if held.get(key) is not None:
+        raise InputError(f"{read.place((*path, key))} has a value already, {_flow(held[key])}; take it out first")
+    made = _with_entry(text, group, after, key, _flow(value))
+    before = dict(held)
+    held.clear()
+    for other, one in before.items():
+        held[other] = value if other == key else one
+        if other == after and key not in before:
+            held[key] = value
+    try:
+        right = _flow(parse(made, name).value) == _flow(read.value)
+    except ConfigError:
+        right = False
+    if not right:
+        entry = f"{_text(key)}: {_flow(value)}"
+        raise InputError(f"{read.place(path)} is written so that nothing can be put behind {after}; add {entry} there")
+    return made
+
+
+def _with_entry(text: str, group: Any, after: Any, key: Any, value: str) -> str:
+    """In most ways that YAML has of writing a group; who calls must look at the result."""
+    entries = _entries(group)
+    if key in entries:
+        start, end = entries[key][1].start_mark.index, entries[key][1].end_mark.index
+        return f"{text[:start]}{'' if end > start else ' '}{value}{text[end:]}"
+    entry, at = f"{_text(key)}: {value}", _end(entries[after][1])
+    if group.flow_style:
+        return f"{text[:at]}, {entry}{text[at:]}"
+    entry = " " * min(group.start_mark.column, group.value[0][0].start_mark.column) + entry
+    if not _BREAK_BEFORE.search(text[:at]):  # a block of text ends with its line
+        rest = _REST_OF_LINE.match(text, at)
+        at = rest.end() if rest else at
+    if end_of_line := _BREAK_BEFORE.search(text[:at]):
+        return f"{text[:at]}{entry}{end_of_line[1]}{text[at:]}"
+    first = re.search(_BREAK, text)
+    return f"{text}{first[0] if first else chr(10)}{entry}"
+
+
+def _entries(group: Any) -> dict[Any, tuple[Any, Any]]:
+    return {_scalar(name, (), Document("", None), []): (name, held) for name, held in group.value}
+
+
+def _end(node: Any) -> int:
+    """Where the text of a value ends; a block of entries goes on up to what stands behind it."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(node, yaml.MappingNode) else last)
+    return int(node.end_mark.index)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -381,3 +383,175 @@ def test_empty_collections(value: dict[str, Any]) -> None:
 @pytest.mark.parametrize("key", [1, -1, 1.5, True, None])
 def test_a_key_that_is_no_text(key: Any) -> None:
     round_trip({key: "a", "b": {key: 1}})
+
+
+# --- one entry more -----------------------------------------------------------------------------------------------
+
+PLAN = """\
+# what is to be recorded
+name: 'lab'   # in quotes
+captures:
+  - id: dark      # the shutter is closed
+    # no lamp
+    light: {kind: dark}
+  -  id:
+       flat
+     light:
+        kind: flat    # the lamp
+
+        lux: 5 mlux   # at the sensor
+
+     note: |
+       two
+       lines
+
+  - {id: low, light: {kind: dark}}  # in braces
+  - {"id": high,  # with a comment
+     modality: tr}
+  - {modality: tr, id: last }
+  - file:   # to come
+    id: empty
+  - {file: , id: flow}
+  - {id: tilde, file: ~}
+"""
+FILE = ("file", "a.h5")
+
+
+@pytest.mark.parametrize(
+    ("path", "after", "entry", "old", "new"),
+    [
+        ((), "name", ("a b", 1), "# in quotes\n", "# in quotes\na b: 1\n"),
+        (("captures", 0), "id", FILE, "is closed\n", "is closed\n    file: a.h5\n"),
+        (("captures", 0), "light", FILE, "{kind: dark}\n  -  id", "{kind: dark}\n    file: a.h5\n  -  id"),
+        (("captures", 0, "light"), "kind", FILE, "{kind: dark}\n  -", "{kind: dark, file: a.h5}\n  -"),
+        (("captures", 1), "id", FILE, "flat\n     l", "flat\n     file: a.h5\n     l"),
+        (("captures", 1), "light", FILE, "# at the sensor\n", "# at the sensor\n     file: a.h5\n"),
+        (("captures", 1, "light"), "kind", FILE, "# the lamp\n", "# the lamp\n        file: a.h5\n"),
+        (("captures", 1), "note", FILE, "lines\n\n", "lines\n\n     file: a.h5\n"),
+        (("captures", 2), "id", FILE, "id: low,", "id: low, file: a.h5,"),
+        (("captures", 2), "light", FILE, "dark}}  #", "dark}, file: a.h5}  #"),
+        (("captures", 3), "id", FILE, "high,", "high, file: a.h5,"),
+        (("captures", 3), "modality", FILE, "modality: tr}\n  - {mod", "modality: tr, file: a.h5}\n  - {mod"),
+        (("captures", 4), "id", FILE, "last }", "last, file: a.h5 }"),
+        (("captures", 5), "id", FILE, "- file:   #", "- file: a.h5   #"),
+        (("captures", 6), "id", FILE, "{file: ,", "{file: a.h5 ,"),
+        (("captures", 7), "id", FILE, "file: ~", "file: a.h5"),
+        (("captures", 7), "id", ("mean", 2.5), "tilde,", "tilde, mean: 2.5,"),
+        (("captures", 0), "id", ("file", "no: 1 #"), "is closed\n", 'is closed\n    file: "no: 1 #"\n'),
+        (("captures", 2), "id", ("file", "a, b}"), "id: low,", 'id: low, file: "a, b}",'),
+        (("captures", 2), "id", ("x", {"y": [1, "2"]}), "id: low,", 'id: low, x: {y: [1, "2"]},'),
+    ],
+)
+@pytest.mark.parametrize("end_of_line", ["\n", "\r\n"])
+def test_an_entry_is_put_behind_another(
+    path: tuple[Any, ...], after: str, entry: tuple[str, Any], old: str, new: str, end_of_line: str
+) -> None:
+    """And nothing else changes: no comment, no quote, no end of a line."""
+    assert PLAN.count(old) == 1
+    text, expected = (t.replace("\n", end_of_line) for t in (PLAN, PLAN.replace(old, new)))
+    made = document.insert(text, path, after, *entry)
+    assert made == expected
+    value = value_of(made)
+    for part in path:
+        value = value[part]
+    assert value[entry[0]] == entry[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "after", "made"),
+    [
+        ("a: 1", "a", "a: 1\nfile: a.h5"),
+        ("a: 1  # x", "a", "a: 1  # x\nfile: a.h5"),
+        ("b: 2\r\na: 1", "a", "b: 2\r\na: 1\r\nfile: a.h5"),
+        ("\ufeffa: 1\n", "a", "\ufeffa: 1\nfile: a.h5\n"),
+        ("a:\nb: 2\n", "a", "a:\nfile: a.h5\nb: 2\n"),
+        ("a:\n- 1\n- - 2\n  - x: 3 # y\n# z\nb: 2\n", "a", "a:\n- 1\n- - 2\n  - x: 3 # y\nfile: a.h5\n# z\nb: 2\n"),
+        ("a: >-\n  x\nb: 2\n", "a", "a: >-\n  x\nfile: a.h5\nb: 2\n"),
+        ("a: 'x\n  y'  # z\nb: 2\n", "a", "a: 'x\n  y'  # z\nfile: a.h5\nb: 2\n"),
+        ("'a': \"x\"\n", "a", "'a': \"x\"\nfile: a.h5\n"),
+        ("--- {a: 1}\n...\n", "a", "--- {a: 1, file: a.h5}\n...\n"),
+        ("{a}\n", "a", "{a, file: a.h5}\n"),
+        ("{a: 1,}", "a", "{a: 1, file: a.h5,}"),
+        ("? a\n: 1\nb: 2\n", "a", "? a\n: 1\nfile: a.h5\nb: 2\n"),
+        ("&x\na: 1\n", "a", "&x\na: 1\nfile: a.h5\n"),
+        ("a: 1\nb: 2\nfile:\n", "a", "a: 1\nb: 2\nfile: a.h5\n"),
+        ("file:", "file", "file: a.h5"),
+        ("file: null # x\n", "file", "file: a.h5 # x\n"),
+    ],
+)
+def test_an_entry_is_put_into_texts_of_all_kinds(text: str, after: str, made: str) -> None:
+    assert document.insert(text, (), after, *FILE) == made
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "after", "says"),
+    [
+        ("a: {b: 1}\n", ("a",), "c", "plan.yaml:1: a has no entry c"),
+        ("a: {b: 1}\n", ("c",), "b", "plan.yaml:1: c is not there"),
+        ("a:\n- b: 1\n", ("a", 1), "b", "a[1] is not there"),
+        ("a:\n- b: 1\n", ("a", "x"), "b", "a.x is not there"),
+        ("a: 1\n", ("a",), "b", "a has no entry b"),
+        ("a: text\n", ("a", 0), "b", "a[0] is not there"),
+        ("", (), "a", "plan.yaml has no entry a"),
+        ("a: 1\nfile: b.h5\n", (), "a", "plan.yaml:2: file has a value already, b.h5; take it out"),
+        ("[a: 1]", (0,), "a", "so that nothing can be put behind a; add file: a.h5 there"),
+        ("a: |\n  x", (), "a", "so that nothing can be put behind a"),
+    ],
+)
+def test_where_no_entry_can_be_put(text: str, path: tuple[Any, ...], after: str, says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        document.insert(text, path, after, *FILE, "plan.yaml")
+    assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_no_entry_is_put_into_what_is_not_well_formed() -> None:
+    with pytest.raises(ConfigError, match=r"plan\.yaml:2: "):
+        document.insert("a: 1\nb: [1,", (), "a", *FILE, "plan.yaml")
+
+
+def groups(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], dict[Any, Any]]]:
+    if isinstance(value, dict):
+        yield path, value
+    for key, held in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield from groups(held, (*path, key))
+
+
+class Plain(yaml.SafeDumper):
+    """Writes what stands there twice twice."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+simple = st.text("ab:#-,{}'\" 1\u65e5", max_size=8)
+written = st.recursive(
+    simple | st.integers() | st.booleans() | st.none() | st.floats(allow_nan=False),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(simple, inner, max_size=3),
+    max_leaves=12,
+)
+styles = st.fixed_dictionaries(
+    {"default_flow_style": st.sampled_from([True, False, None]), "width": st.sampled_from([10, 80]),
+     "indent": st.sampled_from([2, 4])}
+)  # fmt: skip
+
+
+@given(st.dictionaries(simple, written, min_size=1, max_size=3), styles, simple | st.floats(), st.data())
+@settings(max_examples=150, deadline=None)
+def test_any_group_takes_an_entry(value: dict[str, Any], style: dict[str, Any], new: Any, data: st.DataObject) -> None:
+    """Written in blocks or braces, folded or not: the same text with a piece more, and the same value with an entry."""
+    text = yaml.dump(value, Dumper=Plain, allow_unicode=True, sort_keys=False, **style)
+    text = text.replace("\n", data.draw(st.sampled_from(["\n", "\r\n"])))
+    text = text.rstrip() if data.draw(st.booleans()) else text
+    read = value_of(text)
+    path, group = data.draw(st.sampled_from([(path, group) for path, group in groups(read) if group]))
+    after = data.draw(st.sampled_from(list(group)))
+    made = document.insert(text, path, after, "new", new)
+    before = list(group.items())
+    group.clear()
+    for key, held in before:
+        group[key] = held
+        if key == after:
+            group["new"] = new
+    assert same(value_of(made), read)
+    common = next((i for i, (a, b) in enumerate(zip(text, made, strict=False)) if a != b), len(text))
+    assert text[common:] == made[len(made) - len(text) + common :]

@@ -24,6 +24,7 @@ LAYERS = [
     {"import_options"},
     {"disk", "kernels"},
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
+    {"validated"},
     {"effects", "readout", "images", "pictures"},
     {"recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
@@ -134,7 +135,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),
         ("pooch", {"images.py", "image_files.py"}),
-        ("pydantic", {"config.py", "images.py", "section.py"}),
+        ("pydantic", {"validated.py", "config.py", "images.py", "section.py", "measurement/entries.py"}),
     ],
 )
 def test_a_library_has_its_place(package: str, owners: set[str]) -> None:

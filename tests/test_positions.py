@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -152,9 +153,21 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     folder_of(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "large.csv").write_bytes(b"x,y\n" + b"0" * (1 << 24))
-    for name, says in (("missing.csv", "no such file"), ("folder", "is no file"), ("large.csv", "larger than 16 MiB")):
+    os.mkfifo(tmp_path / "pipe.csv")  # who opens it for reading waits for a writer
+    (tmp_path / "loop.csv").symlink_to("loop.csv")
+    for name, says in (
+        ("missing.csv", "no such file"),
+        ("folder", "is no file"),
+        ("large.csv", "larger than 16 MiB"),
+        ("pipe.csv", "is no file"),
+        ("loop.csv", "cannot be read"),
+    ):
         with pytest.raises(InputError, match=f"{name}: .*{says}"):
             config.read_positions(tmp_path / name)
+    with pytest.raises(InputError, match="is not the name of a file"):
+        config.read_positions(tmp_path / "a\0.csv")
+    (tmp_path / "link.csv").symlink_to("places.csv")
+    assert len(config.read_positions(tmp_path / "link.csv")) == 5
 
 
 def test_at_most_so_many_pixels(tmp_path: Path) -> None:

@@ -1,0 +1,191 @@
+"""Writes a measurement: `measurement.yaml`, and a file for each recording."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import filecmp
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import capture_files, config, disk, document, units
+from ..errors import InputError, SpadError
+from ..events import Layout
+from ..recording import Capture, Recording
+from .entries import FILE, FORMAT
+
+
+def write(
+    path: str | Path,
+    name: str,
+    layout: Layout,
+    recordings: Iterable[Recording | Capture],
+    captures: Sequence[Capture] = (),
+) -> Path:
+    """Write a measurement: `measurement.yaml` and a file for each recording; its folder.
+
+    recordings: taken one after the other, so that they may be made as they are wanted; a `Capture` with a mean stands
+    for itself. captures: those of `recordings`, where they are known beforehand: then the place is looked at before the
+    first recording is asked for.
+
+    Every file appears by one rename, `measurement.yaml` last. A file that is there and has the same bytes stays; a
+    folder that holds anything else is refused. Raises SpadError where it cannot be written, and for a capture that
+    could not be opened again.
+    """
+    root = Path(path)
+    for capture in captures:
+        _check_counts(capture)
+    if root.exists() and not root.is_dir():
+        raise SpadError(f"{root} is a file; choose another place with -o")
+    with disk.writing(root, 0):
+        root.mkdir(parents=True, exist_ok=True)
+    with _alone(root):
+        _check_place(root, captures, layout)
+        disk.sweep(disk.temporary(root))
+        done: list[Capture] = []
+        for one in recordings:
+            done.append(one if isinstance(one, Capture) else one.capture)
+            _check_counts(done[-1])
+            if isinstance(one, Recording):
+                _commit_recording(root, _files(done)[-1], one)
+        if layout.positions is not None:
+            _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
+        _check_place(root, done, layout)
+        _commit(root, FILE, _yaml(name, layout, done).encode())
+        for folder in (disk.temporary(root), disk.temporary(root).parent):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+    return root
+
+
+_POSITIONS = "positions.csv"
+
+
+def _files(captures: Sequence[Capture]) -> list[str]:
+    """A file's name for each capture, made from its id; no two the same, whatever the file system thinks of case."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for capture in captures:
+        stem = re.sub(r"[^A-Za-z0-9.+-]+", "_", capture.id).strip("_.") or "capture"
+        name, n = f"{stem}.h5", 1
+        while name.lower() in taken:
+            n += 1
+            name = f"{stem}-{n}.h5"
+        taken.add(name.lower())
+        names.append(name)
+    return names
+
+
+@contextlib.contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Hold the folder for writing; the system lets go of it where the process is killed."""
+    with disk.writing(root, 0):
+        handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder") from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> None:
+    """Refuse a folder that holds anything but parts of this measurement. captures: all of them; none: not known yet."""
+    own = disk.temporary(root).parent
+    there = set(os.listdir(root)) - {FILE, own.name}
+    if own.is_dir():  # a dataset that was begun keeps more there
+        there |= {f"{own.name}/{name}" for name in os.listdir(own)} - {f"{own.name}/{disk.temporary(root).name}"}
+    if layout.positions is not None:
+        there.discard(_POSITIONS)
+    known = set(_files(captures))
+    strange = sorted(name for name in there if (name not in known if captures else not name.endswith(".h5")))
+    if strange:
+        raise SpadError(f"{root} is not empty (there is {strange[0]}); choose another folder with -o, or remove it")
+
+
+def _check_counts(capture: Capture) -> None:
+    """Raise InputError where a part of the exposure would be in no count: a count sums 2^bits - 1 binary frames."""
+    c = capture.conditions
+    if capture.modality == "counts" and c.counting == "frames" and c.frames % c.largest_count:
+        raise InputError(
+            f"{capture.id}: {c.frames} binary frames do not fill count frames of {c.bits} bits, each the sum of "
+            f"{c.largest_count}; take {c.count_frames * c.largest_count or c.largest_count}"
+        )
+
+
+def _commit(root: Path, name: str, data: bytes) -> None:
+    final = root / name
+    if final.exists():
+        if not final.is_file() or final.stat().st_size != len(data) or final.read_bytes() != data:
+            raise _another(final)
+        return
+    disk.commit_file(final, data, disk.temporary(root))
+
+
+def _commit_recording(root: Path, name: str, one: Recording) -> None:
+    """Like `_commit`, written piece by piece."""
+    final = root / name
+    with disk.writing(final, capture_files.size(one)), disk.workspace(disk.temporary(root)) as work:
+        new = work / name
+        with new.open("x+b") as file:
+            capture_files.write(one, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if not final.exists():
+            disk.install(new, final, work / "aside")
+        elif not final.is_file() or not filecmp.cmp(new, final, shallow=False):
+            raise _another(final)
+
+
+def _another(final: Path) -> SpadError:
+    return SpadError(
+        f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another folder "
+        f"with -o, or remove {final.parent}"
+    )
+
+
+def _yaml(name: str, layout: Layout, captures: Sequence[Capture]) -> str:
+    array: dict[str, Any] = {"rows": layout.rows, "columns": layout.columns}
+    if layout.positions is not None:
+        array = {"positions": _POSITIONS}
+    lines = document.dump({"format": FORMAT, "name": name, "layout": array}) + "captures:\n"
+    for capture, file in zip(captures, _files(captures), strict=True):
+        entry = document.dump(_entry(capture, file)).splitlines()
+        lines += "".join(f"{'    ' if i else '  - '}{line}\n" for i, line in enumerate(entry))
+    return lines
+
+
+def _entry(capture: Capture, file: str) -> dict[str, Any]:
+    lit, c = capture.light, capture.conditions
+    shown: dict[str, Any] = {"kind": "dark" if lit.dark else "flat"}
+    if lit.wavelength is not None:
+        shown["wavelength"] = _written(lit.wavelength, "m")
+        if lit.level is not None:
+            shown[lit.kind_of_level] = _written(lit.level, "lux" if lit.kind_of_level == "lux" else "W/m^2")
+    for key in ("relative_uncertainty", "own_uncertainty"):
+        if getattr(lit, key):
+            shown[key] = getattr(lit, key)
+    entry: dict[str, Any] = {"id": capture.id}
+    entry |= {"file": file} if capture.mean is None else {"mean": float(capture.mean)}
+    entry |= {"modality": capture.modality, "light": shown}
+    if capture.modality == "tr":
+        return entry | {"exposure": _written(c.exposure, "s")}
+    entry |= {"frames": c.frames}
+    entry |= {"frame_time": _written(c.frame_time, "s"), "frame_period": _written(c.frame_period, "s")}
+    if capture.modality == "counts" and capture.mean is not None:
+        entry |= {"bits": c.bits, "counting": c.counting}
+    return entry
+
+
+def _written(value: float, unit: str) -> str:
+    """The shortest text that is read back as exactly this number."""
+    for digits in (6, 9, 12, 15, 17):
+        text = units.show(value, unit, digits)
+        if "e" not in text.split()[0] and units.parse(text, unit) == value:
+            return text
+    return f"{value!r} {unit}"
