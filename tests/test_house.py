@@ -23,7 +23,7 @@ LAYERS = [
     {"errors", "heap", "units", "streams", "light"},
     {"disk", "kernels"},
     {"document", "plugins", "events", "image_files", "digits", "store"},
-    {"effects", "readout", "images"},
+    {"effects", "readout", "images", "window"},
     {"recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
