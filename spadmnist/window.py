@@ -62,17 +62,13 @@ class Window:
     @cached_property
     def pixels(self) -> np.ndarray:
         """(pixels,) the numbers on the chip of the window's pixels, in their order."""
-        return (
-            np.arange(np.prod(self.whole)).reshape(self.whole)[self.top : self.bottom, self.left : self.right].ravel()
-        )
+        number = np.arange(np.prod(self.whole)).reshape(self.whole)
+        return number[self.top : self.bottom, self.left : self.right].ravel()
 
     def within(self, outer: Window) -> Window:
         """The same part of the whole chip, where this one counts from the corner of another window."""
-        rows, columns = (
-            (self.top + outer.top, self.bottom + outer.top),
-            (self.left + outer.left, self.right + outer.left),
-        )
-        return Window(*rows, *columns, outer.whole)
+        down, right = outer.top, outer.left
+        return Window(self.top + down, self.bottom + down, self.left + right, self.right + right, outer.whole)
 
     # --- from the chip to the window
 

@@ -230,8 +230,9 @@ def test_a_hot_pixel_beside_the_window_causes_crosstalk_in_it(layout: Layout, ru
 def test_no_more_pixels_are_simulated_than_can_matter() -> None:
     """By the paper's rules one hop, by a device's two; a shared bus has all pixels, and shows in TR alone."""
     numbers = {}
+    effects = {"none": of("afterpulsing"), "near": of("crosstalk"), "bus": strongly("readout_loss")}
     for rules in ("paper", "device"):
-        for name, effect in {"none": None, "near": of("crosstalk"), "bus": strongly("readout_loss")}.items():
+        for name, effect in effects.items():
             whole = chip_with(effect, Layout(40, 40, 25e-12, 1.0), rules)
             window = Window.of((40, 40), slice(10, 20), slice(0, 10))
             for readout in ("tr", "qis"):
