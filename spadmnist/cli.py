@@ -20,6 +20,7 @@ import click
 
 if TYPE_CHECKING:
     from .factory import Progress
+    from .sensor import Sensor
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -71,11 +72,20 @@ def _json(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
 
 
+def _crop(command: F) -> F:
+    return click.option(
+        "--crop",
+        metavar="ROW:ROW,COLUMN:COLUMN",
+        help="The part of SENSOR that was measured, stops excluded, as 100:150,200:250: its own maps, cut.",
+    )(command)
+
+
 def _beside(command: F) -> F:
     """What every verb has that sets a model beside a measurement."""
     path = click.Path(path_type=Path)
     for part in (
         _plugin,
+        _crop,
         _jobs,
         click.option(
             "--seed",
@@ -374,10 +384,17 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
 @click.option(
     "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the draws.  [default: 0]"
 )
+@_crop
 @_plugin
 @_json
 def simulate(
-    sensor: Path, measurement: Path, output: Path, seed: int, plugin_files: tuple[Path, ...], as_json: bool
+    sensor: Path,
+    measurement: Path,
+    output: Path,
+    seed: int,
+    crop: str | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
 ) -> None:
     """Simulate the captures of MEASUREMENT as SENSOR (a sensor file, or a config) would have recorded them.
 
@@ -385,11 +402,11 @@ def simulate(
     spadmnist simulate sensor.yaml lab -o twin
     spadmnist inspect twin --plot twin.png
     """
-    from . import config, twin
     from . import measurement as library
+    from . import twin
 
     _load(plugin_files)
-    model = config.read_sensor(sensor)
+    model = _model(sensor, crop)
     opened = library.open(measurement, planned=True)
     with _terminal() as progress:
         twin.simulate(model, opened, output, seed, progress)
@@ -667,6 +684,7 @@ def compare(
     tolerance: str | None,
     seed: int,
     jobs: int | None,
+    crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
     """Set the model SENSOR beside MEASUREMENT: where does it fail, and by how much?
@@ -678,7 +696,6 @@ def compare(
     spadmnist compare sensor.yaml lab/2025-03-01 -o report
     spadmnist compare sensor.yaml lab/2025-03-01 --tolerance "0.5 %" --json answer.json
     """
-    from . import config as configs
     from . import measurement as measurements
     from . import units
     from .criticism import compare as criticism
@@ -693,7 +710,7 @@ def compare(
             raise InputError(f"--tolerance: {error}") from None
         if not 0 < smallest < 1:
             raise InputError(f'--tolerance: {tolerance} is not a share of more than 0 and less than 1, like "0.5 %"')
-    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    model, data = _model(sensor, crop), measurements.open(measurement)
     if output is not None:
         from . import pages
 
@@ -738,6 +755,7 @@ def diagnose(
     quick: bool,
     seed: int,
     jobs: int | None,
+    crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
     """Find out which effect the model SENSOR lacks beside MEASUREMENT, add it, and watch the error fall.
@@ -749,13 +767,12 @@ def diagnose(
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
     spadmnist diagnose sensor.yaml lab/2025-03-01 --plugin echo.py --json answer.json
     """
-    from . import config as configs
     from . import measurement as measurements
     from .criticism import answer, next_sensor
     from .criticism import diagnose as criticism
 
     _load(plugin_files)
-    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    model, data = _model(sensor, crop), measurements.open(measurement)
     if output is not None:
         from . import pages
 
@@ -765,7 +782,8 @@ def diagnose(
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
         with _writing(output):
-            found.file = str(next_sensor.write(sensor, output / "sensor.yaml", found.values, answer.notes(found)))
+            next_file, notes = output / "sensor.yaml", answer.notes(found)
+            found.file = str(next_sensor.write(sensor, next_file, found.values, notes, model.window))
         page = pages.diagnosis(found, output)
         _say(f"Report: {page}")
     _write_answer(json_file, answer.canonical(found))
@@ -788,6 +806,7 @@ def fit(
     json_file: Path | None,
     seed: int,
     jobs: int | None,
+    crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
     """Settle parameters of the model SENSOR against MEASUREMENT, with 95 % intervals.
@@ -796,20 +815,27 @@ def fit(
     spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml
     spadmnist fit sensor.yaml lab --free dead_time.duration --per-pixel detection.pdp -o next.yaml
     """
-    from . import config as configs
     from . import measurement as measurements
     from .criticism import answer, next_sensor
     from .criticism import fitted as criticism
 
     _load(plugin_files)
-    model, data = configs.read_sensor(sensor), measurements.open(measurement)
+    model, data = _model(sensor, crop), measurements.open(measurement)
     next_sensor.check_place(sensor, output)
     _check_answer(json_file)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
     with _writing(output):
-        found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found)))
+        found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found), model.window))
     _write_answer(json_file, answer.canonical(found))
     click.echo(answer.table(found))
+
+
+def _model(sensor: Path, crop: str | None) -> Sensor:
+    """The sensor of a file, or the part of it that was measured."""
+    from . import config, window
+
+    model = config.read_sensor(sensor)
+    return model if crop is None else model.cropped(*window.parse(crop))
 
 
 def _check_answer(file: Path | None) -> None:

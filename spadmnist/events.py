@@ -227,6 +227,14 @@ class Events:
         parent = None if self.parent is None else _shifted(self.parent[part], -offsets[0])
         return Events(times, offsets - offsets[0], self.pixels, ticks, self.tick, None, self.end, cause, parent)
 
+    def of_rows(self, rows: np.ndarray, pixels: int) -> Events:
+        """Some rows (ascending) alone, `pixels` of them to an image."""
+        among = np.zeros(len(self.offsets) - 1, bool)
+        among[rows] = True
+        kept = self.keep(np.repeat(among, self.counts))
+        offsets = np.concatenate([[0], np.cumsum(kept.counts[among])])
+        return Events(kept._times, offsets, pixels, kept.ticks, kept.tick, None, kept.end, kept.cause, kept.parent)
+
     def regrouped(self, pixels: int) -> Events:
         """The same rows with another number of them to an image."""
         return Events(self._times, self.offsets, pixels, self.ticks, self.tick, None, self.end, self.cause, self.parent)

@@ -8,7 +8,7 @@ beyond the paper's line, `kernels.paper_line` does the same, image by image, in 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,12 +24,14 @@ from .events import Children, Events, Layout
 from .plugins import blame, settle, source_file
 from .readout import Frames, Recorded, counts_type, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
+from .window import Window
 
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
 _GENERATIONS = 10_000
 _CHILDREN = 200  # times the events that they come from: more is a cascade without end
 _NONE = np.zeros(0)
 _NOBODY = np.zeros(0, np.int64)
+_HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more of them is left out
 
 
 @dataclass
@@ -37,6 +39,7 @@ class Sensor:
     """Layout, effects and chip seed. The effects' values may still be distributions and files; see `settled`.
 
     rules: `paper` or `device` (physics of the readouts: what fills traps, and what a frame sees).
+    chip, window: where this is a part of a chip (`cropped`), the whole of it, settled, and the part.
     """
 
     layout: Layout
@@ -45,20 +48,65 @@ class Sensor:
     chip_seed: int = 0
     name: str = ""
     _settled: bool = field(default=False, repr=False)
+    chip: Sensor | None = field(default=None, repr=False)
+    window: Window | None = None
 
     def settled(self) -> Sensor:
         """The same sensor with every map read and every distribution drawn. Raises InputError for a bad map."""
         if self._settled:
             return self
+        if self.chip is not None and self.window is not None:
+            own = {"rules": self.rules, "chip_seed": self.chip_seed, "name": self.name}
+            return self.chip.changed(effects=[self._on_chip(e) for e in self.effects], **own)._seen_in(self.window)
         effects = [
             type(effect)(**{name: self.settle(effect, name) for name in effect.parameters})
             for effect in in_order(self.effects)
         ]
-        sensor = Sensor(self.layout, effects, self.rules, self.chip_seed, self.name, True)
+        sensor = replace(self, effects=effects, _settled=True)
         for effect in effects:
             tick, origin = sensor._converter or (0.0, 0.0)
             self._call(effect, "made", Chip(self.layout, self.chip_seed, effect.name, tick, origin))
         return sensor
+
+    def changed(self, **fields: Any) -> Sensor:
+        """The same sensor, or the same part of it, with other `effects` or another `chip_seed`, settled."""
+        return replace(self, **fields, _settled=False).settled()
+
+    def cropped(self, rows: slice, columns: slice) -> Sensor:
+        """The part of the chip in these rows and columns, settled; of pixels that are listed one by one, of one row.
+
+        Its maps and what is drawn from `chip_seed` are the whole chip's, cut, and all its physics is that of the chip:
+        each effect is made for the whole array, sees the rates and events of the whole array, and knows of no window.
+        Light and parameters that are stated for the part alone go on beyond its edges, where the chip has none of its
+        own (`Window`). Exact are all rates, closed forms and effects that stay in their pixel. Of the pixels around
+        the part as many are simulated as can matter (`Effect.influence`; with a shared bus, all): by the paper's rules
+        that is exact, too; by a device's, what needs more than 2 hops from pixel to pixel to come into the part is left
+        out, about the cube of the chance of one. With the whole chip's rows and columns it is the sensor itself.
+
+        Raises InputError where the rows or columns are none, or reach beyond the sensor.
+        """
+        window = Window.of(self.layout.shape, rows, columns)
+        if window.shape == window.whole:
+            return self.settled()
+        chip = self.settled()
+        if chip.chip is not None and chip.window is not None:
+            return chip.chip._seen_in(window.within(chip.window))
+        return chip._seen_in(window)
+
+    def _seen_in(self, window: Window) -> Sensor:
+        """A part of this chip, which is settled."""
+        effects = [window.effect(effect) for effect in self.effects]
+        return replace(self, layout=window.layout(self.layout), effects=effects, chip=self, window=window)
+
+    def _on_chip(self, effect: Effect) -> Effect:
+        """An effect of the window with its values on the whole chip, which keeps its own elsewhere."""
+        assert self.chip is not None and self.window is not None
+        there = self.chip.effect(effect.name)
+        values = {
+            name: self.window.filled(declared, getattr(effect, name), getattr(there, name, None))
+            for name, declared in effect.parameters.items()
+        }
+        return type(effect)(**values)
 
     def settle(self, effect: Effect, name: str) -> Any:
         """The value of one parameter: a map is read, a distribution is drawn. Raises InputError for a bad map."""
@@ -92,6 +140,8 @@ class Sensor:
     @cached_property
     def dead_times(self) -> np.ndarray:
         """(pixels,) s during which a pixel is blind after a detection; 0 without a dead time."""
+        if self.chip is not None and self.window is not None:
+            return self.chip.dead_times[self.window.pixels]
         longest = np.zeros(self.layout.pixels)
         for effect in self.at("dead_time"):
             if not hasattr(effect, "blind_time"):
@@ -122,6 +172,8 @@ class Sensor:
         """
         if self._converter is not None:
             return self._converter[0]
+        if self.chip is not None:
+            return self.chip.tick
         none = np.zeros(0, np.uint64)
         probe = Events(np.zeros(0), np.zeros(1, np.int64), self.layout.pixels)
         for effect in self.at("timing"):
@@ -143,6 +195,10 @@ class Sensor:
 
     def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """(rate of all avalanches' seeds, the light's part), 1/s, from photons/s; each (images, pixels)."""
+        if self.chip is not None and self.window is not None:
+            # by this very rule: one that a subclass has set is upon what it finds here
+            there = Sensor.rates(self.chip, self.window.spread(photons), conditions)
+            return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate = photons
         for stage in ("light", "detection"):
             for effect in self.at(stage):
@@ -163,6 +219,9 @@ class Sensor:
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
+        if self.chip is not None and self.window is not None:
+            there = self.chip.expected(self.window.spread(photons), conditions)
+            return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate, light = self.rates(photons, conditions)
         dark = rate - light
         for effect in self.at("arrival"):
@@ -179,6 +238,26 @@ class Sensor:
             for effect in self.at(stage):
                 rate = effect.expected_rate(rate, conditions)
         return candidates * conditions.exposure, rate * conditions.exposure
+
+    def drawn(self, photons: np.ndarray, conditions: Conditions, readouts: Collection[str]) -> float:
+        """Expected candidates that `expose` has at once for such images, those around a part of a chip among them."""
+        if self.chip is None or self.window is None:
+            return float(self.expected(photons, conditions)[0].sum())
+        there, _ = self.chip.expected(self.window.spread(photons), conditions)
+        return float(there[:, self.chip._lively(self.window, readouts)].sum())
+
+    def _lively(self, window: Window, readouts: Collection[str]) -> np.ndarray:
+        """(pixels,) bool: which pixels of this chip must be simulated, lest a window of it lack what they do to it."""
+        far = {True: 0.0, False: 0.0}  # in a correlated effect's way, and in any other
+        for effect in self.effects:
+            if effect.stage == "readout" and not ("tr" in readouts and hasattr(effect, "apply")):
+                continue
+            reach = self._call(effect, "influence")
+            if not isinstance(reach, (int, float, np.floating)) or not reach >= 0:
+                raise _wrong(effect, f"influence must return pitches, not negative, or inf; it returns {reach!r}")
+            kind = effect.stage == "correlated"
+            far[kind] = max(far[kind], float(reach))
+        return window.around(self.layout, far[True] * (_HOPS if self.rules == "device" else 1) + far[False])
 
     # --- simulation ----------------------------------------------------------------------------------------------
 
@@ -208,16 +287,20 @@ class Sensor:
             )
         stamped = bool({"tr", "str"} & set(readouts))
         counter = "counts" in readouts and conditions.counting == "counter"
-        if self.is_paper_line and not (staged or causes or counter or (stamped and self.tick == 0)):
+        part = self.chip is not None
+        if self.is_paper_line and not (part or staged or causes or counter or (stamped and self.tick == 0)):
             return self._fused(photons, conditions, streams, readouts)
+        line = self.chip or self
         step = self.block
         if step == 1:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1] if photons.size else 0.0
-            step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + photons.shape[1]))))
-        parts = [
-            self._staged(photons[i : i + step], conditions, streams.of(streams.images[i : i + step]), readouts, causes)
-            for i in range(0, max(1, len(photons)), step)
-        ]
+            step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + line.layout.pixels))))
+        parts = []
+        for i in range(0, max(1, len(photons)), step):
+            some = slice(i, i + step)
+            light = photons[some] if self.window is None else self.window.spread(photons[some])
+            own = streams.of(streams.images[some])
+            parts.append(line._staged(light, conditions, own, readouts, causes, self.window))
         return Recorded.join(parts)
 
     @cached_property
@@ -271,7 +354,7 @@ class Sensor:
             stamps = Events(None, first_offsets, pixels, first, tick) if "str" in readouts else None
             frames = Frames(bits, stamps, conditions.frames, conditions.frame_time, pixels)
             waits = waited if "str" in readouts else None
-            tally = self._summed(bits, conditions) if "counts" in readouts else None
+            tally = self._summed(bits, conditions, None) if "counts" in readouts else None
             if not {"str", "qis"} & set(readouts):
                 return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, tally=tally)
             recorded = Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waits, tally)
@@ -284,9 +367,16 @@ class Sensor:
         streams: Streams,
         readouts: Collection[str],
         causes: bool,
+        window: Window | None,
     ) -> Recorded:
-        pixels = photons.shape[1]
-        events = self._gate(self._arrivals(photons, conditions, streams, causes), conditions)
+        """The line, stage by stage; of a window alone where there is one, for photons on the whole chip."""
+
+        def seen(events: Events) -> Events:
+            return events if window is None else events.of_rows(window.rows(len(photons)), len(window.pixels))
+
+        lively = None if window is None else self._lively(window, readouts)
+        pixels = photons.shape[1] if window is None else len(window.pixels)
+        events = self._gate(self._arrivals(photons, conditions, streams, causes, lively), conditions)
         candidates, parents = self._family(events, conditions, streams, causes)
         tr, frames, tally = None, None, None
         counter = "counts" in readouts and conditions.counting == "counter"
@@ -294,49 +384,63 @@ class Sensor:
             detected = self._fired(candidates, parents, conditions, streams, frames=False)
             detected.end = conditions.exposure
         if counter:
-            tally = self._counted(detected, conditions)
+            tally = self._counted(seen(detected), conditions, window)
         if "tr" in readouts:
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
                     if hasattr(effect, "apply"):
                         detected = self._apply(effect, detected, streams)
-            tr = self._narrow(detected, conditions.exposure, "TR stamps")
+            tr = self._narrow(seen(detected), conditions.exposure, "TR stamps")
         if {"str", "qis"} & set(readouts) or ("counts" in readouts and not counter):
             detected = self._fired(candidates, parents, conditions, streams, frames=True)
-            frames = self._frames(detected, conditions, streams, "str" in readouts)
+            frames = self._frames(seen(detected), conditions, streams, "str" in readouts, window)
             if "counts" in readouts and not counter:
-                tally = self._summed(frames.bits, conditions)
+                tally = self._summed(frames.bits, conditions, window)
             if not {"str", "qis"} & set(readouts):
                 frames = None
         return summarised(pixels, tr, frames, tally)
 
-    def _summed(self, bits: np.ndarray, conditions: Conditions) -> np.ndarray:
+    def _summed(self, bits: np.ndarray, conditions: Conditions, window: Window | None) -> np.ndarray:
         """(rows, count frames) sums of binary frames."""
         most = conditions.largest_count
         out = np.empty((len(bits), conditions.count_frames), counts_type(most))
         kernels.sums_of_frames(bits, most, out)
-        return self._limited(out)
+        return self._limited(out, window)
 
-    def _counted(self, events: Events, conditions: Conditions) -> np.ndarray:
+    def _counted(self, events: Events, conditions: Conditions, window: Window | None) -> np.ndarray:
         """(rows, frames) what a counter in each pixel has at the end of each frame."""
         most = conditions.largest_count
         out = np.zeros((len(events.offsets) - 1, conditions.frames), counts_type(most))
         clock = conditions.frame_time, conditions.frame_period
         kernels.counts_in_frames(events.times, events.offsets, *clock, most, out)
-        return self._limited(out)
+        return self._limited(out, window)
 
-    def _limited(self, counts: np.ndarray) -> np.ndarray:
-        for effect in self.at("readout"):
-            if hasattr(effect, "limit"):
-                after = self._call(effect, "limit", counts)
-                if not isinstance(after, np.ndarray) or (after.shape, after.dtype) != (counts.shape, counts.dtype):
-                    raise _wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}")
-                counts = after
-        return counts
+    def _limited(self, counts: np.ndarray, window: Window | None) -> np.ndarray:
+        limits = [effect for effect in self.at("readout") if hasattr(effect, "limit")]
+        if not limits:
+            return counts
+        if window is not None:
+            images = len(counts) // len(window.pixels)
+            whole = np.zeros((images * self.layout.pixels, counts.shape[1]), counts.dtype)
+            whole[window.rows(images)] = counts
+            counts = whole
+        for effect in limits:
+            after = self._call(effect, "limit", counts)
+            if not isinstance(after, np.ndarray) or (after.shape, after.dtype) != (counts.shape, counts.dtype):
+                raise _wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}")
+            counts = after
+        return counts if window is None else counts[window.rows(images)]
 
-    def _arrivals(self, photons: np.ndarray, conditions: Conditions, streams: Streams, causes: bool) -> Events:
-        """The Poisson draw; what is no constant rate is drawn at its maximum and thinned."""
+    def _arrivals(
+        self, photons: np.ndarray, conditions: Conditions, streams: Streams, causes: bool, lively: np.ndarray | None
+    ) -> Events:
+        """The Poisson draw; what is no constant rate is drawn at its maximum and thinned.
+
+        lively: (pixels,) bool, where anything happens at all; None: everywhere.
+        """
         rate, light = self.rates(photons, conditions)
+        if lively is not None:
+            rate, light = rate * lively, light * lively
         varying = self.at("arrival")
         drawn = rate
         # (what it is, its rate) of the parts that vary each in its own way
@@ -349,7 +453,8 @@ class Sensor:
                     good = added.shape in ((), rate.shape[1:]) and bool(np.all((added >= 0) & (added < np.inf)))
                     if not good:
                         raise _wrong(effect, f"added must return 1/s, one value or {rate.shape[1]}, not negative")
-                    parts.append((effect.name, np.broadcast_to(added, rate.shape)))
+                    own = np.broadcast_to(added, rate.shape)
+                    parts.append((effect.name, own if lively is None else own * lively))
                 else:
                     maxima[effect.acts_on] *= self._maximum(effect, conditions)
             drawn = np.zeros_like(rate)
@@ -591,7 +696,9 @@ class Sensor:
             low = np.where(reached, low, middle)
         return high
 
-    def _frames(self, events: Events, conditions: Conditions, streams: Streams, stamped: bool) -> Frames:
+    def _frames(
+        self, events: Events, conditions: Conditions, streams: Streams, stamped: bool, window: Window | None
+    ) -> Frames:
         pixels = events.pixels
         if events.cause is not None:
             # the first of each frame alone: then each has its bit and its stamp
@@ -611,8 +718,8 @@ class Sensor:
             first = Events(
                 stamps,
                 np.arange(len(stamps) + 1),
-                pixels,
-                row_pixel=rows.pixel,
+                self.layout.pixels,
+                row_pixel=rows.pixel if window is None else window.pixels[rows.pixel],
                 end=conditions.frame_time,
                 image_offsets=rows.image_offsets,
             )

@@ -114,6 +114,10 @@ _EXAMPLES = {
         # s from the end of the dead time, which the sensor adds; it also says which children really happen
         return Children(parent, rng.exponential(20e-9, len(parent)))
 
+    def influence(self):
+        # pitches up to which an event matters to other pixels: not at all
+        return 0.0
+
     def expected_rate(self, rate, conditions):
         """r = (1 + probability) rate."""
         return rate * (1 + self.probability)
@@ -152,6 +156,10 @@ _EXAMPLES = {
     def apply(self, events, rng):
         # events: the detections of some images, row after row; rng: a numpy Generator of the effect's own
         return events.keep(rng.random(len(events)) >= self.loss)
+
+    def influence(self):
+        # pitches up to which an event matters to other pixels: not at all
+        return 0.0
 
     def expected_rate(self, rate, conditions):
         """r = (1 - loss) rate."""

@@ -379,6 +379,24 @@ def _edge_cases(trial: _Trial) -> None:
             _sound(_expose(sensor, photons, conditions), sensor, conditions, what)
 
 
+def _influence(trial: _Trial) -> str | None:
+    """No event fires a pixel that lies farther away than the effect says. What a readout shares does not show here."""
+    if trial.kind.stage != "correlated":
+        return "its events fire no others"
+    sensor = trial.sensor("device")
+    effect = sensor.effect(trial.kind.name)
+    assert effect is not None
+    _, photons, conditions = list(_lights(sensor, max(3, sensor.block)))[2]
+    events = _expose(sensor, photons, conditions, readouts=("tr",), causes=True).tr
+    assert events is not None and events.cause is not None and events.parent is not None
+    fired = np.flatnonzero((events.cause == sensor.causes.index(effect.cause)) & (events.parent >= 0))
+    places = sensor.layout.places[events.pixel]
+    far = float(np.hypot(*(places[fired] - places[events.parent[fired]]).T).max(initial=0.0))
+    said = effect.influence()
+    assert far <= said * (1 + 1e-3), f"an event fires a pixel {far:.3g} pitches away, but influence() is {said:g}"
+    return None
+
+
 def _expected_rate(trial: _Trial) -> str | None:
     """Seen without a dead time or traps of other effects, whose closed forms know nothing of this one.
 
@@ -429,6 +447,7 @@ _CHECKS: tuple[Callable[[_Trial], str | None], ...] = (
     _invariants,
     _same_stream_same_result,
     _edge_cases,
+    _influence,
     _expected_rate,
     _moves,
 )

@@ -69,7 +69,7 @@ def model_recordings(
     if not wanted:
         return []
     brightest = flux[[int(np.argmax(flux.mean(axis=1)))]]
-    events = float(sensor.expected(brightest, capture.conditions)[0].sum())
+    events = sensor.drawn(brightest, capture.conditions, (capture.modality,))
     large = events > _AT_ONCE or (direct and capture.modality == "qis")
     if large and (whole := _in_parts(sensor, capture, events)):
         return [whole(flux[i], streams.of(images[i : i + 1]), told) for i in range(wanted)]

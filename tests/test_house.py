@@ -25,7 +25,7 @@ LAYERS = [
     {"disk", "kernels"},
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
     {"validated"},
-    {"effects", "readout", "images", "pictures"},
+    {"effects", "readout", "images", "pictures", "window"},
     {"recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},

@@ -122,12 +122,14 @@ class Diagnosis:
     file: str | None = None
     simulations: int = 0
     dark: list[str] = field(default_factory=list)  # captures without light
+    crop: str | None = None  # the part of the sensor that was measured: rows, columns
 
     def as_data(self) -> dict[str, Any]:
         """As `formats`: spadmnist-diagnosis/1."""
         return {
             "format": "spadmnist-diagnosis/1",
             "verdict": self.verdict,
+            **({"crop": self.crop} if self.crop else {}),
             "misfit": {"before": plain(self.before), "after": plain(self.after)},
             "misfit_null_95": plain(self.null_95),
             "nuisances": self.nuisances,
@@ -274,7 +276,8 @@ def notes(found: Diagnosis) -> dict[Key, str]:
             if v.low is not None and v.high is not None:
                 ends = [units.show(x, v.unit) if v.unit else f"{x:.4g}" for x in (v.low, v.high)]
                 parts.append(f"{name} {ends[0]} to {ends[1]} (95 %)")
-        text = f"from {found.measurement}, {today}" + (f": {', '.join(parts)}" if parts else "")
+        part = f" of rows and columns {found.crop}" if found.crop else ""
+        text = f"from {found.measurement}{part}, {today}" + (f": {', '.join(parts)}" if parts else "")
         keys = [key for key in found.values if key[0] == step.change.effect]
         for key in keys:
             out[key] = text

@@ -139,12 +139,12 @@ def with_values(sensor: Sensor, values: Values) -> Sensor:
         effects.append(type(effect)(**{**own, **given.pop(effect.name, {})}))
     for name, own in given.items():
         effects.append(Effect.registry.find(name)(**own))
-    return Sensor(sensor.layout, effects, sensor.rules, sensor.chip_seed, sensor.name).settled()
+    return sensor.changed(effects=effects)
 
 
 def on_chip(sensor: Sensor, seed: int) -> Sensor:
     """The sensor as another chip of its kind: what chance decides for each pixel falls otherwise."""
-    return Sensor(sensor.layout, sensor.effects, sensor.rules, seed, sensor.name).settled()
+    return sensor.changed(chip_seed=seed)
 
 
 def chancy(sensor: Sensor) -> bool:

@@ -92,6 +92,7 @@ class Comparison:
     replicates: int
     tolerance: float | None = None
     false_alarm_rate: float = FALSE_ALARM
+    crop: str | None = None  # the part of the sensor that was measured: rows, columns
 
     @property
     def failing(self) -> list[Check]:
@@ -108,6 +109,7 @@ class Comparison:
             "false_alarm_rate": self.false_alarm_rate,
             "replicates": self.replicates,
             "tolerance": self.tolerance,
+            **({"crop": self.crop} if self.crop else {}),
             "nuisances": [
                 {
                     "capture": n.capture,
@@ -230,6 +232,7 @@ def compare(
         tuple(checks),
         replicates,
         tolerance,
+        crop=str(sensor.window) if sensor.window else None,
     )
 
 

@@ -154,6 +154,7 @@ def _diagnosed(
         None,
         bench.simulations,
         bench.dark,
+        str(bench.start.window) if bench.start.window else None,
     )
 
 

@@ -84,6 +84,7 @@ def fitted(
             None,
             bench.simulations,
             bench.dark,
+            str(bench.start.window) if bench.start.window else None,
         )
 
 

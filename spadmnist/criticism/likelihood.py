@@ -97,6 +97,7 @@ def _idle(effect: Effect) -> bool:
 
 def blur_of(sensor: Sensor) -> float | None:
     """s, by which jitter widens an interval (1 sigma): found by stamping a few events. None: it is not normal."""
+    sensor = sensor.chip or sensor  # effects are made for the whole of a chip
     pixels = sensor.layout.pixels
     each = -(-_PROBES // pixels)
     offsets = np.arange(pixels + 1, dtype=np.int64) * each

@@ -36,9 +36,11 @@ def name_of(sensor: Sensor, capture: Capture, *more: Any) -> str:
         digest.update(path.read_bytes())
     for _, text in sorted(plugins.loaded_files().items()):
         digest.update(text.encode())
-    places = None if sensor.layout.positions is None else sensor.layout.positions.tobytes()
-    digest.update(repr((sensor.layout, places, sensor.rules, sensor.chip_seed, capture, more)).encode())
-    for effect in sensor.effects:
+    # of a part of a chip the whole of it, whose other pixels may matter, and which part
+    chip = sensor.chip or sensor
+    places = None if chip.layout.positions is None else chip.layout.positions.tobytes()
+    digest.update(repr((chip.layout, places, chip.rules, chip.chip_seed, sensor.window, capture, more)).encode())
+    for effect in chip.effects:
         digest.update(effect.name.encode())
         for name in effect.parameters:
             value = getattr(effect, name)

@@ -14,6 +14,7 @@ import numpy as np
 from .. import config, disk, document, units
 from ..effects import Effect
 from ..errors import InputError, SpadError
+from ..window import Window
 from .candidates import Key
 
 Notes = Mapping[Key, str]
@@ -44,17 +45,22 @@ def _is_ours(file: Path) -> bool:
     return disk.read_file(file, 1 << 24).decode(errors="replace").startswith(_OURS)
 
 
-def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes) -> Path:
+def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, window: Window | None = None) -> Path:
     """Write `out` beside its maps; source: the sensor file that was diagnosed. Returns `out`.
 
-    values: (effect, parameter) -> number, switch or map; notes: what stands behind a line, as a comment.
+    values: (effect, parameter) -> number, switch or map; notes: what stands behind a line, as a comment. window: the
+    part of the sensor that maps are of; elsewhere they are as `source` has them, or at their median where it does not.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     text = source.read_text(encoding="utf-8-sig")
-    shape = config.read_sensor(source).layout.shape
+    chip = config.read_sensor(source)
+    shape = chip.layout.shape
     written: dict[Key, str] = {}
     for (effect, parameter), value in values.items():
         if isinstance(value, np.ndarray):
+            if window is not None:
+                declared = Effect.registry.find(effect).parameters[parameter]
+                value = window.filled(declared, value, getattr(chip.effect(effect), parameter, None))
             # with the file's own name, lest it takes the place of a map that another sensor beside it has
             name = f"{out.stem}.{effect}.{parameter}.npy"
             map_ = io.BytesIO()

@@ -10,7 +10,7 @@ import functools
 import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -85,7 +85,7 @@ def still(sensor: Sensor) -> Sensor:
     if not names:
         return sensor
     rest = [effect for effect in sensor.effects if effect.name not in names]
-    return Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name).settled()
+    return sensor.changed(effects=rest)
 
 
 class InTheDark(Sensor):
@@ -98,8 +98,8 @@ class InTheDark(Sensor):
     @staticmethod
     def of(sensor: Sensor) -> Sensor:
         """The same sensor, in the dark."""
-        s = sensor
-        return InTheDark(s.layout, s.effects, s.rules, s.chip_seed, s.name, True)
+        own = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
+        return InTheDark(**own | {"chip": None if sensor.chip is None else InTheDark.of(sensor.chip)})
 
     def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """The dark rates times the factors that stand for photons."""

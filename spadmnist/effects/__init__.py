@@ -27,12 +27,13 @@ the class, a `spadmnist.streams.Draws` for the counter-based kernels.
 
 Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
 it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
-of its mean; an arrival effect gets the part of the rate that it acts on.
+of its mean; an arrival effect gets the part of the rate that it acts on. And `influence()`, how far its events reach.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -164,6 +165,15 @@ class Effect(Plugin, abstract=True):
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """Mean rate behind this effect (1/s) from that before it; for planning. Default: unchanged."""
         return rate
+
+    def influence(self) -> float:
+        """Pitches up to which what happens in one pixel may change what others record; inf: the whole array.
+
+        Where a part of a chip is looked at (`Sensor.cropped`), so many pixels around it are simulated with it. What is
+        less than the truth leaves out what comes from farther away; what is more costs time. Default: inf for
+        correlated events and for a readout, which pixels may share, otherwise 0.
+        """
+        return math.inf if self.stage in ("correlated", "readout") else 0.0
 
 
 def in_order(effects: list[Effect]) -> list[Effect]:

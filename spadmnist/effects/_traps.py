@@ -32,6 +32,10 @@ class Traps(Effect, stage="correlated", abstract=True):
         parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key)
         return Children(parent, self.lifetime * delay)
 
+    def influence(self) -> float:
+        """A trap fires its own pixel alone."""
+        return 0.0
+
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """rate (1 + probability)."""
         return rate * (1 + np.asarray(self.probability))

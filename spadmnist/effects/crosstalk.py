@@ -93,6 +93,10 @@ class Crosstalk(Effect, stage="correlated"):
         )
         return Children(parent, self.delay * delay, row)
 
+    def influence(self) -> float:
+        """Pitches to the farthest neighbours that are hit."""
+        return float(self.reach) if self.probability else 0.0
+
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """rate (1 + probabilities of all neighbours), averaged over the array."""
         # averaged over the array: a pixel at its edge has fewer neighbours

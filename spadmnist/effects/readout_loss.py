@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .. import kernels
@@ -42,6 +44,10 @@ class ReadoutLoss(Effect, stage="readout"):
         if self.service_time == 0:
             return events
         return events.keep(_served(events.times, events.image_offsets, self.service_time, self.queue))
+
+    def influence(self) -> float:
+        """All pixels share the bus: those around a window load it, too."""
+        return math.inf if self.service_time else 0.0
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """A bound, nearly reached far below and far above the bus's capacity: an image has no more than that."""

@@ -106,8 +106,15 @@ class Measurement:
         """Raise InputError where a sensor has other pixels."""
         mine = self.layout
         if layout.shape != mine.shape:
+            part = ""
+            if mine.rows <= layout.rows and mine.columns <= layout.columns:
+                part = (
+                    f", or, where a part of the sensor was measured, say which: --crop 0:{mine.rows},0:{mine.columns} "
+                    "if it begins at the first row and column (its corner must be put right)"
+                )
             raise InputError(
-                f"{self.source}: layout has {_size(mine)} pixels, but the sensor {_size(layout)}; correct one of them"
+                f"{self.source}: layout has {_size(mine)} pixels, but the sensor {_size(layout)}; correct one of "
+                f"them{part}"
             )
         theirs = layout.positions
         if mine.positions is not None and theirs is not None and not np.allclose(theirs, mine.positions, 0, 1e-9):

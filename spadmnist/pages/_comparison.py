@@ -224,7 +224,8 @@ td.lowish, .key.lowish { background: #f3f6e4; }
 
 <h2>What was compared</h2>
 <dl class="facts">
-<dt>model</dt><dd>{{ found.sensor or "a sensor without a name" }}</dd>
+<dt>model</dt><dd>{{ found.sensor or "a sensor without a name" }}\
+{% if found.crop %}, its rows and columns {{ found.crop }} (places count from the first of them){% endif %}</dd>
 <dt>measurement</dt><dd>{{ found.measurement }}</dd>
 <dt>captures</dt><dd>{{ captures | length }}{% if captures %}: {{ captures[:40] | join(", ") }}\
 {{ ", ..." if captures | length > 40 }}{% endif %}</dd>

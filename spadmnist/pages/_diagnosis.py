@@ -333,7 +333,9 @@ chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 10
 <b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.\
 {% elif found.steps and found.before <= found.null_95 %} It was as low before: a mean over everything hardly \
 shows what is faint in each statistic, or what only a few of them tell.{% endif %}</p>
-<p class="small">{{ found.sensor or "A sensor without a name" }} beside {{ found.measurement }}\
+<p class="small">{{ found.sensor or "A sensor without a name" }}\
+{% if found.crop %}, its rows and columns {{ found.crop }} (places count from the first of them),{% endif %} \
+beside {{ found.measurement }}\
 {% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
 beside this page: <b>{{ next }}</b>{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
