@@ -28,6 +28,7 @@ from typing import IO, Any
 import numpy as np
 
 from . import units
+from .effects import Conditions
 from .errors import InputError, SpadError
 from .events import Events, Layout
 from .kernels import jit
@@ -295,19 +296,31 @@ def _found_counts(file: Any, frames: Any, capture: Capture, path: Path) -> _Foun
             f"{path}: its counts have {bits} bits of a {counting}, but the capture {capture.id} says {c.bits} bits of "
             f"a {c.counting}; correct one of them"
         )
-    each = (1 << bits) - 1 if counting == "frames" else 1
-    if each > 1 and c.frames == frames.shape[0]:
-        # the capture counts the frames of the file
-        clock = replace(c, frames=c.frames * each, frame_time=c.frame_time / each, frame_period=c.frame_period / each)
-    elif c.frames == frames.shape[0] * each:
-        clock = c
-    else:
+    clock = clock_of_counts(c, frames.shape[0], int(bits), str(counting))
+    if clock is None:
+        each = (1 << bits) - 1 if counting == "frames" else 1
         both = f" or, as binary frames, {frames.shape[0] * each:,}" if each > 1 else ""
         raise InputError(
             f"{path}: holds {frames.shape[0]:,} frames, but the capture {capture.id} says {c.frames:,}; "
             f"write {frames.shape[0]:,}{both}"
         )
-    return _Found(replace(capture, conditions=replace(clock, bits=int(bits), counting=str(counting))))
+    return _Found(replace(capture, conditions=clock))
+
+
+def clock_of_counts(stated: Conditions, held: int, bits: int, counting: str) -> Conditions | None:
+    """The clock of the binary frames of count frames; None where the capture states another number than the file holds.
+
+    stated: the clock of the binary frames that the counts sum, or that of the count frames; held: count frames of the
+    file.
+    """
+    each = (1 << bits) - 1 if counting == "frames" else 1
+    clock = stated
+    if each > 1 and stated.frames == held:
+        times = {name: getattr(stated, name) / each for name in ("frame_time", "frame_period")}
+        clock = replace(stated, frames=held * each, **times)
+    elif stated.frames != held * each:
+        return None
+    return replace(clock, bits=bits, counting=counting)
 
 
 # --- reading ------------------------------------------------------------------------------------------------------

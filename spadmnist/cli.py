@@ -517,15 +517,27 @@ def _import_option(name: str, declared: Any, about: str) -> click.Option:
     metavar="LIGHT",
     help='What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2". Once for all files, or once for each.',
 )
+@click.option(
+    "--capture", "ids", multiple=True, metavar="ID", help="Of a plan: the capture that a file is, once for each file."
+)
 @_json
 def import_(
-    files: tuple[Path, ...], output: Path | None, name: str | None, lights: tuple[str, ...], as_json: bool, **given: Any
+    files: tuple[Path, ...],
+    output: Path | None,
+    name: str | None,
+    lights: tuple[str, ...],
+    ids: tuple[str, ...],
+    as_json: bool,
+    **given: Any,
 ) -> None:
     """Make a measurement of FILES, each a capture that is named as its file.
 
     The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
     NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits; counts with --bits),
     CSV of pixel and time. What no file says is asked for. Times are written with their unit: --exposure "100 ms".
+
+    Where MEASUREMENT is a plan, a measurement.yaml whose captures have no files yet, FILES become its captures: by
+    name, by --capture, or in order. Light, clock and pixels are then the plan's, and a contradiction is an error.
 
     \b
     spadmnist import t2.ptu -o lab --light free
@@ -541,16 +553,19 @@ def import_(
     said = Said.of(**given)
     shone = [light(text, said.relative_uncertainty) for text in lights]
     with _terminal() as progress:
-        made = import_files(files, output, said, shone, name, progress)
+        made = import_files(files, output, said, shone, name, progress, ids)
     if as_json:
         captures = [one.as_data() for one in made.took]
-        click.echo(json.dumps({"measurement": str(made.folder), "captures": captures, "notes": made.notes}))
+        told = {"measurement": str(made.folder), "captures": captures, "notes": made.notes, "missing": made.missing}
+        click.echo(json.dumps(told))
     else:
         for one in made.took:
             click.echo(one.text())
     for note in made.notes:
         _say(f"Note: {note}.")
-    if not as_json:
+    if made.missing:
+        _say(f"Still missing: {', '.join(made.missing)}. Next:  spadmnist import FILE -o {made.folder}")
+    elif not as_json:
         _say(f"Made: {made.folder}. Look at it:  spadmnist inspect {made.folder}")
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from . import __version__, capture_files, disk
 from .errors import SpadError
 from .factory import Progress
-from .importers.captures import safe_name
+from .importers.names import safe_name
 from .measurement import Measurement
 from .recording import Recording
 

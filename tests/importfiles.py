@@ -228,3 +228,12 @@ def made_of(sample: Sample, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     sample.make(folder / sample.name)
     return folder / sample.name
+
+
+def refusal_of(call: Any, *arguments: Any, **named: Any) -> str:
+    """The one sentence with which a call is refused."""
+    with pytest.raises(SpadError) as caught:
+        call(*arguments, **named)
+    text = str(caught.value)
+    assert "\n" not in text and len(text) < 600
+    return text

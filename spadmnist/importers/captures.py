@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .. import config, measurement, units
+from .. import config, look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
-from ..import_options import options, without_effect, word
+from ..import_options import without_effect, word
 from ..recording import Capture, Light, Recording
-from . import FACTS, Found, Said, ask, pixels, recognise, stacks
+from . import FACTS, Format, Found, Said, ask, pixels, plan, recognise, stacks
+from .names import safe_name
 from .pixels import Channels
 
 
@@ -96,12 +96,16 @@ class Took:
 
 @dataclass(frozen=True)
 class Imported:
-    """What was made of some files: the folder, the captures in their order, and what is to be known of the files."""
+    """What was made of some files: the folder, the captures in their order, and what is to be known of the files.
+
+    missing: captures of a plan that have yet to be recorded.
+    """
 
     folder: Path
     captures: tuple[Capture, ...]
     notes: tuple[str, ...]
     took: tuple[Took, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 _MOST_COUNTED = 12  # pixels whose detections are listed one by one
@@ -114,8 +118,12 @@ def import_files(
     lights: Sequence[Light] = (),
     name: str | None = None,
     progress: Progress | None = None,
+    ids: Sequence[str] = (),
 ) -> Imported:
     """Make a measurement of files, a capture each. lights: one for all files, or one for each, in their order.
+
+    Where `out` is a plan (see `plan`), the files are its captures: those named by `ids`, one for each file, else those
+    called as the files are, else those that are missing, in order.
 
     The files are read twice, so that one at a time is in memory: first to know the pixels and to ask for what is
     missing, then to be written. Raises InputError with a sentence.
@@ -124,65 +132,46 @@ def import_files(
         raise SpadError(f"--light: {len(lights)} for {len(files)} files; give it once, or once for each file in order")
     if said.relative_uncertainty is not None and lights and all(lit.level is None for lit in lights):
         raise SpadError("--relative-uncertainty: belongs to a light with a level, as in 500 nm 5 nW/cm^2; leave it out")
-    kinds = [recognise(path) for path in files]
-    _check_options(files, said, [(kind, kind.modalities, None) for kind in kinds])
-    sizes = [path.stat().st_size for path in files]
+    planned = plan.read(out)
+    if planned is None and ids:
+        raise SpadError(f"--capture: {out} is no plan with captures that are missing; leave out --capture")
     progress = progress or Progress()
-    progress.start("importing", 2.0 * sum(sizes), 0.0)
-    captures: list[Capture] = []
+    ones = _matched(files, said, planned, lights, name, ids)
+    _check_options([(one.path, one.kind, one.kind.modalities, None) for one in ones], said)
+    progress.start("importing", 2.0 * sum(one.size for one in ones), 0.0)
     notes: list[str] = []
     shapes: list[tuple[int, int]] = []
-    channels, found, held = Channels(), Found(), []
-    for i, (path, kind) in enumerate(zip(files, kinds, strict=True)):
-        found = kind.read(path, said)
-        modality = stacks.modality(path, found, said)
-        held.append((kind, (modality,), found.packed))
-        lit = lights[min(i, len(lights) - 1)] if lights else None
-        captures.append(_capture(path, found, said, modality, lit, captures))
-        notes += [f"{path}: {note}" for note in (*found.notes, *stacks.axes_note(found, said))]
-        shape = _shape(path, found, said)
+    channels = Channels()
+    for one in ones:
+        found = one.read()
+        one.capture = _capture(one, found, said, planned, [other.capture for other in ones if other.capture])
+        notes += [f"{one.path}: {note}" for note in (*found.notes, *stacks.axes_note(found, one.said))]
+        shape = _shape(one.path, found, one.said)
         if shape is not None:
             shapes.append(shape)
             if shape != shapes[0]:
-                raise InputError(f"{path}: has {_by(shape)} pixels, others {_by(shapes[0])}; import it by itself")
+                raise InputError(f"{one.path}: has {_by(shape)} pixels, others {_by(shapes[0])}; import it by itself")
         if found.channel is not None:
-            channels.add(path, found)
-        progress.advance(sizes[i], path.name)
-    _check_options(files, said, held)
+            channels.add(one.path, found)
+        one.found = found if len(ones) == 1 else None
+        progress.advance(one.size, one.path.name)
+    _check_options([(one.path, one.kind, (one.made.modality,), one.packed) for one in ones], said)
     places = None if said.positions is None else config.read_positions(said.positions)
+    if planned is not None:
+        places = planned.layout.positions
     array = pixels.array(files[0], said, shapes, channels, places)
     if array.channels is not None and array.channels != tuple(range(array.layout.pixels)):
         several = len(array.channels) > 1
         are = "s {} are the pixels, in this order" if several else " {} is the pixel"
         notes.append(f"the channel{are.format(channels.called(array.channels))}")
     took: list[Took] = []
-
-    def recordings() -> Iterator[Recording]:
-        for path, kind, size, capture in zip(files, kinds, sizes, captures, strict=True):
-
-            def told(share: float, size: int = size, name: str = path.name) -> None:
-                progress.advance(size * share, name)
-
-            again = found if len(files) == 1 else kind.read(path, said)
-            sources = _sources(again, said, capture)
-            if again.frames is None:
-                placed = pixels.events(path, again, said, capture, array, channels)
-                yield placed.recording
-                told(1.0)
-                notes.extend(f"{path}: {note}" for note in placed.notes)
-                totals = placed.recording.totals
-                few = tuple(map(int, totals)) if len(totals) <= _MOST_COUNTED else None
-                left_out = (*again.left_out, *placed.left_out)
-                count, tick = int(totals.sum()), placed.recording.tick
-            else:
-                made, seen = stacks.recording(path, again, said, capture, array.layout)
-                yield made.watched(told)
-                notes.extend(f"{path}: {note}" for note in seen.notes())
-                few, left_out, count, tick = None, again.left_out, seen.detections, made.tick
-            took.append(Took(path, kind.about, capture, array.layout.shape, count, few, tick, sources, left_out))
-
+    captures = [one.made for one in ones]
+    recordings = _recordings(ones, said, array, channels, progress, took, notes)
+    if planned is not None:
+        measurement.fill(planned, recordings)
+        return Imported(out, tuple(captures), tuple(notes), tuple(took), measurement.open(out, planned=True).missing)
     default = files[0].stem if len(files) == 1 else out.resolve().name
-    measurement.write(out, name or safe_name(default), array.layout, recordings(), captures)
+    measurement.write(out, name or safe_name(default), array.layout, recordings, captures)
     if said.relative_uncertainty is None and (levels := [lit for lit in lights if lit.level is not None]):
         share = levels[0].relative_uncertainty
         notes.append(
@@ -191,35 +180,120 @@ def import_files(
     return Imported(out, tuple(captures), tuple(notes), tuple(took))
 
 
-def _check_options(files: Sequence[Path], said: Said, held: Sequence[tuple[Any, Sequence[str], bool | None]]) -> None:
+@dataclass
+class _One:
+    """A file on its way to be a capture.
+
+    said: what the user says, and what the plan says where there is one; light: as the command line says it, target: the
+    capture of the plan. capture, packed: known when the file has been read once. found: kept where it is the only file.
+    """
+
+    path: Path
+    kind: type[Format]
+    said: Said
+    light: Light | None = None
+    target: Capture | None = None
+    capture: Capture | None = None
+    packed: bool = False
+    found: Found | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return self.path.stat().st_size
+
+    @property
+    def made(self) -> Capture:
+        """The capture that the file is."""
+        assert self.capture is not None
+        return self.capture
+
+    def read(self) -> Found:
+        """What the file holds."""
+        if self.found is not None:
+            return self.found
+        found = self.kind.read(self.path, self.said)
+        self.packed = found.packed
+        return found
+
+
+def _matched(
+    files: Sequence[Path],
+    said: Said,
+    planned: measurement.Measurement | None,
+    lights: Sequence[Light],
+    name: str | None,
+    ids: Sequence[str],
+) -> list[_One]:
+    """Each file with its kind, its light, and its capture of the plan."""
+    kinds = [recognise(path) for path in files]
+    if planned is None:
+        lit = [lights[min(i, len(lights) - 1)] if lights else None for i in range(len(files))]
+        return [_One(*one) for one in zip(files, kinds, [said] * len(files), lit, strict=True)]
+    plan.check_lights(planned, lights, name)
+    targets = plan.match(planned, files, ids)
+    return [
+        _One(path, kind, plan.said_with(said, planned, target), target.light, target)
+        for path, kind, target in zip(files, kinds, targets, strict=True)
+    ]
+
+
+def _recordings(
+    ones: Sequence[_One],
+    said: Said,
+    array: pixels.Array,
+    channels: Channels,
+    progress: Progress,
+    took: list[Took],
+    notes: list[str],
+) -> Iterator[Recording]:
+    """The data of each file. What was taken of it, and what is to be known, is added to `took` and `notes`."""
+    for one in ones:
+
+        def told(share: float, size: int = one.size, name: str = one.path.name) -> None:
+            progress.advance(size * share, name)
+
+        found, shape = one.read(), array.layout.shape
+        if found.frames is None:
+            placed = pixels.events(one.path, found, one.said, one.made, array, channels)
+            made, more = placed.recording, tuple(placed.notes)
+            yield made
+            told(1.0)
+            count, left_out = int(made.totals.sum()), (*found.left_out, *placed.left_out)
+        else:
+            made, seen = stacks.recording(one.path, found, one.said, one.made, array.layout)
+            yield made.watched(told)
+            count, left_out, more = seen.detections, found.left_out, tuple(seen.notes())
+        broken_off = look.silence(made)
+        notes.extend(f"{one.path}: {note}" for note in (*more, *([broken_off] if broken_off else [])))
+        few = None
+        if made.events is not None and array.layout.pixels <= _MOST_COUNTED:
+            few = tuple(map(int, made.totals))
+        sources = _sources(found, said, one)
+        took.append(Took(one.path, one.kind.about, one.made, shape, count, few, made.tick, sources, left_out))
+
+
+def _check_options(held: Sequence[tuple[Path, type[Format], Sequence[str], bool | None]], said: Said) -> None:
     """Raise SpadError for an option that has an effect on none of the files.
 
     held: of each file its kind, what it holds or may hold, and whether its frames are packed bits.
     """
     for name in said.given:
         alone = replace(Said(), **{name: getattr(said, name)})
-        reasons = [without_effect(alone, kind, modalities, packed) for kind, modalities, packed in held]
+        reasons = [without_effect(alone, kind, modalities, packed) for _, kind, modalities, packed in held]
         if all(reasons):
-            raise SpadError(f"{files[0]}: {reasons[0]}")
+            raise SpadError(f"{held[0][0]}: {reasons[0]}")
 
 
-def _sources(found: Found, said: Said, capture: Capture) -> dict[str, str]:
+def _sources(found: Found, said: Said, one: _One) -> dict[str, str]:
     """Where tick, exposure, times of frames and the shape come from."""
     sources = dict(found.sources)
     for name in ("tick", "exposure", "frame_time", "frame_period", "rows", "columns"):
         if getattr(said, name) is not None and not (name == "tick" and "tick" in sources):
             sources[name] = word(name)
-    return {name: where for name, where in sources.items() if name in (*FACTS, *options())}
-
-
-def safe_name(text: str, taken: Sequence[str] = ()) -> str:
-    """A name for a capture and its file, unlike those that are taken, whatever the file system thinks of case."""
-    stem = name = re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_.")[:80] or "capture"
-    n = 1
-    while name.lower() in {one.lower() for one in taken}:
-        n += 1
-        name = f"{stem}-{n}"
-    return name
+        elif one.target is not None and getattr(one.said, name) is not None:
+            sources[name] = "the plan"
+    return sources
 
 
 def _by(shape: Sequence[int]) -> str:
@@ -230,6 +304,22 @@ def _by(shape: Sequence[int]) -> str:
 
 
 def _capture(
+    one: _One, found: Found, said: Said, planned: measurement.Measurement | None, before: Sequence[Capture]
+) -> Capture:
+    """The capture that a file is: as the plan says, where there is one."""
+    if planned is not None and one.target is not None:
+        plan.check(found, one.path, said, planned, one.target)
+        modality = stacks.modality(one.path, found, one.said)
+        if modality == "counts" and not one.said.bits and "bits" not in found.facts:
+            raise ask(one.path, ["bits"])
+        if found.facts.get("tick", one.said.tick) is None and modality in ("tr", "str"):
+            raise ask(one.path, ["tick"])
+        return replace(one.target, conditions=plan.clock(found, one.path, one.said, planned, one.target))
+    modality = stacks.modality(one.path, found, one.said)
+    return _described(one.path, found, one.said, modality, one.light, before)
+
+
+def _described(
     path: Path, found: Found, said: Said, modality: str, lit: Light | None, before: Sequence[Capture]
 ) -> Capture:
     """What the user says, else what the file says, else a question."""
@@ -237,15 +327,23 @@ def _capture(
     known = {**found.facts, **told}
     if said.tick is not None and found.facts.get("tick", said.tick) != said.tick:
         raise InputError(f"{path}: has ticks of {units.show(found.facts['tick'], 's')}; leave out --tick")
+    for key in ("rows", "columns", "bits"):
+        if getattr(said, key) is not None and found.facts.get(key, getattr(said, key)) != getattr(said, key):
+            raise InputError(f"{path}: says that its {key} are {found.facts[key]}; leave out {word(key)}")
+    if said.counting == "frames" and found.facts.get("counter"):
+        raise InputError(f"{path}: says that its counts are those of a counter; leave out --counting")
     missing = ["exposure"] if modality == "tr" else ["frame_time", "frame_period"]
     missing += {"tr": ["tick"], "str": ["tick"], "counts": ["bits"]}.get(modality, [])
     missing = [key for key in missing if key not in known]
+    described = lit is None  # by the file
     if lit is None and "relative_uncertainty" in found.facts:
         kind = "lux" if "lux" in known else "irradiance"
-        uncertain = known["relative_uncertainty"], known.get("own_uncertainty", 0.0)
+        uncertain = found.facts["relative_uncertainty"], known.get("own_uncertainty", 0.0)
         lit = Light(known.get("wavelength"), known.get(kind), kind, *uncertain)
     if missing or lit is None:
         raise ask(path, missing + ["light"] * (lit is None))
+    if said.relative_uncertainty is not None and lit.level is None and described:
+        raise InputError(f"{path}: --relative-uncertainty belongs to a light with a level; leave it out")
     if said.relative_uncertainty is not None and lit.level is not None:
         lit = replace(lit, relative_uncertainty=said.relative_uncertainty)
     if found.frames is None:

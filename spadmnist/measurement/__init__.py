@@ -10,8 +10,8 @@ from __future__ import annotations
 from .entries import FILE, FORMAT
 from .reader import is_measurement, open
 from .type import Measurement
-from .writer import write
+from .writer import fill, write
 
 open_measurement = open  # its name in the package
 
-__all__ = ["FILE", "FORMAT", "Measurement", "is_measurement", "open", "open_measurement", "write"]
+__all__ = ["FILE", "FORMAT", "Measurement", "fill", "is_measurement", "open", "open_measurement", "write"]

@@ -71,6 +71,11 @@ class Measurement:
         pairs = zip(self.captures, self._paths, strict=False)
         return tuple(c.id for c, path in pairs if c.mean is None and not (path and os.path.exists(path)))
 
+    def file_name(self, id: str) -> str | None:
+        """The name of a capture's file in the folder, as the YAML says it; None where it says none."""
+        path = self._paths[self._index(id)] if self._paths else None
+        return None if path is None or self.folder is None else path.relative_to(self.folder).as_posix()
+
     def recording(self, id: str, of: Sensor | Layout | None = None, dead_time: float = 0.0) -> Recording:
         """The data of a capture. of: the sensor, or its layout and nominal dead time (s), for statistics to know.
 

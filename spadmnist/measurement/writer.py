@@ -16,6 +16,7 @@ from ..errors import InputError, SpadError
 from ..events import Layout
 from ..recording import Capture, Recording
 from .entries import FILE, FORMAT
+from .type import Measurement
 
 
 def write(
@@ -55,10 +56,53 @@ def write(
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
         _check_place(root, done, layout)
         _commit(root, FILE, _yaml(name, layout, done).encode())
-        for folder in (disk.temporary(root), disk.temporary(root).parent):
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        _clear(root)
     return root
+
+
+def fill(plan: Measurement, recordings: Iterable[Recording]) -> None:
+    """Write captures of a plan: a file for each recording, which the plan's YAML then names; all else in it stays.
+
+    Each file appears by one rename, then its name in the YAML: what is there stays whole, whenever the run ends. Raises
+    SpadError where something cannot be written, and where the file of a capture is there with other data.
+    """
+    root, described = plan.folder, plan.file
+    assert root is not None and described is not None
+    ids, names = [capture.id for capture in plan.captures], _files_of_plan(plan)
+    with _alone(root):
+        disk.sweep(disk.temporary(root))
+        for one in recordings:
+            index = ids.index(one.capture.id)
+            _check_counts(one.capture)
+            disk.inside(root, names[index])
+            _commit_recording(root, names[index], one)
+            if plan.file_name(one.capture.id) is None:
+                text = described.read_bytes().decode()
+                new = document.insert(text, ("captures", index), "id", "file", names[index], str(described))
+                disk.commit_file(described, new.encode(), disk.temporary(root))
+        _clear(root)
+
+
+def _files_of_plan(plan: Measurement) -> list[str]:
+    """The file's name of each capture: as the plan says, else made of its id; no two the same."""
+    said = [plan.file_name(capture.id) for capture in plan.captures]
+    taken = {name.lower() for name in said if name is not None}
+    names = []
+    for name, made in zip(said, _files(plan.captures), strict=True):
+        stem, n = made.removesuffix(".h5"), 1
+        while name is None and made.lower() in taken:
+            n += 1
+            made = f"{stem}-{n}.h5"
+        names.append(made if name is None else name)
+        taken.add(names[-1].lower())
+    return names
+
+
+def _clear(root: Path) -> None:
+    """Remove the folders of temporary files, where they are empty."""
+    for folder in (disk.temporary(root), disk.temporary(root).parent):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 _POSITIONS = "positions.csv"
@@ -131,7 +175,7 @@ def _commit_recording(root: Path, name: str, one: Recording) -> None:
     """Like `_commit`, written piece by piece."""
     final = root / name
     with disk.writing(final, capture_files.size(one)), disk.workspace(disk.temporary(root)) as work:
-        new = work / name
+        new = work / final.name
         with new.open("x+b") as file:
             capture_files.write(one, file)
             file.flush()
