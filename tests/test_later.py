@@ -169,7 +169,7 @@ class Tinted(images.Uniform):
 
     source: Literal["tinted"] = "tinted"  # type: ignore[assignment]
     tint: Annotated[int, LATER] = 0
-    fade: Annotated[config._Time, LATER] = Field(default="5 ns")  # type: ignore[assignment]
+    fade: Annotated[config.Time, LATER] = Field(default="5 ns")  # type: ignore[assignment]
     words: Annotated[list[str], LATER] = Field(default_factory=lambda: ["warm"])
     note: Annotated[str | None, LATER] = None
     old: int = 7

@@ -331,8 +331,8 @@ def test_levels_share_a_folder_where_they_are_one(one: tuple[tuple[str, str], st
 @pytest.mark.parametrize("sign", ["u", *MICRO], ids=ascii)
 def test_light_on_the_command_line(sign: str) -> None:
     assert importers.light(f"500 nm 1.5 {sign}W/cm^2") == importers.light(f"0.5 {sign}m 1.5{sign}W/cm^2")
-    assert importers.light(f"500 nm 1.5 {sign}W/cm^2") == Light(500e-9, 0.015, "irradiance")
-    assert importers.light(f"5 {sign}lux") == Light(555e-9, 5e-6, "lux")
+    assert importers.light(f"500 nm 1.5 {sign}W/cm^2") == Light(500e-9, 0.015, "irradiance", 0.05)
+    assert importers.light(f"5 {sign}lux") == Light(555e-9, 5e-6, "lux", 0.05)
 
 
 @pytest.mark.parametrize("sign", ["u", *MICRO], ids=ascii)
