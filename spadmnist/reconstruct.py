@@ -130,8 +130,8 @@ class PassiveFreeRunning(Method):
         if settings.dead_time <= 0:
             return np.inf
         most = settings.exposure / settings.dead_time
-        # a dead time longer than the exposure leaves less than one detection, and still no negative flux
-        return float(self.estimate(settings, np.asarray(max(most - 0.5, most / 2))))
+        # a dead time longer than twice the exposure leaves less than half a detection, and still no negative flux
+        return float(self.estimate(settings, np.asarray(most - 0.5 if most > 0.5 else most / 2)))
 
 
 class InterPhoton(Method):

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pytest
@@ -44,6 +44,10 @@ sensor: {layout: {positions: places.csv, pixel_area: 25 um^2}, effects: {detecti
 """
 
 
+# the classes of all image sources, by the word that a config names them by
+SOURCES = {one.model_fields["source"].default: one for one in get_args(get_args(images.ImageSource)[0])}
+
+
 def build(text: str, base: Path = Path()) -> config.Experiment:
     return config.build(document.parse(text, "lab.yaml"), base)
 
@@ -58,7 +62,7 @@ Keys = dict[str, dict[str, dict[str, Any]]]  # kind -> name -> key -> what is wr
 
 
 def sources() -> dict[str, type[Section]]:
-    return {name: kind for name, kind in config._SOURCES.items() if kind.__module__ == images.__name__}
+    return {name: kind for name, kind in SOURCES.items() if kind.__module__ == images.__name__}
 
 
 def effects() -> list[str]:
