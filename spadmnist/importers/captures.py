@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .. import config, measurement, units
+from .. import config, look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
@@ -264,7 +264,8 @@ def _recordings(
             made, seen = stacks.recording(one.path, found, one.said, one.made, array.layout)
             yield made.watched(told)
             count, left_out, more = seen.detections, found.left_out, tuple(seen.notes())
-        notes.extend(f"{one.path}: {note}" for note in more)
+        broken_off = look.silence(made)
+        notes.extend(f"{one.path}: {note}" for note in (*more, *([broken_off] if broken_off else [])))
         few = None
         if made.events is not None and array.layout.pixels <= _MOST_COUNTED:
             few = tuple(map(int, made.totals))

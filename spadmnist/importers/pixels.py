@@ -237,20 +237,14 @@ def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, sa
 
 
 def _silence(ticks: np.ndarray, tick: float, exposure: float) -> Iterator[str]:
-    """What is to be known of a recording that begins late or breaks off: its rate would be wrong."""
+    """What is to be known of a recording that begins late: its rate would be wrong. Its end is `look.silence`'s."""
     if not len(ticks):
         return
-    first, last = float(ticks.min()) * tick, float(ticks.max()) * tick
-    whole = units.show(exposure, "s", 6)
+    first = float(ticks.min()) * tick
     if len(ticks) * first > SURE * exposure:
         yield (
-            f"nothing was recorded in the first {units.show(first, 's')} of {whole}; if its clock did not start at 0, "
-            "give --subtract-start and the --exposure since then"
-        )
-    if len(ticks) * (exposure - last) > SURE * exposure:
-        yield (
-            f"nothing was recorded in the last {units.show(exposure - last, 's')} of {whole}; if it broke off, give "
-            f'--exposure "{units.show(last, "s", 6)}"'
+            f"nothing was recorded in the first {units.show(first, 's')} of {units.show(exposure, 's', 6)}; if its "
+            "clock did not start at 0, give --subtract-start and the --exposure since then"
         )
 
 

@@ -110,7 +110,7 @@ class Seen:
     """What was seen of the frames of a capture as they were read, in order: to be told when all are.
 
     detections: their sum (of counts: of what is counted); white: the number that stands for a detection; others: is
-    there a number that is neither 0 nor white of 8 bits? first, last: numbers of the frames with a detection; upto:
+    there a number that is neither 0 nor white of 8 bits? first: the number of the first frame with a detection; upto:
     frames seen so far. Of time stamps: zeros: how many are 0; latest: the last one; at_latest: how many are that one;
     missed: does one mean that there was no detection?
     """
@@ -120,7 +120,6 @@ class Seen:
     white: int = 0
     others: bool = False
     first: int | None = None
-    last: int = -1
     upto: int = 0
     zeros: int = 0
     latest: int = 0
@@ -136,7 +135,6 @@ class Seen:
         lit = np.flatnonzero(each)
         if len(lit):
             self.first = start + int(lit[0]) if self.first is None else self.first
-            self.last = start + int(lit[-1])
         return True
 
     def notes(self) -> Iterator[str]:
@@ -153,9 +151,9 @@ class Seen:
                         f"{value}; if that means it, correct --frame-time, or store the ticks of a frame in its place"
                     )
                     break
-        for silent, where in ((self.first or 0, "first"), (self.upto - 1 - self.last, "last")):
-            if self.detections * silent > SURE * self.upto:
-                yield f"nothing was recorded in the {where} {silent:,} of {self.upto:,} frames; if so, cut them off"
+        silent = self.first or 0
+        if self.detections * silent > SURE * self.upto:
+            yield f"nothing was recorded in the first {silent:,} of {self.upto:,} frames; if so, cut them off"
 
 
 def recording(path: Path, found: Found, said: Said, capture: Capture, layout: Layout) -> tuple[Recording, Seen]:
