@@ -889,3 +889,23 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypat
     for wrong in (["--exposure", "1"], ["--exposure", "-1 ms"], ["--light", "blue"], []):
         status, told, said = spadmnist("import", file, "-o", tmp_path / "n", *wrong)
         assert status == 2 and not told and said.startswith("Error: ") and said.count("\n") == 1
+
+
+def test_a_refusal_leaves_nothing_of_its_own(tmp_path: Path) -> None:
+    """The second file is refused as it is read: what the first one made goes again, what was there stays."""
+    good, bad = bits(), bits().astype(np.uint8)
+    bad[15] = 7
+    files = [save(tmp_path / "a.npy", good), save(tmp_path / "b.npy", bad)]
+    said = replace(CLOCK, modality="qis")
+    assert "7 stands in the frames" in refusal(files, said)
+    assert not (tmp_path / "made").exists()
+    (tmp_path / "made").mkdir()
+    assert "7 stands in the frames" in refusal(files, said)
+    assert list((tmp_path / "made").iterdir()) == []
+    save(files[1], good)
+    kept = run(files, said).folder
+    (kept / "measurement.yaml").unlink()  # as if it had been stopped before the end
+    (kept / "b.h5").unlink()
+    save(files[1], bad)
+    assert "7 stands in the frames" in refusal(files, said)
+    assert [path.name for path in kept.iterdir()] == ["a.h5"]

@@ -34,24 +34,39 @@ def write(
 
     Every file appears by one rename, `measurement.yaml` last. A file that is there and has the same bytes stays; a
     folder that holds anything else is refused. Raises SpadError where it cannot be written, and for a capture that
-    could not be opened again.
+    could not be opened again. Where a recording is refused (InputError) the files of this call go again: with other
+    words the same files may be right, and would not be those that lie there.
     """
     root = Path(path)
     for capture in captures:
         _check_counts(capture)
     if root.exists() and not root.is_dir():
         raise SpadError(f"{root} is a file; choose another place with -o")
+    begun = not root.exists()
     with disk.writing(root, 0):
         root.mkdir(parents=True, exist_ok=True)
     with _alone(root):
         _check_place(root, captures, layout)
         disk.sweep(disk.temporary(root))
         done: list[Capture] = []
-        for one in recordings:
-            done.append(one if isinstance(one, Capture) else one.capture)
-            _check_counts(done[-1])
-            if isinstance(one, Recording):
-                _commit_recording(root, _files(done)[-1], one)
+        made: list[Path] = []
+        try:
+            for one in recordings:
+                done.append(one if isinstance(one, Capture) else one.capture)
+                _check_counts(done[-1])
+                if isinstance(one, Recording):
+                    final = root / _files(done)[-1]
+                    known = final.exists()
+                    _commit_recording(root, final.name, one)
+                    made += [] if known else [final]
+        except InputError:
+            for final in made:
+                final.unlink(missing_ok=True)
+            _clear(root)
+            if begun:
+                with contextlib.suppress(OSError):
+                    root.rmdir()
+            raise
         if layout.positions is not None:
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
         _check_place(root, done, layout)
