@@ -170,7 +170,8 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     by_size = sorted(units.items(), key=lambda item: item[1])
     best = by_size[0]
     for name, factor in by_size:
-        if abs(value) / factor >= 1 - 1e-9:
+        number = abs(value) / factor
+        if number >= 1 - 1e-9 or float(f"{number:.{digits}g}") >= 1:  # what is rounded to 1000 is 1 of the next unit
             best = (name, factor)
     return f"{value / best[1]:.{digits}g} {best[0]}"
 

@@ -259,14 +259,15 @@ def test_text_in_other_encodings(tmp_path: Path) -> None:
 def test_times_that_fall_back(tmp_path: Path) -> None:
     """A counter that went round, or two recordings in one file: the lines are sorted, and it is said."""
     (tmp_path / "a.csv").write_text("pixel,time (us)\n0,1\n1,4\n0,900\n1,2\n0,3\n0,5\n")
-    made = run(tmp_path / "a.csv")
+    made = run(tmp_path / "a.csv", replace(SECOND, exposure=1e-3))
     (note,) = made.notes
     assert "its times fall back 2 times within a pixel, by up to 897 us; they were sorted" in note
     assert taken(made) == sorted([(0, t * 10**6) for t in (1, 3, 5, 900)] + [(1, 2 * 10**6), (1, 4 * 10**6)])
     # in time order, or pixel by pixel, nothing is said
     for n, body in enumerate(("0,1\n1,2\n0,3\n1,4\n", "1,2\n1,4\n0,1\n0,3\n")):
         (tmp_path / f"{n}.csv").write_text("pixel,time (us)\n" + body)
-        assert not import_files([tmp_path / f"{n}.csv"], tmp_path / str(n), SECOND, DARK).notes
+        said = replace(SECOND, exposure=5e-6)
+        assert not import_files([tmp_path / f"{n}.csv"], tmp_path / str(n), said, DARK).notes
 
 
 @pytest.mark.parametrize("size", [1, 7, 40, 1 << 20])

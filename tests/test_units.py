@@ -345,3 +345,11 @@ def test_the_header_of_positions(sign: str, tmp_path: Path) -> None:
 def test_a_document_with_the_micro_sign_is_read_back(sign: str) -> None:
     value = {"a": f"5 {sign}s", f"5 {sign}m": [f"1.5 {sign}W/cm^2", {f"0.5 {sign}m": 0.4}], "b": {"c": f"x ({sign}m)"}}
     assert document.parse(document.dump(value), "c.yaml").value == value
+
+
+def test_what_is_rounded_to_a_thousand_is_one_of_the_next_unit() -> None:
+    assert (units.show(0.9996, "s", 3), units.show(0.9994, "s", 3), units.show(999.6e-9, "s", 3)) == (
+        "1 s",
+        "999 ms",
+        "1 us",
+    )
