@@ -276,7 +276,7 @@ def test_without_channels_those_in_use_are_the_pixels(tmp_path: Path) -> None:
     assert totals(made) == [2, 3, 1] and any(
         "the channels 2, 5, 9 are the pixels, in this order" in n for n in made.notes
     )
-    made = run(table(tmp_path / "b" / "a.csv", [0, 1, 1]), replace(SECOND, exposure=12e-6))
+    made = run(table(tmp_path / "b" / "a.csv", [0, 1, 1]), replace(SECOND, exposure=40e-9))
     assert totals(made) == [1, 2] and not made.notes
 
 
