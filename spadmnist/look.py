@@ -13,9 +13,9 @@ from .events import Events
 from .measurement import Measurement
 from .recording import Capture, Light, Recording
 
-_CHANCE = 1e-6  # a silence at the end is told where a constant rate leaves one as long less often
-_LONGER = 3  # times the longest silence inside, which the one at the end must exceed: light may come in bursts
-_FRAMES_AT_ONCE = 64  # from the end, to begin with
+_CHANCE = 1e-6  # a silence at an end is noted where a constant rate leaves one as long less often
+_LONGER = 3  # times the longest silence inside, which the one at an end must exceed: light may come in bursts
+_FRAMES_AT_ONCE = 64  # from either end, to begin with
 
 
 def intervals(events: Events) -> Iterator[np.ndarray]:
@@ -80,9 +80,7 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
     if recorded.events is not None:
         shortest = [float(piece.min()) for piece in intervals(recorded.events) if len(piece)]
         row["shortest_interval"] = min(shortest, default=None)
-    interrupted = silence(recorded)
-    if interrupted is not None:
-        row["notes"].append(interrupted)
+    row["notes"] += silences(recorded)
     return row
 
 
@@ -98,76 +96,97 @@ def light_text(lit: Light) -> str:
 # --- an interruption ----------------------------------------------------------------------------------------------
 
 
-def silence(recorded: Recording) -> str | None:
-    """A sentence without its full stop where the recording seems to have broken off before its end; None otherwise.
+def silences(recorded: Recording) -> list[str]:
+    """Sentences without their full stops: the recording seems to have begun late, or to have broken off.
 
-    The silence behind the last detection of all pixels is longer than three times the longest one between two
-    detections, and less likely than 1e-6 under a constant rate: of N detections anywhere in [0, T) all lie before t
-    with the probability (t / T)^N. A time stamp lies anywhere in its tick. Of frames, those with a detection take the
-    place of the detections, and their numbers that of the time; frames are read from the end, and no further than they
-    are empty where that is nothing unusual.
+    The silence before the first detection of all pixels, or behind the last one, is longer than three times the longest
+    one between two detections, and less likely than 1e-6 under a constant rate: of N detections anywhere in [0, T) all
+    lie before t with the probability (t / T)^N. A time stamp lies anywhere in its tick. Of frames, those with a
+    detection take the place of the detections, and their numbers that of the time; frames are read from both ends, and
+    no further than they are empty where that is nothing unusual.
     """
-    return _silent_frames(recorded) if recorded.events is None else _silent_end(recorded, recorded.events)
+    return _silent_frames(recorded) if recorded.events is None else _silent_stamps(recorded, recorded.events)
 
 
 def _chance(count: int, last: float, end: float) -> float:
-    """Of so many moments anywhere in [0, end), how often all lie before `last`."""
+    """Of so many moments anywhere in [0, end), how often all lie before `last`. As often all lie behind end - last."""
     return min(last / end, 1.0) ** count
 
 
-def _is_broken_off(quiet: float, moments: np.ndarray, width: float) -> bool:
-    """Is the silence at the end too long for the moments of the detections? Each moment lasts `width`."""
+def _is_unusual(quiet: float, moments: np.ndarray, width: float) -> bool:
+    """Is the silence at an end too long for the moments of the detections? Each moment lasts `width`."""
     return quiet > _LONGER * (float(np.diff(moments).max(initial=0)) - width)
 
 
-def _silent_end(recorded: Recording, events: Events) -> str | None:
+def _silent_stamps(recorded: Recording, events: Events) -> list[str]:
     stamps, tick = (events.times, 1.0) if events.ticks is None else (events.ticks, float(events.tick or 1.0))
     width = 0.0 if events.ticks is None else 1.0
     exposure = recorded.conditions.exposure
     end, count = exposure / tick, len(stamps)
-    last = float(stamps.max()) + width if count else 0.0
-    quiet = end - last
-    if count < 2 or _chance(count, last, end) >= _CHANCE or not _is_broken_off(quiet, np.unique(stamps), width):
-        return None
-    step = 10.0 ** (math.floor(math.log10(quiet * tick)) - 2)  # three digits of the silence
-    at = units.show(math.ceil(last * tick / step) * step, "s", 12)
-    return (
-        f"nothing was recorded in the last {units.show(quiet * tick, 's', 3)} of {units.show(exposure, 's')}; "
-        f'if the recording broke off at {at}, import it again with --exposure "{at}"'
-    )
+    if count < 2:
+        return []
+    before, last = float(stamps.min()), float(stamps.max()) + width
+    behind = end - last
+    if min(_chance(count, end - before, end), _chance(count, last, end)) >= _CHANCE:
+        return []
+    moments, notes = np.unique(stamps), []
+    if _chance(count, end - before, end) < _CHANCE and _is_unusual(before, moments, width):
+        notes.append(
+            f"nothing was recorded in the first {units.show(before * tick, 's', 3)} of {units.show(exposure, 's', 6)}; "
+            "if its clock did not start at 0, import it again with --subtract-start and the --exposure since then"
+        )
+    if _chance(count, last, end) < _CHANCE and _is_unusual(behind, moments, width):
+        step = 10.0 ** (math.floor(math.log10(behind * tick)) - 2)  # three digits of the silence
+        at = units.show(math.ceil(last * tick / step) * step, "s", 12)
+        notes.append(
+            f"nothing was recorded in the last {units.show(behind * tick, 's', 3)} of {units.show(exposure, 's', 6)}; "
+            f'if the recording broke off at {at}, import it again with --exposure "{at}"'
+        )
+    return notes
 
 
-def _silent_frames(recorded: Recording) -> str | None:
-    end = recorded.n_frames
-    last = _behind_the_last_detection(recorded)
-    # the frames with a detection are no more than those before, nor than all detections
-    if last < 2 or _chance(last, last, end) >= _CHANCE or _chance(int(recorded.totals.sum()), last, end) >= _CHANCE:
-        return None
+def _silent_frames(recorded: Recording) -> list[str]:
+    end, c = recorded.n_frames, recorded.conditions
+    before = _empty(recorded, ((start, min(start + n, end)) for start, n in _pieces(end)))
+    behind = _empty(recorded, ((max(end - start - n, 0), end - start) for start, n in _pieces(end)), -1)
+    longest = max(before, behind)
+    # the frames with a detection are no more than those between the silences, nor than all detections
+    for most in (lambda: end - before - behind, lambda: int(recorded.totals.sum())):
+        if (count := most()) < 2 or _chance(count, end - longest, end) >= _CHANCE:
+            return []
     some = np.concatenate([_with_a_detection(recorded, part) for _, part in recorded.chunks()])
-    moments = np.flatnonzero(some)
-    if len(moments) < 2 or _chance(len(moments), last, end) >= _CHANCE:
-        return None
-    if not _is_broken_off(end - last, moments, 1.0):
-        return None
-    c = recorded.conditions
-    return (
-        f"nothing was recorded in the last {end - last:,} of {end:,} frames "
-        f"({units.show((end - last) * c.exposure / end, 's', 3)}); if the recording broke off there, import its first "
-        f"{last:,} frames alone"
-    )
+    moments, notes = np.flatnonzero(some), []
+    for quiet, place, advice in (
+        (before, "first", "began late, import its last"),
+        (behind, "last", "broke off there, import its first"),
+    ):
+        if _chance(len(moments), end - quiet, end) < _CHANCE and _is_unusual(quiet, moments, 1.0):
+            notes.append(
+                f"nothing was recorded in the {place} {quiet:,} of {end:,} frames "
+                f"({units.show(quiet * c.exposure / end, 's', 3)}); if the recording {advice} {end - quiet:,} frames "
+                "alone"
+            )
+    return notes
 
 
-def _behind_the_last_detection(recorded: Recording) -> int:
-    """The number of the frame behind the last one with a detection; 0 without any. Read from the end."""
+def _pieces(end: int) -> Iterator[tuple[int, int]]:
+    """Start and length of pieces that double, over so many frames."""
+    start, step = 0, _FRAMES_AT_ONCE
+    while start < end:
+        yield start, step
+        start, step = start + step, 2 * step
+
+
+def _empty(recorded: Recording, pieces: Iterator[tuple[int, int]], direction: int = 1) -> int:
+    """How many frames are empty from one end on. direction: 1 from the first frame, -1 from the last."""
     assert recorded.frames is not None
-    stop, step = recorded.n_frames, _FRAMES_AT_ONCE
-    while stop > 0:
-        start = max(0, stop - step)
-        some = np.flatnonzero(_with_a_detection(recorded, np.asarray(recorded.frames[start:stop])))
-        if len(some):
-            return start + int(some[-1]) + 1
-        stop, step = start, 2 * step
-    return 0
+    count = 0
+    for start, stop in pieces:
+        some = _with_a_detection(recorded, np.asarray(recorded.frames[start:stop]))[::direction]
+        if some.any():
+            return count + int(some.argmax())
+        count += stop - start
+    return count
 
 
 def _with_a_detection(recorded: Recording, frames: np.ndarray) -> np.ndarray:

@@ -160,6 +160,8 @@ def show(value: float, unit: str, digits: int = 4) -> str:
 
     >>> show(5e-8, "s")
     '50 ns'
+    >>> show(36000, "s")
+    '36000 s'
     """
     units = {u: float(f) for u, f in _DIMENSIONS[unit][1].items() if u != "%"}
     if unit == "W/m^2":
@@ -173,7 +175,10 @@ def show(value: float, unit: str, digits: int = 4) -> str:
         number = abs(value) / factor
         if number >= 1 - 1e-9 or float(f"{number:.{digits}g}") >= 1:  # what is rounded to 1000 is 1 of the next unit
             best = (name, factor)
-    return f"{value / best[1]:.{digits}g} {best[0]}"
+    number = value / best[1]
+    rounded = float(f"{number:.{digits}g}")
+    plain = 10**digits <= abs(rounded) < 1e7  # `36000 s` and not 3.6e+04
+    return f"{rounded:.0f} {best[0]}" if plain else f"{number:.{digits}g} {best[0]}"
 
 
 def factor(value: float) -> str:

@@ -109,12 +109,12 @@ def test_ticks_and_frames_make_no_more_alarms(slots: int) -> None:
 def test_what_runs_to_its_end_is_not_called_interrupted(count: int, end: int, seed: int) -> None:
     """Steady light: 800 recordings, each wrongly told with a probability below 1e-6."""
     at = np.random.default_rng(seed).random(count)
-    assert look.silence(stamped((at * end).astype(np.int64), end)) is None
-    assert look.silence(stamped(at, 1, tick=None)) is None
+    assert look.silences(stamped((at * end).astype(np.int64), end)) == []
+    assert look.silences(stamped(at, 1, tick=None)) == []
     frames = np.zeros(min(end, 10_000), bool)
     frames[(at * len(frames)).astype(int)] = True
-    assert look.silence(framed(frames)) is None
-    assert look.silence(framed(frames, "str")) is None
+    assert look.silences(framed(frames)) == []
+    assert look.silences(framed(frames, "str")) == []
 
 
 # --- what is told -------------------------------------------------------------------------------------------------
@@ -128,14 +128,14 @@ def test_a_recording_that_broke_off_is_told() -> None:
         stamped(np.minimum(at, at[1]).astype(np.int64), 10**9),
         stamped(np.minimum(at, at[1]) * 1e-9, 1, tick=None),
     ):
-        assert look.silence(recorded) == f"nothing was recorded in {note}"
+        assert look.silences(recorded) == [f"nothing was recorded in {note}"]
 
 
 def test_where_it_broke_off_is_never_before_the_last_detection() -> None:
     """The exposure that is named holds every detection, however short the silence is beside it."""
     at = np.arange(998_984) * 1000
-    told = look.silence(stamped(at, 10**9))
-    assert told is not None and '--exposure "998.99 ms"' in told and "the last 1.02 ms of 1 s" in told
+    (told,) = look.silences(stamped(at, 10**9))
+    assert '--exposure "998.99 ms"' in told and "the last 1.02 ms of 1 s" in told
 
 
 @pytest.mark.parametrize("modality", ["qis", "str", "counts"])
@@ -144,32 +144,67 @@ def test_frames_that_broke_off_are_told(modality: str) -> None:
     some[587], some[588:] = True, False
     recorded = framed(some, modality)
     lasting = "61.8 ms" if modality == "counts" else "4.12 ms"
-    assert look.silence(recorded) == (
+    assert look.silences(recorded) == [
         f"nothing was recorded in the last 412 of 1,000 frames ({lasting}); if the recording broke off there, import "
         "its first 588 frames alone"
-    )
+    ]
 
 
-def test_bursts_leave_a_silence_at_the_end() -> None:
+def test_a_recording_that_began_late_is_noted() -> None:
+    at = 0.4e9 + np.random.default_rng(3).random(200) * 0.6e9
+    at[:2] = 400_400_000, 999_999_999
+    at = np.maximum(at, at[0])
+    note = "if its clock did not start at 0, import it again with --subtract-start and the --exposure since then"
+    for recorded in (stamped(at.astype(np.int64), 10**9), stamped(at * 1e-9, 1, tick=None)):
+        assert look.silences(recorded) == [f"nothing was recorded in the first 400 ms of 1 s; {note}"]
+
+
+@pytest.mark.parametrize("modality", ["qis", "str", "counts"])
+def test_frames_that_began_late_are_noted(modality: str) -> None:
+    some = np.random.default_rng(4).random(1000) < 0.3
+    some[:412], some[412] = False, True
+    lasting = "61.8 ms" if modality == "counts" else "4.12 ms"
+    assert look.silences(framed(some, modality)) == [
+        f"nothing was recorded in the first 412 of 1,000 frames ({lasting}); if the recording began late, import its "
+        "last 588 frames alone"
+    ]
+
+
+@pytest.mark.parametrize("of", ["stamps", "frames"])
+def test_both_ends_can_be_silent(of: str) -> None:
+    at = np.arange(4000, 6000, 3)
+    some = np.zeros(10_000, bool)
+    some[at] = True
+    first, last = look.silences(stamped(at, 10_000) if of == "stamps" else framed(some))
+    assert "in the first 4" in first and "in the last 4" in last
+
+
+def test_bursts_leave_a_silence_at_an_end() -> None:
     """As long as three of those between them: that is no interruption."""
     bursts = np.concatenate([np.arange(start, start + 50) for start in (0, 1000, 2000)])
     quiet = 950  # between two bursts: from 50 to 1000
-    assert look.silence(stamped(bursts, 2050 + 3 * quiet)) is None
-    assert look.silence(stamped(bursts, 2051 + 3 * quiet)) is not None
+    assert look.silences(stamped(bursts, 2050 + 3 * quiet)) == []
+    assert look.silences(stamped(bursts, 2051 + 3 * quiet)) != []
     some = np.zeros(2051 + 3 * quiet, bool)
     some[bursts] = True
-    assert look.silence(framed(some[:-1])) is None
-    assert look.silence(framed(some)) is not None
+    assert look.silences(framed(some[:-1])) == []
+    assert look.silences(framed(some)) != []
+    # the same, mirrored
+    end = 2051 + 3 * quiet
+    late = end - 1 - bursts
+    assert len(look.silences(stamped(late, end))) == 1
+    assert look.silences(stamped(late - 1, end - 1)) == []
+    assert len(look.silences(framed(some[::-1]))) == 1
+    assert look.silences(framed(some[:-1][::-1])) == []
 
 
 @pytest.mark.parametrize("stamps", [[], [5], [5, 5], [0, 1]])
 def test_too_few_detections_tell_nothing(stamps: list[int]) -> None:
     """One detection leaves no silence to compare with; two are told where they lie in the first thousandth."""
-    told = look.silence(stamped(stamps, 10**6))
-    assert (told is not None) == (len(stamps) == 2)
+    assert len(look.silences(stamped(stamps, 10**6))) == (len(stamps) == 2)
     some = np.zeros(1000, bool)
     some[stamps] = True
-    assert look.silence(framed(some)) is None
+    assert look.silences(framed(some)) == []
 
 
 def test_the_bound_is_one_in_a_million() -> None:
@@ -178,18 +213,18 @@ def test_the_bound_is_one_in_a_million() -> None:
         some = np.zeros(n, bool)
         some[:3] = True
         for recorded in (stamped([0, 1, 2], n), framed(some)):
-            assert (look.silence(recorded) is not None) == (n > 300)
+            assert (look.silences(recorded) != []) == (n > 300)
 
 
-def test_frames_are_read_from_the_end_and_no_further_than_needed() -> None:
+def test_frames_are_read_from_both_ends_and_no_further_than_needed() -> None:
     some = np.ones(1000, bool)
     recorded = framed(some)
-    assert look.silence(recorded) is None
-    assert isinstance(recorded.frames, Watched) and recorded.frames.read.sum() == 64
+    assert look.silences(recorded) == []
+    assert isinstance(recorded.frames, Watched) and recorded.frames.read.sum() == 2 * 64
     some[-100:] = False
     some[::2] = False
     recorded = framed(some)
-    assert look.silence(recorded) is not None
+    assert look.silences(recorded) != []
     assert isinstance(recorded.frames, Watched) and recorded.frames.read.max() <= 4
     # so few detections that many empty frames are nothing unusual: what is counted already is not counted again
     some = np.zeros(1000, bool)
@@ -197,8 +232,8 @@ def test_frames_are_read_from_the_end_and_no_further_than_needed() -> None:
     recorded = framed(some)
     assert recorded.totals.sum() == 2 and isinstance(recorded.frames, Watched)
     recorded.frames.read[:] = 0
-    assert look.silence(recorded) is None
-    assert recorded.frames.read.max() == 1
+    assert look.silences(recorded) == []
+    assert recorded.frames.read.max() <= 2
 
 
 def test_inspect_tells_it(tmp_path: Path) -> None:
@@ -207,7 +242,7 @@ def test_inspect_tells_it(tmp_path: Path) -> None:
     recorded = stamped(at, 10**6)
     root = measurement.write(tmp_path / "lab", "lab", recorded.layout, [recorded])
     (row,) = json.loads(said("inspect", root, "--json"))["captures"]
-    assert row["notes"] == [look.silence(recorded)]
+    assert row["notes"] == look.silences(recorded)
     assert "a: nothing was recorded in the last 500 us of 1 ms" in said("inspect", root)
 
 

@@ -36,7 +36,6 @@ MOST_CHANNELS = 1 << 24
 MOST_EVENTS = 1 << 29  # of a file
 LARGEST_PIECE = 1 << 28  # bytes that a file may make one take at once
 PICOSECOND = 1e-12
-SURE = 25.0  # detections that were due where there are none: under steady light one recording of 10^10 is so by chance
 LASER_PULSES = (
     "was recorded in T3 mode, or alike: its times count from the last laser pulse; record in T2 mode, or export the "
     "times since the start to CSV"

@@ -264,8 +264,7 @@ def _recordings(
             made, seen = stacks.recording(one.path, found, one.said, one.made, array.layout)
             yield made.watched(told)
             count, left_out, more = seen.detections, found.left_out, tuple(seen.notes())
-        broken_off = look.silence(made)
-        notes.extend(f"{one.path}: {note}" for note in (*more, *([broken_off] if broken_off else [])))
+        notes.extend(f"{one.path}: {note}" for note in (*more, *look.silences(made)))
         few = None
         if made.events is not None and array.layout.pixels <= _MOST_COUNTED:
             few = tuple(map(int, made.totals))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from ..events import Events, Layout
 from ..import_options import MOST_ROWS
 from ..readout import no_detection, stamps_for
 from ..recording import Capture, Recording
-from . import MOST_CHANNELS, SURE, Found, Said
+from . import MOST_CHANNELS, Found, Said
 
 _NO_PIXEL = -1
 _MOST_NAMED = 20  # channels that a sentence lists
@@ -180,7 +180,6 @@ def events(path: Path, found: Found, said: Said, capture: Capture, array: Array,
         notes.append(f"its clock is counted from the first detection, at {units.show(float(start) * tick, 's', 12)}")
         ticks = ticks - start
     end = _check_times(path, ticks, tick, exposure, said)
-    notes += _silence(ticks, tick, exposure)
     # the stable sort of 16-bit integers counts them
     order = np.argsort(pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))]).astype(np.int64)
@@ -234,18 +233,6 @@ def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, sa
         f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {low} to {high}, outside the exposure "
         f"of {units.show(exposure, 's', 9)}; {advice}"
     )
-
-
-def _silence(ticks: np.ndarray, tick: float, exposure: float) -> Iterator[str]:
-    """What is to be known of a recording that begins late: its rate would be wrong. Its end is `look.silence`'s."""
-    if not len(ticks):
-        return
-    first = float(ticks.min()) * tick
-    if len(ticks) * first > SURE * exposure:
-        yield (
-            f"nothing was recorded in the first {units.show(first, 's')} of {units.show(exposure, 's', 6)}; if its "
-            "clock did not start at 0, give --subtract-start and the --exposure since then"
-        )
 
 
 def _by(shape: Sequence[int]) -> str:

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..events import Layout
 from ..readout import counts_type, no_detection
 from ..recording import Capture, Recording
-from . import SURE, Found, Said, Stack, are_whole, ask, no_whole
+from . import Found, Said, Stack, are_whole, ask, no_whole
 
 _STRIDED_PIECE = 1 << 28  # bytes: of frames that lie across the file each piece reads all of it, so pieces are large
 
@@ -110,16 +110,14 @@ class Seen:
     """What was seen of the frames of a capture as they were read, in order: to be told when all are.
 
     detections: their sum (of counts: of what is counted); white: the number that stands for a detection; others: is
-    there a number that is neither 0 nor white of 8 bits? first: the number of the first frame with a detection; upto:
-    frames seen so far. Of time stamps: zeros: how many are 0; latest: the last one; at_latest: how many are that one;
-    missed: does one mean that there was no detection?
+    there a number that is neither 0 nor white of 8 bits? upto: frames seen so far. Of time stamps: zeros: how many are
+    0; latest: the last one; at_latest: how many are that one; missed: does one mean that there was no detection?
     """
 
     modality: str
     detections: int = 0
     white: int = 0
     others: bool = False
-    first: int | None = None
     upto: int = 0
     zeros: int = 0
     latest: int = 0
@@ -132,9 +130,6 @@ class Seen:
             return False
         self.upto = start + len(each)
         self.detections += int(each.sum())
-        lit = np.flatnonzero(each)
-        if len(lit):
-            self.first = start + int(lit[0]) if self.first is None else self.first
         return True
 
     def notes(self) -> Iterator[str]:
@@ -151,9 +146,6 @@ class Seen:
                         f"{value}; if that means it, correct --frame-time, or store the ticks of a frame in its place"
                     )
                     break
-        silent = self.first or 0
-        if self.detections * silent > SURE * self.upto:
-            yield f"nothing was recorded in the first {silent:,} of {self.upto:,} frames; if so, cut them off"
 
 
 def recording(path: Path, found: Found, said: Said, capture: Capture, layout: Layout) -> tuple[Recording, Seen]:
