@@ -837,8 +837,9 @@ def _rate_histogram(axes: Any, one: Look) -> None:
     axes.stairs(sums, (edges - 0.5) * to_rate, color="tab:orange", label=f"{name}, equal pixels")
     beyond = len(totals) - len(inner)
     more = f" ({beyond:,} beyond)" if beyond else ""
+    axes.margins(y=0.3)  # room for the legend
     axes.set(xlabel=f"detections of a pixel, {unit}{more}", ylabel="pixels")
-    axes.legend(frameon=False, fontsize=7)
+    axes.legend(frameon=False, fontsize=7, loc="upper right")
 
 
 def _interval_plot(axes: Any, one: Look) -> None:
@@ -865,9 +866,9 @@ def _interval_plot(axes: Any, one: Look) -> None:
     some = counts > 0
     low, high = float((counts / widths)[some].min()), float(max((counts / widths).max(), (expected / widths).max()))
     right = edges[1:][some].max()
-    axes.set(xscale="log", yscale="log", ylim=(low / 2, high * 2), xlim=(max(edges[0], (shortest or 0) / 5), right))
-    axes.set(xlabel="interval, s", ylabel="intervals / s")
-    axes.legend(frameon=False, fontsize=7)
+    axes.set(xscale="log", yscale="log", ylim=(low / 2, high * 2 * (high / low) ** 0.25))
+    axes.set(xlim=(max(edges[0], (shortest or 0) / 5), right), xlabel="interval, s", ylabel="intervals / s")
+    axes.legend(frameon=False, fontsize=7, loc="upper right")
 
 
 def _course_plot(axes: Any, one: Look) -> None:

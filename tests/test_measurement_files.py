@@ -168,7 +168,7 @@ def test_a_hostile_or_wrong_file_is_one_sentence(tmp_path: Path, fault: str) -> 
 
 def test_no_file_and_what_is_no_file(tmp_path: Path) -> None:
     described(tmp_path, TR)
-    refused(lambda: measurement.open(tmp_path), "a.h5: no such file")
+    refused(lambda: measurement.open(tmp_path), "a.h5: no such file", "spadmnist import FILE --capture a -o")
     (tmp_path / "a.h5").mkdir()
     refused(lambda: measurement.open(tmp_path), "is no file")
     (tmp_path / "a.h5").rmdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +90,12 @@ class _Reader(Reader):
             more = ", ".join(path.name for path, _ in wrong[1:4])
             if len(wrong) > 4:
                 more += f" and {len(wrong) - 4} more"
-            raise InputError(f"{wrong[0][1]}{f'. Nor can {more} be used' if more else ''}")
+            text = f"{wrong[0][1]}{f'. Nor can {more} be used' if more else ''}"
+            absent = [capture.id for capture, path in captures if path is not None and not os.path.lexists(path)]
+            if absent:
+                fill = f"spadmnist import FILE --capture {absent[0]} -o {shlex.quote(str(self.base))}"
+                text += f". What is not there yet is imported by:  {fill}"
+            raise InputError(text)
         paths = tuple(path for _, path in captures)
 
         def read(index: int, layout: Layout, dead_time: float) -> tuple[Recording, list[str]]:
