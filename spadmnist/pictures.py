@@ -101,6 +101,8 @@ def draw_map(
     else:
         flat = min(layout.shape) * 8 < max(layout.shape)
         drawn = axes.imshow(values.reshape(layout.shape), aspect="auto" if flat else "equal", **style)
+        for axis in (axes.xaxis, axes.yaxis):  # a pixel has a whole number
+            axis.get_major_locator().set_params(integer=True)
     beyond = bool(values.min() < low), bool(values.max() > high)
     extend = {(False, True): "max", (True, False): "min", (True, True): "both"}.get(beyond, "neither")
     axes.figure.colorbar(drawn, ax=axes, shrink=0.9, label=label, extend=extend)
