@@ -91,6 +91,8 @@ def draw_map(
     axes: Axes, layout: Layout, values: np.ndarray, low: float, high: float, label: str, colours: str = "viridis"
 ) -> None:
     """Draw (pixels,) values where the pixels lie, and their scale from `low` to `high`, which some may exceed."""
+    from matplotlib.ticker import MaxNLocator
+
     style: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": high, "interpolation": "nearest"}
     if layout.positions is not None:
         pixel, edges = pixel_at(layout.positions, _POINTS)
@@ -102,7 +104,7 @@ def draw_map(
         flat = min(layout.shape) * 8 < max(layout.shape)
         drawn = axes.imshow(values.reshape(layout.shape), aspect="auto" if flat else "equal", **style)
         for axis in (axes.xaxis, axes.yaxis):  # a pixel has a whole number
-            axis.get_major_locator().set_params(integer=True)
+            axis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
     beyond = bool(values.min() < low), bool(values.max() > high)
     extend = {(False, True): "max", (True, False): "min", (True, True): "both"}.get(beyond, "neither")
     axes.figure.colorbar(drawn, ax=axes, shrink=0.9, label=label, extend=extend)
