@@ -22,6 +22,7 @@ __version__ = "0.1.0"
 # imported when they are first used: `spadmnist --help` needs neither numpy nor numba
 _PUBLIC = {
     "open": "dataset",
+    "concatenate": "dataset",
     "Dataset": "dataset",
     "Part": "dataset",
     "open_measurement": "measurement",

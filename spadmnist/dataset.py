@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -28,6 +27,7 @@ from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
 from .experiment import Experiment, Level, level_of
+from .gather import gather, indices_of, join
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
@@ -446,6 +446,7 @@ def intact_manifest(root: Path) -> dict[str, Any]:
 # --- reading ------------------------------------------------------------------------------------------------------
 
 T = TypeVar("T")
+str_ = str  # within `Part` the name is a readout's
 
 
 class _Backend(Protocol):
@@ -457,13 +458,15 @@ class _Backend(Protocol):
 
     def normalisation(self, method: str) -> float | None: ...
 
+    def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None: ...
+
     def originals(self, start: int, stop: int) -> np.ndarray: ...
 
     def labels(self) -> np.ndarray | None: ...
 
 
 class Field(Generic[T]):
-    """One kind of data of a part, by image: `[i]` or `[a:b]`."""
+    """One kind of data of a part, by image: `[i]`, `[a:b:step]`, `[[3, 1, 2]]`, an array of numbers or a mask."""
 
     def __init__(self, length: int, get: Callable[[int, int], Any], one: Callable[[Any], Any]):
         self._length = length
@@ -477,20 +480,15 @@ class Field(Generic[T]):
     def __getitem__(self, index: int) -> T: ...
 
     @overload
-    def __getitem__(self, index: slice) -> Any: ...
+    def __getitem__(self, index: slice | range | Sequence[int] | np.ndarray) -> Any: ...
 
-    def __getitem__(self, index: int | slice) -> Any:
-        if isinstance(index, slice):
-            start, stop, step = index.indices(self._length)
-            if step != 1:
-                raise IndexError("slices go in steps of 1; take every n-th image one by one")
-            return self._get(start, max(start, stop))
-        i = operator.index(index)
-        if i < 0:
-            i += self._length
-        if not 0 <= i < self._length:
-            raise IndexError(f"image {index} was asked for; there are {self._length}")
-        return self._one(self._get(i, i + 1))
+    def __getitem__(self, index: Any) -> Any:
+        found = indices_of(index, self._length)
+        if isinstance(found, int):
+            return self._one(self._get(found, found + 1))
+        if isinstance(found, range) and found.step == 1:
+            return self._get(found.start, max(found.start, found.stop))
+        return gather(self._get, np.asarray(found))
 
     def __iter__(self) -> Iterator[T]:
         for i in range(self._length):
@@ -515,7 +513,10 @@ class Reconstruction(Field[np.ndarray]):
 
     @cached_property
     def normalisation(self) -> float | None:
-        """The median of the non-zero pixels of the training split; None where the method is not normalised."""
+        """The median of the non-zero pixels of the training split; None where the method is not normalised.
+
+        Raises SpadError for images of several levels, each of which has its own.
+        """
         return self._backend.normalisation(self.method)
 
     @property
@@ -524,7 +525,55 @@ class Reconstruction(Field[np.ndarray]):
 
     def _divided(self, start: int, stop: int) -> np.ndarray:
         raw = self._backend.reconstruction(self.method, start, stop)
-        return raw if self.normalisation is None else raw / np.float32(self.normalisation)
+        by = self._backend.divisors(self.method, start, stop)
+        return raw if by is None else raw / by.reshape(-1, *[1] * (raw.ndim - 1))
+
+
+class Image:
+    """One image of a part: its streams and fluxes, read as they are asked for; see `Part`.
+
+    index: its number in the part; label: int, or None where the source has none; image: the 8-bit original.
+    """
+
+    def __init__(self, part: Part, index: int):
+        self._part = part
+        self.index = index
+
+    def __repr__(self) -> str:
+        return f"Image({self.index} of {self._part!r})"
+
+    @property
+    def label(self) -> int | None:
+        return None if self._part.labels is None else int(self._part.labels[self.index])
+
+    @property
+    def image(self) -> np.ndarray:
+        return self._part.images[self.index]
+
+    @property
+    def tr(self) -> Events:
+        return self._part.tr[self.index]
+
+    @property
+    def frames(self) -> Frames:
+        return self._part.frames[self.index]
+
+    @property
+    def counts(self) -> np.ndarray:
+        return self._part.counts[self.index]
+
+    @property
+    def qis(self) -> np.ndarray:
+        return self._part.qis[self.index]
+
+    @property
+    def str(self) -> np.ndarray:
+        return self._part.str[self.index]
+
+    def reconstruction(self, method: Any, normalised: bool = False) -> np.ndarray:
+        """(rows, columns) float32: the flux by a method, divided by the training median where it is asked for."""
+        field = self._part.reconstruction[method]
+        return (field.normalised if normalised else field)[self.index]
 
 
 class Part:
@@ -561,6 +610,31 @@ class Part:
     def __len__(self) -> int:
         return self._length
 
+    @overload
+    def __getitem__(self, index: int) -> Image: ...
+
+    @overload
+    def __getitem__(self, index: slice | range | Sequence[int] | np.ndarray) -> Part: ...
+
+    def __getitem__(self, index: Any) -> Image | Part:
+        """An image with all that is known of it; of a slice, a list, an array of numbers or a mask: a smaller part."""
+        found = indices_of(index, self._length)
+        if isinstance(found, int):
+            return Image(self, found)
+        return self._of(_Chosen(self._backend, found), len(found))
+
+    def __iter__(self) -> Iterator[Image]:
+        return (Image(self, i) for i in range(self._length))
+
+    def _of(self, backend: _Backend, length: int, stored: bool | None = None) -> Part:
+        """The like, of other images."""
+        stored = self.stored if stored is None else stored
+        return Part(length, backend, stored, self.readouts, tuple(self.reconstruction), self.shape, self.causes)
+
+    def __getstate__(self) -> dict[str_, Any]:
+        """Labels are read again where the part is sent to."""
+        return {key: value for key, value in self.__dict__.items() if key != "labels"}
+
     def __repr__(self) -> str:
         return f"Part({self._length} images of {self.shape}, {', '.join(self.readouts)})"
 
@@ -588,7 +662,7 @@ class Part:
 
     def _tally(self, start: int, stop: int) -> np.ndarray:
         rows = self._backend.recorded(start, stop, "counts")
-        dense = rows.reshape(stop - start, *self.shape, rows.shape[1])
+        dense = rows.reshape(stop - start, *self.shape, rows.shape[-1])
         # behind the image (and its channel): the frames, then rows and columns
         return np.moveaxis(dense, -1, len(self.shape) - 1)
 
@@ -710,8 +784,7 @@ class _Stored:
         if what == "tr":
             return read_tr(reader, start, stop, f["pixels"], f["tick"])
         if what == "counts":
-            found = reader.read("counts/frames", start, stop)
-            return found.reshape(-1, found.shape[-1])
+            return reader.read("counts/frames", start, stop).reshape(stop - start, f["pixels"], -1)
         return read_frames(reader, start, stop, f["pixels"], f["tick"], f["frames"], f["frame_time"], what == "str")
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
@@ -720,6 +793,9 @@ class _Stored:
 
     def normalisation(self, method: str) -> float | None:
         return self._facts["normalisation"].get(method)
+
+    def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None:
+        return _alike(self.normalisation(method), start, stop)
 
     def originals(self, start: int, stop: int) -> np.ndarray:
         return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
@@ -730,6 +806,10 @@ class _Stored:
         return np.concatenate([reader.read("labels") for _, _, reader in self._originals])
 
 
+def _alike(normalisation: float | None, start: int, stop: int) -> np.ndarray | None:
+    return None if normalisation is None else np.full(stop - start, np.float32(normalisation))
+
+
 def _joined(arrays: list[np.ndarray]) -> np.ndarray:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
@@ -737,12 +817,23 @@ def _joined(arrays: list[np.ndarray]) -> np.ndarray:
 class _Simulated:
     """A part that is made when it is asked for; the last range is kept."""
 
-    def __init__(self, experiment: Experiment, level: Level, split: str, splits: Mapping[str, Images]):
+    def __init__(
+        self, experiment: Experiment, level: Level, split: str, splits: Mapping[str, Images], images_dir: Path | None
+    ):
         self._experiment = experiment
         self._level = level
         self._split = split
         self._splits = splits
+        self._images_dir = images_dir  # another process reads the images there again
         self._last: tuple[tuple[int, int], Recorded] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the images; with the normalisations where they are known."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_splits", "_last")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _last=None)
+        self._splits = self._experiment.load_images(self._images_dir)
 
     def _make(self, start: int, stop: int) -> Recorded:
         if self._last is None or self._last[0] != (start, stop):
@@ -755,7 +846,9 @@ class _Simulated:
 
     def recorded(self, start: int, stop: int, what: str) -> Any:
         made = self._make(start, stop)
-        return {"tr": made.tr, "counts": made.tally}.get(what, made.frames)
+        if what == "counts" and made.tally is not None:
+            return made.tally.reshape(stop - start, -1, made.tally.shape[-1])
+        return made.tr if what == "tr" else made.frames
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
         values, _ = reconstruct.find(method).image(self._make(start, stop), self._experiment.settings)
@@ -780,12 +873,119 @@ class _Simulated:
     def normalisation(self, method: str) -> float | None:
         return self._normalisations[method] if reconstruct.find(method).normalised else None
 
+    def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None:
+        return _alike(self.normalisation(method), start, stop)
+
     def originals(self, start: int, stop: int) -> np.ndarray:
         return self._splits[self._split].pixels[start:stop]
 
     def labels(self) -> np.ndarray | None:
         labels = self._splits[self._split].labels
         return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
+
+
+class _Chosen:
+    """Some images of a part."""
+
+    def __init__(self, inner: _Backend, indices: range | np.ndarray):
+        self._inner, self._indices = inner, indices
+
+    def _read(self, get: Callable[[int, int], Any], start: int, stop: int) -> Any:
+        chosen = self._indices[start:stop]
+        if isinstance(chosen, range) and chosen.step == 1:
+            return get(chosen.start, max(chosen.start, chosen.stop))
+        return gather(get, np.asarray(chosen, np.int64))
+
+    def recorded(self, start: int, stop: int, what: str) -> Any:
+        return self._read(partial(self._inner.recorded, what=what), start, stop)
+
+    def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
+        return np.asarray(self._read(partial(self._inner.reconstruction, method), start, stop))
+
+    def normalisation(self, method: str) -> float | None:
+        return self._inner.normalisation(method)
+
+    def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None:
+        chosen = np.asarray(self._indices[start:stop], np.int64)
+        if not len(chosen):
+            return None
+        found = self._inner.divisors(method, int(chosen.min()), int(chosen.max()) + 1)
+        return None if found is None else found[chosen - chosen.min()]
+
+    def originals(self, start: int, stop: int) -> np.ndarray:
+        return np.asarray(self._read(self._inner.originals, start, stop))
+
+    def labels(self) -> np.ndarray | None:
+        labels = self._inner.labels()
+        return None if labels is None else labels[np.asarray(self._indices, np.int64)]
+
+
+class _Concatenated:
+    """The images of several parts, one after the other."""
+
+    def __init__(self, parts: Sequence[tuple[_Backend, int]]):
+        self._parts = [backend for backend, _ in parts]
+        self._starts = np.cumsum([0, *(length for _, length in parts)])
+
+    def _pieces(self, start: int, stop: int) -> list[tuple[_Backend, int, int]]:
+        found = [
+            (backend, int(max(start, low) - low), int(min(stop, high) - low))
+            for backend, low, high in zip(self._parts, self._starts, self._starts[1:], strict=False)
+            if low < stop and start < high
+        ]
+        return found or [(self._parts[0], 0, 0)]
+
+    def recorded(self, start: int, stop: int, what: str) -> Any:
+        return join([backend.recorded(a, b, what) for backend, a, b in self._pieces(start, stop)])
+
+    def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
+        return np.asarray(join([backend.reconstruction(method, a, b) for backend, a, b in self._pieces(start, stop)]))
+
+    def normalisation(self, method: str) -> float | None:
+        found = {backend.normalisation(method) for backend in self._parts}
+        if len(found) > 1:
+            raise SpadError(f"{method}: each light level has a normalisation of its own; .normalised divides by it")
+        return found.pop()
+
+    def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None:
+        found = [(backend.divisors(method, a, b), b - a) for backend, a, b in self._pieces(start, stop)]
+        if all(by is None for by, _ in found):
+            return None
+        return np.concatenate([np.ones(n, np.float32) if by is None else by for by, n in found])
+
+    def originals(self, start: int, stop: int) -> np.ndarray:
+        return np.asarray(join([backend.originals(a, b) for backend, a, b in self._pieces(start, stop)]))
+
+    def labels(self) -> np.ndarray | None:
+        found = [backend.labels() for backend in self._parts]
+        known = [labels for labels in found if labels is not None]
+        return np.concatenate(known) if len(known) == len(found) else None
+
+
+def concatenate(parts: Sequence[Part]) -> Part:
+    """One part of the images of several, one after the other: of other light levels, splits or datasets.
+
+    It has the readouts and methods that all of them have; `normalised` divides each image by the median of its own
+    level. Raises SpadError where their images differ in size, or nothing is in all of them.
+    """
+    parts = list(parts)
+    if not parts:
+        raise SpadError("there is no part to concatenate; give one or more")
+    first = parts[0]
+    for part in parts:
+        if part.shape != first.shape:
+            raise SpadError(
+                f"images of {part.shape} and of {first.shape} differ in size; concatenate those of one size"
+            )
+        if part.causes != first.causes:
+            raise SpadError("the causes of detections differ between the parts; concatenate those of one sensor")
+    readouts = [name for name in first.readouts if all(name in part.readouts for part in parts)]
+    methods = [name for name in first.reconstruction if all(name in part.reconstruction for part in parts)]
+    if not readouts:
+        raise SpadError("the parts have no readout in common; concatenate those that were recorded alike")
+    backend = _Concatenated([(part._backend, len(part)) for part in parts])
+    stored = all(part.stored for part in parts)
+    return Part(sum(map(len, parts)), backend, stored, readouts, methods, first.shape, first.causes)
 
 
 def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()) -> Dataset:
@@ -811,7 +1011,7 @@ def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset
     shape = any_split.pixels.shape[1:]
 
     def part(level: Level, split: str) -> Part:
-        backend = _Simulated(experiment, level, split, splits)
+        backend = _Simulated(experiment, level, split, splits, images_dir)
         length = experiment.wanted(splits[split])
         names = experiment.sensor.causes if experiment.causes else ()
         return Part(length, backend, False, experiment.readouts, experiment.methods, shape, names)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from . import kernels
+from .errors import SpadError
 
 
 @dataclass(frozen=True)
@@ -227,6 +228,24 @@ class Events:
         parent = None if self.parent is None else _shifted(self.parent[part], -offsets[0])
         return Events(times, offsets - offsets[0], self.pixels, ticks, self.tick, None, self.end, cause, parent)
 
+    def take(self, images: np.ndarray) -> Events:
+        """Some images, in any order, repeated or not, with offsets from 0."""
+        starts, images = self.image_offsets, np.asarray(images)
+        rows = (images[:, None] * self.pixels + np.arange(self.pixels)).reshape(-1)
+        offsets = np.concatenate([[0], np.cumsum(self.counts[rows])])
+        pieces = [slice(a, b) for a, b in zip(starts[images].tolist(), starts[images + 1].tolist(), strict=True)]
+
+        def taken(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else np.concatenate([values[:0], *(values[piece] for piece in pieces)])
+
+        parent = taken(self.parent)
+        if parent is not None:
+            moved = offsets[:: self.pixels][:-1] - starts[images]
+            parent = _shifted(parent, np.repeat(moved, starts[images + 1] - starts[images]))
+        times = taken(self._times) if self.ticks is None else None
+        cause = taken(self.cause)
+        return Events(times, offsets, self.pixels, taken(self.ticks), self.tick, None, self.end, cause, parent)
+
     def of_rows(self, rows: np.ndarray, pixels: int) -> Events:
         """Some rows (ascending) alone, `pixels` of them to an image."""
         among = np.zeros(len(self.offsets) - 1, bool)
@@ -244,6 +263,8 @@ class Events:
         """Several batches, one after the other."""
         if len(parts) == 1:
             return parts[0]
+        if len({(p.tick, p.pixels) for p in parts}) > 1:
+            raise SpadError("streams of other ticks or of another number of pixels cannot be joined; read them apart")
         starts = np.cumsum([0] + [len(p) for p in parts])
         offsets = np.concatenate([[0], *(p.offsets[1:] + s for p, s in zip(parts, starts, strict=False))])
         first = parts[0]
@@ -278,7 +299,7 @@ class Events:
         return None
 
 
-def _shifted(parent: np.ndarray | None, by: int) -> np.ndarray:
+def _shifted(parent: np.ndarray | None, by: int | np.ndarray) -> np.ndarray:
     """Indices moved by so much; what is negative stays."""
     assert parent is not None
     return np.where(parent >= 0, parent + by, parent)

@@ -86,12 +86,24 @@ class Frames:
             cause, parent = part.cause, part.parent
         return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels, cause, parent)
 
+    def take(self, images: np.ndarray) -> Frames:
+        """Some images, in any order, repeated or not."""
+        rows = (np.asarray(images)[:, None] * self.pixels + np.arange(self.pixels)).reshape(-1)
+        first = None if self.first is None else self.first.take(images)
+        cause = parent = None
+        if self.cause is not None:
+            part = self.detections.take(images)
+            cause, parent = part.cause, part.parent
+        return Frames(self.bits[rows], first, self.frames, self.frame_time, self.pixels, cause, parent)
+
     @staticmethod
     def join(parts: list[Frames]) -> Frames:
         """Several batches, one after the other."""
         if len(parts) == 1:
             return parts[0]
         one = parts[0]
+        if len({(p.frames, p.frame_time, p.pixels) for p in parts}) > 1:
+            raise SpadError("frames of another number, time or size cannot be joined; read them apart")
         first = None if one.first is None else Events.join([f.first for f in parts if f.first is not None])
         cause = parent = None
         if one.cause is not None:

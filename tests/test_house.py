@@ -26,7 +26,7 @@ LAYERS = [
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
     {"validated"},
     {"effects", "readout", "images", "pictures", "window"},
-    {"recording"},
+    {"gather", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
     {"config"},

@@ -1,0 +1,77 @@
+"""Images in any order, out of data that are read in ranges."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .events import Events
+from .readout import Frames
+
+# images between two that are wanted, up to which they are read in one range: a chunk holds 32, and what lies between
+# them is unpacked with it anyway
+_NEAR = 32
+
+
+def indices_of(index: Any, length: int) -> int | range | np.ndarray:
+    """What an index means among `length` images: a number, a range (of a slice), or (n,) int64 (of a list or array).
+
+    Negative numbers count from the end; a mask is (length,) bool. Raises IndexError with a sentence.
+    """
+    if isinstance(index, slice):
+        return range(*index.indices(length))
+    if isinstance(index, range):
+        index = np.arange(index.start, index.stop, index.step)
+    if not isinstance(index, Sequence | np.ndarray) and hasattr(index, "__index__"):
+        one = operator.index(index)
+        if not -length <= one < length:
+            raise IndexError(f"image {one} was asked for; there are {length}")
+        return one % length
+    found = np.asarray(index)
+    if found.ndim == 0 and found.dtype.kind in "iu":
+        return indices_of(int(found), length)
+    if found.ndim == 1 and found.dtype == bool:
+        if len(found) != length:
+            raise IndexError(f"a mask of {len(found)} was given for {length} images; give one value for each")
+        return np.flatnonzero(found)
+    if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
+        raise IndexError("images are chosen by a number, a slice, a list or array of numbers, or a mask")
+    found = found.astype(np.int64)
+    outside = found[(found < -length) | (found >= length)]
+    if len(outside):
+        raise IndexError(f"image {outside[0]} was asked for; there are {length}")
+    return np.where(found < 0, found + length, found)
+
+
+def gather(get: Callable[[int, int], Any], indices: np.ndarray) -> Any:
+    """The images `indices`, in that order, of what `get(start, stop)` reads: arrays by image, `Events` or `Frames`.
+
+    Each image is read once, and neighbours in one range.
+    """
+    if not len(indices):
+        return get(0, 0)
+    wanted, back = np.unique(indices, return_inverse=True)
+    parts = []
+    for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > _NEAR) + 1):
+        first, stop = int(run[0]), int(run[-1]) + 1
+        piece = get(first, stop)
+        parts.append(piece if len(run) == stop - first else take(piece, run - first))
+    found = join(parts)
+    return found if np.array_equal(back, np.arange(len(wanted))) else take(found, back)
+
+
+def take(value: Any, images: np.ndarray) -> Any:
+    """Some images of a batch, in any order, repeated or not."""
+    return value.take(images) if isinstance(value, Events | Frames) else value[images]
+
+
+def join(parts: Sequence[Any]) -> Any:
+    """Several batches, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    if isinstance(parts[0], Events | Frames):
+        return type(parts[0]).join(list(parts))
+    return np.concatenate(parts)
