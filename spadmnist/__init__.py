@@ -30,6 +30,7 @@ _PUBLIC = {
     "Events": "events",
     "Layout": "events",
     "Sensor": "sensor",
+    "read_sensor": "config",
     "Effect": "effects",
     "Conditions": "effects",
     "parameter": "plugins",

@@ -12,11 +12,11 @@ import errno
 import io
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 from pydantic import Field
@@ -195,6 +195,40 @@ def build(
         causes=parts["causes"],
         notes=_notes(scene, source),
     )
+
+
+def of_sensor(
+    sensor: Sensor, recording: Mapping[str, Any], lux: Sequence[Any], wavelength: Any, methods: Sequence[str], seed: int
+) -> Experiment:
+    """An Experiment without images of its own. recording: as in a config; lux: levels, in lux or as "5 mlux";
+    wavelength alike; methods: reconstructions.
+
+    Raises ConfigError with every mistake.
+    """
+
+    def plain(value: Any, unit: str) -> Any:
+        return f"{float(value)!r} {unit}" if isinstance(value, int | float | np.number) else value
+
+    scene = {
+        "images": {"source": "uniform"},
+        "wavelength": plain(wavelength, "m"),
+        "lux": [plain(x, "lux") for x in lux],
+    }
+    raw = {"scene": scene, "recording": dict(recording), "reconstruct": list(methods)}
+    reader = _Reader(document.parse(document.dump(raw), "Simulated"), Path(), [])
+    parts = reader.sections(raw, {name: _SECTIONS[name] for name in raw}, {})
+    found = parts.get("scene"), parts.get("recording")
+    known = reader.levels(found[0]) if found[0] else ()
+    conditions = reader.conditions(found[1], found[0]) if found[1] else None
+    if found[1]:
+        reader.methods(list(methods), found[1])
+    if conditions and found[0] and found[1] and not reader.problems:
+        _Described(sensor, sensor, cast(Any, None), {}, reader, ("sensor",)).check_clock(conditions, found[1].readouts)
+    if reader.problems or not (conditions and found[0] and found[1]):
+        raise ConfigError(reader.problems)
+    readouts = tuple(r for r in READOUTS if r in found[1].readouts)
+    made = (seed, known, found[0].images, conditions, readouts, tuple(methods), sensor, "zarr")
+    return Experiment("Simulated", {}, Path(), *made)
 
 
 def _notes(scene: _Scene, source: Document) -> tuple[str, ...]:

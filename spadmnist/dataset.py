@@ -464,6 +464,8 @@ class _Backend(Protocol):
 
     def labels(self) -> np.ndarray | None: ...
 
+    def cuts(self, length: int, most: int) -> list[int]: ...
+
 
 class Field(Generic[T]):
     """One kind of data of a part, by image: `[i]`, `[a:b:step]`, `[[3, 1, 2]]`, an array of numbers or a mask."""
@@ -625,6 +627,10 @@ class Part:
 
     def __iter__(self) -> Iterator[Image]:
         return (Image(self, i) for i in range(self._length))
+
+    def cuts(self, most: int = 1 << 62) -> list[int]:
+        """Where reading may be cut: 0, the ends of shards, and the last image. Else no more than `most` apart."""
+        return self._backend.cuts(self._length, most)
 
     def _of(self, backend: _Backend, length: int, stored: bool | None = None) -> Part:
         """The like, of other images."""
@@ -805,6 +811,13 @@ class _Stored:
             return None
         return np.concatenate([reader.read("labels") for _, _, reader in self._originals])
 
+    def cuts(self, length: int, most: int) -> list[int]:
+        return [start for start, _, _ in self._shards] + [length]
+
+
+def _even_cuts(length: int, most: int) -> list[int]:
+    return [*range(0, length, max(1, min(most, length or 1))), length]
+
 
 def _alike(normalisation: float | None, start: int, stop: int) -> np.ndarray | None:
     return None if normalisation is None else np.full(stop - start, np.float32(normalisation))
@@ -883,6 +896,9 @@ class _Simulated:
         labels = self._splits[self._split].labels
         return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
 
+    def cuts(self, length: int, most: int) -> list[int]:
+        return _even_cuts(length, most)
+
 
 class _Chosen:
     """Some images of a part."""
@@ -918,6 +934,9 @@ class _Chosen:
     def labels(self) -> np.ndarray | None:
         labels = self._inner.labels()
         return None if labels is None else labels[np.asarray(self._indices, np.int64)]
+
+    def cuts(self, length: int, most: int) -> list[int]:
+        return _even_cuts(length, most)
 
 
 class _Concatenated:
@@ -960,6 +979,13 @@ class _Concatenated:
         found = [backend.labels() for backend in self._parts]
         known = [labels for labels in found if labels is not None]
         return np.concatenate(known) if len(known) == len(found) else None
+
+    def cuts(self, length: int, most: int) -> list[int]:
+        sizes = np.diff(self._starts).tolist()
+        inner = [backend.cuts(n, most) for backend, n in zip(self._parts, sizes, strict=True)]
+        return [int(start) + cut for start, cuts in zip(self._starts, inner, strict=False) for cut in cuts[:-1]] + [
+            length
+        ]
 
 
 def concatenate(parts: Sequence[Part]) -> Part:

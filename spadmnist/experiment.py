@@ -146,9 +146,15 @@ class Experiment:
 
     def simulate_block(self, level: Level, split: str, pixels: np.ndarray, white: float, first: int) -> Recorded:
         """As `simulate`, for the images `pixels` whose first has the index `first` (a multiple of the block)."""
+        return self.simulate_numbered(level, split, pixels, white, np.arange(first, first + len(pixels)))
+
+    def simulate_numbered(
+        self, level: Level, split: str, pixels: np.ndarray, white: float, images: np.ndarray
+    ) -> Recorded:
+        """As `simulate`, for images whose indices are `images`: any, or one whole block where the sensor has blocks."""
         channels = pixels[0].size // self.sensor.layout.pixels
         # each channel is an image of its own to the sensor
-        numbers = np.arange(first * channels, (first + len(pixels)) * channels, dtype=np.uint64)
+        numbers = (images[:, None] * channels + np.arange(channels)).reshape(-1).astype(np.uint64)
         photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
         streams = self.streams(level, split, numbers)
         made = self.sensor.expose(photons, self.conditions, streams, self.readouts, causes=self.causes)

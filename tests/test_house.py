@@ -26,7 +26,7 @@ LAYERS = [
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
     {"validated"},
     {"effects", "readout", "images", "pictures", "window"},
-    {"gather", "recording"},
+    {"gather", "grids", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
     {"config"},
@@ -36,7 +36,7 @@ LAYERS = [
     {"criticism"},
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
-    {"exporters", "fluxes"},
+    {"exporters", "fluxes", "torch"},
     {"cli"},
 ]
 LEVEL = {name: level for level, layer in enumerate(LAYERS) for name in layer}

@@ -224,9 +224,11 @@ def test_what_the_python_of_the_readme_reads(reader: Reader) -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="PyTorch is not installed")
 def test_the_loader_of_the_readme_loads(reader: Reader) -> None:
-    reader.read(having("DataLoader("))
+    reader.read(having("st.Fluxes("))
     fluxes, labels = next(iter(reader.names["loader"]))
     assert fluxes.shape == (64, 1, 28, 28) and labels.shape == (64,)
+    packed, (voxels, _) = next(iter(reader.names["events"])), next(iter(reader.names["voxels"]))
+    assert len(packed.offsets) == 65 and voxels.shape == (64, 10, 28, 28)
 
 
 @pytest.mark.parametrize("block", [pytest.param(b, id=b.effect) for b in BLOCKS if b.effect])

@@ -1,0 +1,587 @@
+"""Datasets for PyTorch: sets by index, a shuffled stream, transforms of events, and images that are simulated afresh.
+
+    import spadmnist.torch as st
+    loader = DataLoader(st.Fluxes(part), batch_size=64, shuffle=True, num_workers=2)
+
+An item is (tensor or `Events`, int label); the label is -1 where the images have none. Nothing here holds an open file:
+workers may be forked, spawned or kept. torch is the user's own; this module alone imports it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+try:
+    import torch
+    from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
+except ImportError:
+    raise ImportError(
+        "spadmnist.torch needs PyTorch, which is not installed: pip install 'spadmnist[train]' (on Linux this takes "
+        "gigabytes of CUDA; https://pytorch.org/get-started tells how to install the build for CPUs)"
+    ) from None
+
+from . import config, grids, reconstruct
+from .dataset import Part
+from .errors import SpadError
+from .events import Events as EventBatch
+from .experiment import Experiment, Level
+from .gather import join
+from .grids import structured
+from .readout import READOUTS
+from .sensor import Sensor
+
+_IN_MEMORY = 1 << 30  # bytes of fluxes up to which a set is read once and kept: MNIST at five levels
+_BUFFER = 4  # pieces whose images a stream shuffles together: shards of at most some 80 MB
+_PIECE = 256  # images of a piece where nothing is stored in shards
+_NO_LABEL = -1
+
+
+# --- sets by index ------------------------------------------------------------------------------------------------
+
+
+class _Set(Dataset[Any]):
+    """Map-style: `[i]` is an item; `__getitems__` gives those of a batch, read by blocks."""
+
+    def __init__(self, part: Part):
+        self.part = part
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def _read(self, indices: np.ndarray) -> Sequence[Any]:
+        raise TypeError(f"{type(self).__name__} must define _read")
+
+    def __getitems__(self, indices: Sequence[int]) -> list[tuple[Any, int]]:
+        chosen = np.asarray(indices, np.int64)
+        return list(zip(self._read(chosen), _labels(self.part, chosen), strict=True))
+
+    def __getitem__(self, index: int) -> tuple[Any, int]:
+        return self.__getitems__([index])[0]
+
+
+class Fluxes(_Set):
+    """Flux images of a method: items of a (channels, rows, columns) float32 tensor and the label.
+
+    normalised: divided by the training median of the level. Up to 1 GB of them are read once and kept in memory; more
+    are read as they are asked for. Raises SpadError for a method that the part lacks.
+    """
+
+    def __init__(self, part: Part, method: str = "counts", normalised: bool = True):
+        super().__init__(part)
+        self.method, self.normalised = _method(part, method), normalised
+        _ = self._field  # in the parent: a part that is simulated works the median out, once
+        self._kept: torch.Tensor | None = None
+        self._keeps = len(part) * int(np.prod(part.shape)) * 4 <= _IN_MEMORY
+        if self._keeps:
+            self._keep()
+
+    @property
+    def _field(self) -> Any:
+        found = self.part.reconstruction[self.method]
+        return found.normalised if self.normalised else found
+
+    def _keep(self) -> torch.Tensor:
+        if self._kept is None:
+            self._kept = torch.from_numpy(_with_channel(self._field[:], self.part))
+        return self._kept
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Another process reads the images itself."""
+        return {**self.__dict__, "_kept": None}
+
+    def _read(self, indices: np.ndarray) -> Sequence[torch.Tensor]:
+        if self._keeps:
+            return self._keep()[torch.from_numpy(indices)].unbind()
+        return torch.from_numpy(_with_channel(self._field[indices], self.part)).unbind()
+
+
+class Frames(_Set):
+    """Frames: items of a (frames, rows, columns) tensor, colour a leading channel axis, and the label.
+
+    readout: qis (uint8, 0 or 1), str (float32, s since the start of the frame, the frame time where there is no
+    detection) or counts (int32).
+    """
+
+    def __init__(self, part: Part, readout: str = "qis"):
+        super().__init__(part)
+        if readout not in ("qis", "str", "counts") or readout not in part.readouts:
+            there = ", ".join(r for r in part.readouts if r != "tr") or "none"
+            raise SpadError(f"{readout!r} is no readout of frames that was recorded here; there are {there}")
+        self.readout = readout
+
+    def _read(self, indices: np.ndarray) -> Sequence[torch.Tensor]:
+        return _frames(self.part, self.readout, indices).unbind()
+
+
+class Events(_Set):
+    """Time stamps (TR): items of a `spadmnist.Events` of one image, or what `transform` makes of it, and the label.
+
+    Collate them with `collate_packed`, `collate_padded` or `collate_nested`.
+    """
+
+    def __init__(self, part: Part, transform: Callable[[EventBatch], Any] | None = None):
+        super().__init__(part)
+        self.transform = transform
+        _ = part.tr  # says so where TR was not recorded
+
+    def _read(self, indices: np.ndarray) -> Sequence[Any]:
+        batch = self.part.tr[indices]
+        return [_transformed(batch.images(i, i + 1), self.transform) for i in range(len(indices))]
+
+
+def _method(part: Part, method: str) -> str:
+    if method not in part.reconstruction:
+        there = ", ".join(part.reconstruction) or "none"
+        raise SpadError(f"{method!r} is no reconstruction of this part; there are {there}")
+    return method
+
+
+def _labels(part: Part, indices: np.ndarray) -> list[int]:
+    labels = part.labels
+    return [_NO_LABEL] * len(indices) if labels is None else [int(x) for x in labels[indices]]
+
+
+def _with_channel(images: np.ndarray, part: Part) -> np.ndarray:
+    return images if len(part.shape) == 3 else images[:, None]
+
+
+def _frames(part: Part, readout: str, index: Any) -> torch.Tensor:
+    found = getattr(part, readout)[index]
+    kind = {"qis": np.uint8, "str": np.float32, "counts": np.int32}[readout]
+    return torch.from_numpy(np.ascontiguousarray(found.astype(kind, copy=False)))
+
+
+def _transformed(events: EventBatch, transform: Callable[[EventBatch], Any] | None) -> Any:
+    return events if transform is None else transform(events)
+
+
+# --- a shuffled stream --------------------------------------------------------------------------------------------
+
+
+class Stream(IterableDataset[Any]):
+    """Items in an order of chance, read shard by shard; see `stream`."""
+
+    def __init__(
+        self, part: Part, kind: str, method: str | None, seed: int, rank: int, world: int, transform: Any, buffer: int
+    ):
+        if not 0 <= rank < world:
+            raise SpadError(f"rank: {rank} of {world} is not possible; ranks are 0 to {world - 1}")
+        if buffer < 1:
+            raise SpadError(f"buffer: {buffer} pieces are not possible; give 1 or more")
+        self.part, self.kind, self.seed, self.rank, self.world = part, kind, seed, rank, world
+        self.transform, self.buffer = transform, buffer
+        self._method = method
+        self._epoch = _Shared()
+        self._done, self._goes_on = 0, False
+        if kind == "events":
+            _ = part.tr
+        elif kind == "fluxes":
+            self._method = _method(part, method or "counts")
+            _ = part.reconstruction[self._method].normalised[:0]
+        elif kind == "frames":
+            known = [r for r in ("qis", "str", "counts") if r in part.readouts]
+            self._method = Frames(part, method or (known or ["qis"])[0]).readout
+        else:
+            raise SpadError(f"kind: {kind!r} is not possible; it is events, fluxes or frames")
+        if kind == "events" and method is not None:
+            raise SpadError("method: events have none; leave it out, or take kind='fluxes'")
+
+    def set_epoch(self, epoch: int) -> None:
+        """Another order, from the next pass on. It reaches workers that are kept."""
+        self._epoch.value = epoch
+
+    def __len__(self) -> int:
+        """Items of this rank, over all its workers."""
+        total = len(self.part)
+        return (self.rank + 1) * total // self.world - self.rank * total // self.world
+
+    def _share(self) -> tuple[int, int]:
+        """(which consumer this is, of how many): workers of rank 0 first."""
+        info = get_worker_info()
+        workers, worker = (1, 0) if info is None else (info.num_workers, info.id)
+        return self.rank * workers + worker, self.world * workers
+
+    def state_dict(self) -> dict[str, int]:
+        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
+        consumer, consumers = self._share()
+        return {
+            "seed": self.seed,
+            "epoch": self._epoch.value,
+            "done": self._done,
+            "consumer": consumer,
+            "consumers": consumers,
+        }
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Go on where `state` was taken. Raises SpadError where it is of another seed, worker or rank."""
+        own = self.state_dict()
+        for name in ("seed", "consumer", "consumers"):
+            if state.get(name) != own[name]:
+                raise SpadError(f"the state is of {name} {state.get(name)}, but this stream has {own[name]}")
+        self._epoch.value, self._done, self._goes_on = int(state["epoch"]), int(state["done"]), True
+
+    def _pieces(self) -> list[tuple[int, int]]:
+        """(start, stop) of images of this consumer, in the order of this epoch: whole shards, cut at its two ends.
+
+        The shards follow one another in an order of chance, and each consumer has an equal share of their images.
+        """
+        consumer, consumers = self._share()
+        cuts = self.part.cuts(_PIECE)
+        order = self._random("order").permutation(len(cuts) - 1)
+        total = len(self.part)
+        low, high = consumer * total // consumers, (consumer + 1) * total // consumers
+        found, at = [], 0
+        for k in order:
+            start, stop = cuts[k], cuts[k + 1]
+            first, last = max(low - at, 0), min(high - at, stop - start)
+            if first < last:
+                found.append((start + first, start + last))
+            at += stop - start
+        return found
+
+    def _random(self, *names: Any) -> np.random.Generator:
+        text = "/".join(map(str, (self.seed, self._epoch.value, *names)))
+        words = np.frombuffer(hashlib.sha256(text.encode()).digest(), "<u4")
+        return np.random.Generator(np.random.Philox(np.random.SeedSequence(words.tolist())))
+
+    def __iter__(self) -> Iterator[tuple[Any, int]]:
+        skipped = self._done if self._goes_on else 0
+        self._done, self._goes_on = skipped, False
+        pieces = self._pieces()
+        for k in range(0, len(pieces), self.buffer):
+            group = pieces[k : k + self.buffer]
+            numbers = np.concatenate([np.arange(*piece) for piece in group])
+            if skipped >= len(numbers):
+                skipped -= len(numbers)
+                continue
+            order = self._random("buffer", self._share()[0], k).permutation(len(numbers))[skipped:]
+            skipped = 0
+            items, labels = self._loaded(group), _labels(self.part, numbers)
+            for i in order.tolist():
+                self._done += 1
+                yield items(i), labels[i]
+
+    def _loaded(self, group: Sequence[tuple[int, int]]) -> Callable[[int], Any]:
+        ranges = [slice(*piece) for piece in group]
+        if self.kind == "events":
+            batch = join([self.part.tr[piece] for piece in ranges])
+            return lambda i: _transformed(batch.images(i, i + 1), self.transform)
+        if self.kind == "fluxes":
+            assert self._method is not None
+            field = self.part.reconstruction[self._method].normalised
+            images = _with_channel(np.concatenate([field[piece] for piece in ranges]), self.part)
+            return torch.from_numpy(images).unbind().__getitem__
+        assert self._method is not None
+        frames = [_frames(self.part, self._method, piece) for piece in ranges]
+        return torch.cat(frames).unbind().__getitem__
+
+
+def stream(
+    part: Part,
+    kind: str = "events",
+    method: str | None = None,
+    seed: int = 0,
+    rank: int = 0,
+    world: int = 1,
+    transform: Callable[[EventBatch], Any] | None = None,
+    buffer: int = _BUFFER,
+) -> Stream:
+    """Items of a part in an order of chance, each once over all workers and ranks; an iterable set for a DataLoader.
+
+    kind: "events", "fluxes" (normalised; method: the reconstruction, counts if not given) or "frames" (method: the
+    readout, the first of qis, str, counts that was recorded). rank, world: which of how many processes this is; each
+    gets as many items as another, or one more. transform: of events. buffer: shards whose images are shuffled together,
+    and held in memory. The order is a function of seed, epoch (`set_epoch`), and the numbers of workers and ranks.
+    Raises SpadError with a sentence.
+    """
+    return Stream(part, kind, method, seed, rank, world, transform, buffer)
+
+
+class _Shared:
+    """A whole number that workers see when it is changed, forked or spawned."""
+
+    def __init__(self) -> None:
+        self._cell = torch.zeros(1, dtype=torch.int64).share_memory_()
+
+    @property
+    def value(self) -> int:
+        return int(self._cell[0])
+
+    @value.setter
+    def value(self, value: int) -> None:
+        if value < 0:
+            raise SpadError(f"epoch: {value} is not possible; epochs count from 0")
+        self._cell[0] = value
+
+
+# --- batches of events --------------------------------------------------------------------------------------------
+
+
+class Packed(NamedTuple):
+    """Events of several images, one after the other.
+
+    times: (events,) float64, s; pixel: (events,) int64 within its image; offsets: (images + 1,) int64, where each
+    image's events begin; labels: (images,) int64.
+    """
+
+    times: torch.Tensor
+    pixel: torch.Tensor
+    offsets: torch.Tensor
+    labels: torch.Tensor
+
+
+class Padded(NamedTuple):
+    """Events of several images, as many to each as the longest has.
+
+    times: (images, most) float64, s, 0 behind the last; pixel: (images, most) int64, alike; mask: (images, most) bool,
+    true where there is an event; labels: (images,) int64.
+    """
+
+    times: torch.Tensor
+    pixel: torch.Tensor
+    mask: torch.Tensor
+    labels: torch.Tensor
+
+
+class Nested(NamedTuple):
+    """Events of several images as jagged nested tensors (images, events of each): times, s, and pixel; labels."""
+
+    times: torch.Tensor
+    pixel: torch.Tensor
+    labels: torch.Tensor
+
+
+def collate_packed(items: Sequence[tuple[EventBatch, int]]) -> Packed:
+    """Items of `Events` as one `Packed`."""
+    events = [one for one, _ in items]
+    for one in events:
+        if not isinstance(one, EventBatch):
+            raise SpadError(f"collate: {type(one).__name__} are no events; leave the transform out, or this collate")
+    offsets = np.cumsum([0, *map(len, events)])
+    times = torch.from_numpy(np.concatenate([one.times for one in events]))
+    pixel = torch.from_numpy(np.concatenate([one.pixel for one in events]))
+    return Packed(times, pixel, torch.from_numpy(offsets), torch.tensor([label for _, label in items]))
+
+
+def collate_padded(items: Sequence[tuple[EventBatch, int]]) -> Padded:
+    """Items of `Events` as one `Padded`."""
+    packed = collate_packed(items)
+    counts = packed.offsets.diff()
+    mask = torch.arange(int(counts.max()))[None, :] < counts[:, None]
+    times = torch.zeros(mask.shape, dtype=packed.times.dtype)
+    pixel = torch.zeros(mask.shape, dtype=packed.pixel.dtype)
+    times[mask], pixel[mask] = packed.times, packed.pixel
+    return Padded(times, pixel, mask, packed.labels)
+
+
+def collate_nested(items: Sequence[tuple[EventBatch, int]]) -> Nested:
+    """Items of `Events` as one `Nested`."""
+    packed = collate_packed(items)
+    nested = [torch.nested.nested_tensor_from_jagged(x, packed.offsets) for x in (packed.times, packed.pixel)]
+    return Nested(nested[0], nested[1], packed.labels)
+
+
+# --- transforms of events -----------------------------------------------------------------------------------------
+
+
+class ToFrames(grids.Frames):
+    """As `grids.Frames`: detections in bins of equal time, as a float32 tensor (frames, rows, columns)."""
+
+    def __call__(self, events: EventBatch) -> torch.Tensor:
+        return torch.from_numpy(super().__call__(events))
+
+
+class ToVoxelGrid(grids.VoxelGrid):
+    """As `grids.VoxelGrid`: detections shared out between two bins, as a float32 tensor (bins, rows, columns)."""
+
+    def __call__(self, events: EventBatch) -> torch.Tensor:
+        return torch.from_numpy(super().__call__(events))
+
+
+class ToTimeSurface(grids.TimeSurface):
+    """As `grids.TimeSurface`: what fades since the last detection, as a float32 tensor (bins, rows, columns)."""
+
+    def __call__(self, events: EventBatch) -> torch.Tensor:
+        return torch.from_numpy(super().__call__(events))
+
+
+class ToStructured:
+    """The events of an image as a structured array x, y, t, p, which the transforms of tonic take; see `structured`.
+
+    columns: of the image; unit: of t, s, or None for whole ticks of the converter.
+    """
+
+    def __init__(self, columns: int, unit: float | None = None):
+        self.columns, self.unit = columns, unit
+
+    def __call__(self, events: EventBatch) -> np.ndarray:
+        return structured(events, self.columns, self.unit)
+
+
+# --- images that are simulated as they are asked for ----------------------------------------------------------------
+
+
+class Simulated(Dataset[Any]):
+    """Any map-style set of images, seen by a sensor: fresh photons in every epoch, never the same noise twice.
+
+    images: items of an image, or of (image, label): PIL images, arrays or tensors of (rows, columns), (channels, rows,
+    columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1. sensor: as `read_sensor` gives it.
+    recording: a mapping, as in a config. lux: a level (lux, or as "5 mlux"), or (low, high): then each image has a
+    level of its own in each epoch, drawn evenly on a logarithmic scale. returns: a reconstruction (float32 tensor
+    (channels, rows, columns), divided by `scale`), or a readout: tr (`Events`), qis, str or counts (tensors as of
+    `Frames`).
+
+    In epoch 0, at one level, image i is image i of `generate` with the same seed and split. `set_epoch` begins another
+    epoch, in workers that are kept, too; an image that is asked for a second time in one epoch raises SpadError.
+    """
+
+    def __init__(
+        self,
+        images: Any,
+        sensor: Sensor,
+        *,
+        recording: Mapping[str, Any],
+        lux: Any,
+        returns: str = "counts",
+        split: str = "train",
+        seed: int = 0,
+        wavelength: float | str = 555e-9,
+        scale: float = 1.0,
+        transform: Callable[[EventBatch], Any] | None = None,
+    ):
+        self.images, self.split, self.returns, self.scale, self.transform = images, split, returns, scale, transform
+        levels = [lux] if isinstance(lux, str | int | float) else list(lux)
+        if len(levels) not in (1, 2):
+            raise SpadError("lux: give one level, or (low, high)")
+        methods = [returns] if returns in reconstruct.Method.registry else []
+        if not methods and returns not in READOUTS:
+            known = ", ".join([*READOUTS, *reconstruct.Method.registry])
+            raise SpadError(f"returns: {returns!r} is neither a readout nor a reconstruction; there are {known}")
+        needed = list(reconstruct.find(returns).readouts()) if methods else [returns]
+        self.experiment: Experiment = config.of_sensor(
+            sensor, {**recording, "readouts": needed}, levels, wavelength, methods, seed
+        )
+        self.range = self.experiment.levels if len(levels) == 2 else None
+        if self.range and not self.range[0].value < self.range[1].value:
+            raise SpadError(f"lux: {self.range[0].text} is not below {self.range[1].text}; give (low, high)")
+        self._epoch = _Shared()
+        self._seen = torch.zeros(len(images), dtype=torch.uint8).share_memory_()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begin an epoch, before a pass: all images may be asked for again, and each epoch has its own photons."""
+        self._epoch.value = epoch
+        self._seen.zero_()
+
+    def __getitem__(self, index: int) -> tuple[Any, int]:
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[tuple[Any, int]]:
+        chosen = np.asarray(indices, np.int64)
+        outside = chosen[(chosen < 0) | (chosen >= len(self))]
+        if len(outside):
+            raise IndexError(f"image {outside[0]} was asked for; there are {len(self)}")
+        epoch = self._epoch.value
+        again = [int(i) for i in chosen if self._seen[int(i)]]
+        if again or len(set(chosen.tolist())) < len(chosen):
+            raise SpadError(
+                f"image {again[0] if again else int(chosen[0])} was simulated in epoch {epoch} already, and would have "
+                f"the same noise again; call set_epoch({epoch + 1}) before the next pass"
+            )
+        self._seen[torch.from_numpy(chosen)] = 1
+        block = self.experiment.sensor.block
+        if block == 1:
+            return self._simulated(chosen, np.arange(len(chosen)), epoch)
+        found: dict[int, tuple[Any, int]] = {}
+        for first in np.unique(chosen // block) * block:
+            mine = chosen[chosen // block * block == first]
+            whole = np.arange(first, min(first + block, len(self)))
+            found.update(zip(mine.tolist(), self._simulated(whole, mine - first, epoch), strict=True))
+        return [found[int(i)] for i in chosen]
+
+    def _simulated(self, numbers: np.ndarray, wanted: np.ndarray, epoch: int) -> list[tuple[Any, int]]:
+        """The items `wanted` of the images `numbers`, which are simulated together."""
+        shown = [_image(self.images[int(i)]) for i in numbers]
+        pixels, white = np.stack([image for image, _, _ in shown]), shown[0][1]
+        layout = self.experiment.sensor.layout
+        if pixels.shape[-2:] != layout.shape:
+            size = " x ".join(map(str, pixels.shape[-2:]))
+            raise SpadError(
+                f"the images are {size} pixels, but the sensor {layout.rows} x {layout.columns}; resize them"
+            )
+        # in the first epoch the streams are those of `generate`
+        split = self.split if epoch == 0 else f"{self.split}/epoch {epoch}"
+        if self.range is None:
+            made = self.experiment.simulate_numbered(self.experiment.levels[0], split, pixels, white, numbers)
+        else:
+            brightest = self.range[1]
+            level = Level(f"{self.range[0].text} to {brightest.text}", "lux", brightest.value)
+            share = self._levels(numbers, epoch) / brightest.value
+            dimmed = pixels * share.reshape(-1, *[1] * (pixels.ndim - 1))
+            made = self.experiment.simulate_numbered(level, f"{split}/{self.range[0].key}", dimmed, white, numbers)
+        labels = [shown[int(i)][2] for i in wanted]
+        channels = pixels.shape[1:-2]
+        if self.returns in reconstruct.Method.registry:
+            values, _ = reconstruct.find(self.returns).image(made, self.experiment.settings)
+            images = values.reshape(len(numbers), *(channels or (1,)), *layout.shape)[wanted] / np.float32(self.scale)
+            return list(zip(torch.from_numpy(images).unbind(), labels, strict=True))
+        if self.returns == "tr":
+            assert made.tr is not None
+            batch = made.tr
+            return [
+                (_transformed(batch.images(int(i), int(i) + 1), self.transform), label)
+                for i, label in zip(wanted, labels, strict=True)
+            ]
+        if self.returns == "counts":
+            assert made.tally is not None
+            dense, kind = np.moveaxis(made.tally.reshape(len(numbers), made.pixels, -1), -1, 1), np.int32
+        else:
+            assert made.frames is not None
+            dense = made.frames.unpacked() if self.returns == "qis" else made.frames.stamps()
+            kind = np.uint8 if self.returns == "qis" else np.float32  # type: ignore[assignment]
+        dense = dense.reshape(*dense.shape[:2], *channels, *layout.shape)
+        dense = np.moveaxis(dense, 2, 1) if channels else dense
+        frames = torch.from_numpy(np.ascontiguousarray(dense[wanted].astype(kind, copy=False)))
+        return list(zip(frames.unbind(), labels, strict=True))
+
+    def _levels(self, numbers: np.ndarray, epoch: int) -> np.ndarray:
+        """(n,) lux of each image in this epoch."""
+        assert self.range is not None
+        low, high = (level.value for level in self.range)
+        out = np.empty(len(numbers))
+        for k, number in enumerate(numbers.tolist()):
+            text = f"{self.experiment.seed}/{self.split}/{epoch}/{number}/lux"
+            word = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+            out[k] = low * (high / low) ** (word / 2**64)
+        return out
+
+
+def _image(item: Any) -> tuple[np.ndarray, float, int]:
+    """(grey levels, white, label) of an item of somebody's set of images."""
+    image, label = item if isinstance(item, tuple | list) and len(item) == 2 else (item, _NO_LABEL)
+    array = image.numpy() if isinstance(image, torch.Tensor) else np.asarray(image)
+    if array.ndim == 3 and array.shape[-1] in (3, 4) and not isinstance(image, torch.Tensor):
+        array = np.moveaxis(array[..., :3], -1, 0)  # PIL's channels come last
+    if array.ndim == 3 and len(array) == 1:
+        array = array[0]
+    if array.ndim not in (2, 3):
+        raise SpadError(f"an image is an array of {array.ndim} axes; give (rows, columns) or (channels, rows, columns)")
+    if array.dtype == bool:
+        array = array.astype(np.uint8) * np.uint8(255)
+    if array.dtype in (np.uint8, np.uint16):
+        return array, float(np.iinfo(array.dtype).max), int(label)
+    if array.dtype.kind != "f" or not (array.size and array.min() >= 0 and array.max() <= 1):
+        raise SpadError(f"an image of {array.dtype} is not from 0 to 1; give uint8, uint16, or floats from 0 to 1")
+    return array.astype(np.float64), 1.0, int(label)
+
+
+__all__ = [
+    "Events", "Fluxes", "Frames", "Nested", "Packed", "Padded", "Simulated", "Stream", "ToFrames", "ToStructured",
+    "ToTimeSurface", "ToVoxelGrid", "collate_nested", "collate_packed", "collate_padded", "default_collate", "stream",
+]  # fmt: skip

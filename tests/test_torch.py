@@ -1,0 +1,535 @@
+"""Sets for PyTorch: the same values as `part`, in every order and start method; each image once; fresh photons."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import spadmnist
+from spadmnist import config, factory, grids
+from spadmnist.errors import ConfigError, SpadError
+from spadmnist.events import Events
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+from torch.utils.data import DataLoader  # noqa: E402
+
+import spadmnist.torch as st  # noqa: E402
+
+N = 70
+CONFIG = """
+seed: 3
+scene:
+  images: {source: digits, train: 70, test: 6}
+  wavelength: 555 nm
+  lux: [2 lux, 30 lux]
+recording: {exposure: 30 us, frames: 3, frame_time: 8 us, frame_period: 10 us, bits: 2, readouts: READOUTS}
+sensor:
+  rules: paper
+  layout: {rows: 28, columns: 28, pixel_area: 25 um^2, fill_factor: 1}
+  effects: {detection: {pdp: 0.5}, dead_time: {duration: 50 ns}, tdc: {resolution: 1 ns}}
+"""
+RECORDING = {"exposure": "30 us", "frames": 3, "frame_time": "8 us", "frame_period": "10 us"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("torch")
+    (root / "lab.yaml").write_text(CONFIG.replace("READOUTS", "[tr, str, qis, counts]"))
+    # small shards, so that there is something to shuffle
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spadmnist.dataset._IMAGES_PER_SHARD", 10)
+        experiment = config.read(root / "lab.yaml")
+        factory.generate(experiment, experiment.load_images(), root / "out", 1)
+    return root
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> spadmnist.Dataset:
+    return spadmnist.open(folder / "out")
+
+
+@pytest.fixture(scope="module")
+def part(dataset: spadmnist.Dataset) -> spadmnist.Part:
+    return dataset["30 lux", "train"]
+
+
+def expected(part: spadmnist.Part, kind: str, i: int) -> np.ndarray:
+    if kind == "events":
+        return part.tr[i].times
+    if kind == "fluxes":
+        return part.reconstruction["counts"].normalised[i][None]
+    return np.asarray(getattr(part, kind)[i])
+
+
+def sets(part: spadmnist.Part) -> dict[str, Any]:
+    frames = {name: st.Frames(part, name) for name in ("qis", "str", "counts")}
+    return {"fluxes": st.Fluxes(part), "events": st.Events(part), **frames}
+
+
+def values(item: Any) -> np.ndarray:
+    return np.asarray(item.times if isinstance(item, Events) else item)
+
+
+def identity(items: Sequence[Any]) -> Sequence[Any]:
+    return items
+
+
+# --- sets by index ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_items_are_those_of_the_part(part: spadmnist.Part, folder: Path, stored: bool) -> None:
+    part = part if stored else spadmnist.open(folder / "lab.yaml")["30 lux", "train"]
+    for kind, made in sets(part).items():
+        assert len(made) == N
+        for indices in ([0, 1, 2], [69, 3, 33, 3], [12]):
+            items = made.__getitems__(indices)
+            assert len(items) == len(indices)
+            for i, (item, label) in zip(indices, items, strict=True):
+                right = expected(part, kind, i)
+                right = right.astype({"str": np.float32, "counts": np.int32}.get(kind, right.dtype))
+                assert np.array_equal(values(item), right) and values(item).dtype == right.dtype, (kind, i)
+                assert type(label) is int and label == part.labels[i]  # type: ignore[index]
+        assert np.array_equal(values(made[5][0]), values(made.__getitems__([5])[0][0]))
+
+
+def test_fluxes_beyond_memory_are_read_as_they_are_asked_for(
+    part: spadmnist.Part, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = st.Fluxes(part, "passive_free_running", normalised=False)
+    monkeypatch.setattr(st, "_IN_MEMORY", 1000)
+    read = st.Fluxes(part, "passive_free_running", normalised=False)
+    assert kept._kept is not None and read._kept is None
+    order = [9, 3, 69, 0]
+    for (a, _), (b, _) in zip(kept.__getitems__(order), read.__getitems__(order), strict=True):
+        assert torch.equal(a, b)
+    assert read._kept is None
+
+
+def test_images_without_labels(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    text = CONFIG.replace("READOUTS", "[tr, str, qis, counts]").replace(
+        "{source: digits, train: 70, test: 6}", "{source: uniform, repetitions: 4}"
+    )
+    file.write_text(text)
+    assert [label for _, label in st.Events(spadmnist.open(file)["2 lux"]).__getitems__([0, 2])] == [-1, -1]
+
+
+WORKERS = [
+    pytest.param("fork", False, id="fork"),
+    pytest.param("fork", True, id="fork, kept"),
+    pytest.param("spawn", True, id="spawn, kept", marks=pytest.mark.slow),
+    pytest.param("forkserver", False, id="forkserver", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("method", "persistent"), WORKERS)
+def test_workers_give_the_same(part: spadmnist.Part, method: str, persistent: bool) -> None:
+    for made, collate in ((st.Fluxes(part), None), (st.Events(part), st.collate_packed)):
+        loader = DataLoader(
+            made, batch_size=16, num_workers=2, multiprocessing_context=method, persistent_workers=persistent,
+            collate_fn=collate, sampler=list(reversed(range(N))),
+        )  # fmt: skip
+        alone = DataLoader(made, batch_size=16, collate_fn=collate, sampler=list(reversed(range(N))))
+        for _ in range(2):
+            for a, b in zip(loader, alone, strict=True):
+                assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_a_worker_is_sent_kilobytes(folder: Path, part: spadmnist.Part) -> None:
+    simulated = spadmnist.open(folder / "lab.yaml")["30 lux", "train"]
+    for one in (part, simulated, spadmnist.concatenate([part, part])):
+        for made in (*sets(one).values(), st.stream(one), st.stream(one, "fluxes")):
+            buffer = io.BytesIO()
+            ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump(made)
+            assert buffer.tell() < 100_000
+
+
+# --- batches and transforms ---------------------------------------------------------------------------------------
+
+
+def test_collates(part: spadmnist.Part) -> None:
+    items = st.Events(part).__getitems__([4, 0, 9])
+    packed, padded, nested = st.collate_packed(items), st.collate_padded(items), st.collate_nested(items)
+    assert packed.labels.tolist() == padded.labels.tolist() == nested.labels.tolist() == [x for _, x in items]
+    assert padded.times.shape == padded.mask.shape == (3, max(len(e) for e, _ in items))
+    for k, (events, _) in enumerate(items):
+        cut = slice(int(packed.offsets[k]), int(packed.offsets[k + 1]))
+        for times, pixel in (
+            (packed.times[cut], packed.pixel[cut]),
+            (padded.times[k][padded.mask[k]], padded.pixel[k][padded.mask[k]]),
+            (nested.times[k], nested.pixel[k]),
+        ):
+            assert np.array_equal(times, events.times) and np.array_equal(pixel, events.pixel)
+    assert not padded.times[~padded.mask].any() and not padded.pixel[~padded.mask].any()
+    with pytest.raises(SpadError, match="Tensor are no events"):
+        st.collate_packed(st.Fluxes(part).__getitems__([0]))
+
+
+def by_hand(rows: list[list[float]], pixels: int = 2) -> Events:
+    return Events(np.concatenate([[], *rows]), np.cumsum([0, *map(len, rows)]), pixels)
+
+
+def test_frames_of_events_by_hand() -> None:
+    events = by_hand([[0.0, 0.24, 0.25, 0.99], []])
+    assert st.ToFrames((1, 2), 4, 1.0)(events).tolist() == [[[2, 0]], [[1, 0]], [[0, 0]], [[1, 0]]]
+    assert st.ToFrames((1, 2), 4, 1.0, binary=True)(events)[0].tolist() == [[1, 0]]
+    two = st.ToFrames((1, 2), 1, 1.0)(by_hand([[0.5], [], [], [0.1, 0.2]]))
+    assert two.shape == (2, 1, 1, 2) and two.ravel().tolist() == [1, 0, 0, 2]
+    colour = st.ToFrames((3, 1, 1), 2, 1.0)(by_hand([[0.1], [0.6], []], 3))
+    assert colour.shape == (3, 2, 1, 1) and colour.reshape(3, 2).tolist() == [[1, 0], [0, 1], [0, 0]]
+
+
+def test_voxels_by_hand() -> None:
+    """Four bins, whose middles lie at 1/8, 3/8, 5/8 and 7/8."""
+    grid = st.ToVoxelGrid((1, 2), 4, 1.0)
+    one = grid(by_hand([[0.0, 1 / 8, 1 / 4, 0.99], [0.6]]))[:, 0]
+    assert one[:, 0].tolist() == [2.5, 0.5, 0.0, 1.0]
+    assert np.allclose(one[:, 1], [0, 0.1, 0.9, 0])
+    assert st.ToVoxelGrid((1, 2), 1, 1.0)(by_hand([[0.1, 0.9], []])).ravel().tolist() == [2, 0]
+
+
+def test_a_time_surface_by_hand() -> None:
+    surface = st.ToTimeSurface((1, 2), 0.5, 1.0, bins=2)(by_hand([[0.1, 0.4, 0.75], []]))
+    assert np.allclose(surface[:, 0, 0], np.exp([-0.1 / 0.5, -0.25 / 0.5])) and not surface[:, 0, 1].any()
+
+
+def test_frames_of_events_are_the_counts(part: spadmnist.Part) -> None:
+    """Added up over the bins: the detections of each pixel."""
+    events = part.tr[7]
+    for transform in (st.ToFrames((28, 28), 10, 30e-6), st.ToVoxelGrid((28, 28), 10, 30e-6)):
+        assert np.allclose(transform(events).sum(0).ravel(), events.counts, atol=1e-3)
+
+
+def test_structured_events(part: spadmnist.Part) -> None:
+    events = part.tr[7]
+    made = st.ToStructured(28)(events)
+    assert made.dtype.names == ("x", "y", "t", "p") and made["p"].all() and (np.diff(made["t"]) >= 0).all()
+    order = np.lexsort((events.ticks, events.pixel))  # type: ignore[arg-type]
+    again = np.lexsort((made["t"], made["y"] * 28 + made["x"]))
+    assert np.array_equal(made["t"][again], events.ticks[order])  # type: ignore[index]
+    assert np.array_equal((made["y"] * 28 + made["x"])[again], events.pixel[order])
+    assert np.array_equal(grids.structured(events, 28, 1e-9)["t"], made["t"])
+    with pytest.raises(SpadError, match="no converter's ticks; give the unit"):
+        grids.structured(by_hand([[0.1], []]), 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: st.ToFrames((28,), 10, 1.0), r"is no image; give \(rows, columns\)"),
+        (lambda: st.ToFrames((28, 28), 0, 1.0), "number of bins is 0"),
+        (lambda: st.ToFrames((28, 28), 2, np.nan), "exposure: nan s"),
+        (lambda: st.ToTimeSurface((28, 28), -1.0, 1.0), "tau: -1.0 s"),
+        (lambda: st.ToFrames((3, 3), 2, 1.0)(by_hand([[], []])), "has 9 pixels, but the events are of images of 2"),
+    ],
+)
+def test_wrong_transforms_are_sentences(make: Any, says: str) -> None:
+    with pytest.raises(SpadError, match=says):
+        make()
+
+
+def test_a_transform_in_a_set(part: spadmnist.Part) -> None:
+    made = st.Events(part, st.ToFrames((28, 28), 5, 30e-6))
+    batch, labels = next(iter(DataLoader(made, batch_size=8)))
+    assert batch.shape == (8, 5, 28, 28) and len(labels) == 8
+
+
+# --- the stream ---------------------------------------------------------------------------------------------------
+
+
+def marks(part: spadmnist.Part) -> dict[bytes, int]:
+    """Which image an item's fluxes are."""
+    found = {part.reconstruction["counts"].normalised[i].tobytes(): i for i in range(len(part))}
+    assert len(found) == len(part)
+    return found
+
+
+def numbers(part: spadmnist.Part, stream: Any, workers: int = 0, **more: Any) -> list[int]:
+    known = marks(part)
+    loader = DataLoader(stream, batch_size=None, num_workers=workers, **more)
+    return [known[item[0].numpy().tobytes()] for item, _ in loader]
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 3 worker")
+@pytest.mark.parametrize("workers", [0, 1, 3])
+@pytest.mark.parametrize("world", [1, 2, 4])
+def test_a_stream_holds_each_image_once(part: spadmnist.Part, workers: int, world: int) -> None:
+    apart = []
+    for rank in range(world):
+        stream = st.stream(part, "fluxes", seed=5, rank=rank, world=world)
+        apart.append(numbers(part, stream, workers))
+        assert len(apart[-1]) == len(stream)
+        if workers < 3:
+            assert numbers(part, stream, workers) == apart[-1]  # the same again
+    assert sorted(itertools.chain(*apart)) == list(range(N))
+    assert max(map(len, apart)) - min(map(len, apart)) <= 1
+
+
+def test_a_stream_is_shuffled_and_differs_between_epochs_and_seeds(part: spadmnist.Part) -> None:
+    stream = st.stream(part, "fluxes", seed=5)
+    first = numbers(part, stream)
+    stream.set_epoch(1)
+    second = numbers(part, stream)
+    stream.set_epoch(0)
+    assert first != sorted(first) and second != first and numbers(part, stream) == first
+    assert numbers(part, st.stream(part, "fluxes", seed=6)) != first
+    # more than within its shard: of the first 10, some lie in another shard than the very first
+    assert len({i // 10 for i in first[:10]}) > 1
+    assert len({i // 10 for i in numbers(part, st.stream(part, "fluxes", seed=5, buffer=1))[:10]}) == 1
+
+
+def test_an_epoch_reaches_workers_that_are_kept(part: spadmnist.Part) -> None:
+    stream = st.stream(part, "fluxes", seed=5)
+    loader = DataLoader(stream, batch_size=None, num_workers=2, persistent_workers=True)
+    known, orders = marks(part), []
+    for epoch in (0, 1, 0):
+        stream.set_epoch(epoch)
+        orders.append([known[item[0].numpy().tobytes()] for item, _ in loader])
+    assert orders[0] == orders[2] != orders[1] and sorted(orders[1]) == list(range(N))
+
+
+@pytest.mark.parametrize("kind", ["events", "fluxes", "qis", "str", "counts"])
+def test_what_a_stream_gives(part: spadmnist.Part, kind: str) -> None:
+    known, labels = marks(part), part.labels
+    order = numbers(part, st.stream(part, "fluxes", seed=2))
+    assert known and labels is not None
+    what = ("frames", kind) if kind in ("qis", "str", "counts") else (kind, None)
+    for (item, label), i in zip(st.stream(part, *what, seed=2), order, strict=True):
+        right = expected(part, kind, i)
+        assert np.array_equal(values(item), right.astype(values(item).dtype)) and label == labels[i]
+
+
+@pytest.mark.parametrize("after", [0, 1, 10, 41, 69, 70])
+def test_a_stream_goes_on_where_it_stopped(part: spadmnist.Part, after: int) -> None:
+    whole = numbers(part, st.stream(part, "fluxes", seed=5))
+    known = marks(part)
+    one = st.stream(part, "fluxes", seed=5)
+    begun = [known[item[0].numpy().tobytes()] for item, _ in itertools.islice(one, after)]
+    state = pickle.loads(pickle.dumps(one.state_dict()))
+    other = st.stream(part, "fluxes", seed=5)
+    other.load_state_dict(state)
+    assert begun + [known[item[0].numpy().tobytes()] for item, _ in other] == whole
+    assert [known[item[0].numpy().tobytes()] for item, _ in other] == whole  # the pass after it is whole
+    with pytest.raises(SpadError, match="of seed 5, but this stream has 6"):
+        st.stream(part, "fluxes", seed=6).load_state_dict(state)
+
+
+def test_a_stream_of_several_levels_and_of_a_config(dataset: spadmnist.Dataset, folder: Path) -> None:
+    whole = spadmnist.concatenate([dataset[level, "train"] for level in dataset.levels])
+    assert sorted(numbers(whole, st.stream(whole, "fluxes"))) == list(range(2 * N))
+    simulated = spadmnist.open(folder / "lab.yaml")["30 lux", "train"]
+    assert sorted(numbers(simulated[::2], st.stream(simulated[::2], "fluxes"))) == list(range(N // 2))
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda p: st.stream(p, "photons"), "kind: 'photons' is not possible; it is events, fluxes or frames"),
+        (lambda p: st.stream(p, rank=2, world=2), "rank: 2 of 2"),
+        (lambda p: st.stream(p, "events", method="counts"), "events have none"),
+        (lambda p: st.stream(p, "fluxes", method="none"), "'none' is no reconstruction of this part; there are counts"),
+        (lambda p: st.stream(p, buffer=0), "buffer: 0"),
+        (lambda p: st.stream(p).set_epoch(-1), "epoch: -1"),
+        (lambda p: st.Frames(p, "tr"), "'tr' is no readout of frames"),
+        (lambda p: st.Fluxes(p, "none"), "'none' is no reconstruction"),
+    ],
+)
+def test_wrong_wishes_are_sentences(part: spadmnist.Part, make: Any, says: str) -> None:
+    with pytest.raises(SpadError, match=says):
+        make(part)
+
+
+# --- images that are simulated ------------------------------------------------------------------------------------
+
+
+class Pictures:
+    """A map-style set of somebody's."""
+
+    def __init__(self, images: np.ndarray, labels: np.ndarray | None = None):
+        self.images, self.labels = images, labels
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, i: int) -> Any:
+        return self.images[i] if self.labels is None else (self.images[i], self.labels[i])
+
+
+@pytest.fixture(scope="module")
+def pictures(part: spadmnist.Part) -> Pictures:
+    assert part.labels is not None
+    return Pictures(part.images[:], part.labels)
+
+
+@pytest.fixture(scope="module")
+def sensor(folder: Path) -> Any:
+    return spadmnist.read_sensor(folder / "lab.yaml")
+
+
+def simulated(pictures: Any, sensor: Any, returns: str = "counts", **more: Any) -> st.Simulated:
+    recording = {**RECORDING, **({"bits": 2} if returns == "counts_readout" else {})}
+    return st.Simulated(
+        pictures, sensor, **{"recording": recording, "lux": "30 lux", "seed": 3, "returns": returns, **more}
+    )
+
+
+@pytest.mark.parametrize("returns", ["counts", "passive_free_running", "qis_counts", "str_flux", "tr", "qis", "str"])
+def test_the_first_epoch_is_that_of_generate(part: spadmnist.Part, pictures: Any, sensor: Any, returns: str) -> None:
+    made = simulated(pictures, sensor, returns)
+    for i, (item, label) in zip([4, 60, 0], made.__getitems__([4, 60, 0]), strict=True):
+        if returns in ("tr", "qis", "str"):
+            right = expected(part, {"tr": "events"}.get(returns, returns), i)
+        else:
+            right = part.reconstruction[returns][i][None]
+        assert np.array_equal(values(item), right.astype(values(item).dtype)), i
+        assert label == part.labels[i]  # type: ignore[index]
+
+
+BLUR = '''
+from spadmnist import Effect, parameter
+
+class Blur(Effect):
+    """A jitter of a program that does not count its draws. Source: none, of a test."""
+
+    stage = "timing"
+    width = parameter(1e-9, "s", "width of the jitter", bounds=(0, None), off=0.0)
+
+    def apply(self, events, rng):
+        return events.moved(events.times + self.width * rng.random(len(events)))
+'''
+
+
+def test_blocks_are_simulated_whole(tmp_path: Path) -> None:
+    """Where an effect draws for 32 images at once, image i is that of `generate` all the same."""
+    file = tmp_path / "lab.yaml"
+    (tmp_path / "blur.py").write_text(BLUR)
+    text = CONFIG.replace("READOUTS", "[tr]").replace(", bits: 2", "").replace("rules: paper", "rules: device")
+    file.write_text(text.replace("resolution: 1 ns}}", "resolution: 1 ns}, blur: {width: 5 ns}}"))
+    part = spadmnist.open(file, plugin=[tmp_path / "blur.py"])["30 lux", "train"]
+    sensor = spadmnist.read_sensor(file)
+    assert sensor.block == 32
+    made = st.Simulated(
+        Pictures(part.images[:]), sensor, recording={"exposure": "30 us"}, lux="30 lux", seed=3, returns="tr"
+    )
+    for i, (item, label) in zip([65, 2, 40], made.__getitems__([65, 2, 40]), strict=True):
+        assert np.array_equal(item.times, part.tr[i].times) and label == -1
+
+
+@pytest.mark.parametrize(("method", "persistent"), WORKERS)
+def test_no_two_epochs_share_a_draw(pictures: Any, sensor: Any, method: str, persistent: bool) -> None:
+    """Nor do two workers: white images, so that any two that are alike share their draws."""
+    white = Pictures(np.full((40, 28, 28), 255, np.uint8))
+    made = simulated(white, sensor, "tr")
+    loader = DataLoader(
+        made, batch_size=4, num_workers=2, multiprocessing_context=method, persistent_workers=persistent,
+        collate_fn=identity, shuffle=True,
+    )  # fmt: skip
+    found = set()
+    for epoch in range(3):
+        made.set_epoch(epoch)
+        found |= {item.times.tobytes() for batch in loader for item, _ in batch}
+    assert len(found) == 3 * 40
+
+
+def test_a_second_pass_needs_another_epoch(pictures: Any, sensor: Any) -> None:
+    made = simulated(pictures, sensor)
+    loader = DataLoader(made, batch_size=10)
+    first = torch.cat([x for x, _ in loader])
+    with pytest.raises(SpadError, match=r"simulated in epoch 0 already.*call set_epoch\(1\)"):
+        list(loader)
+    made.set_epoch(1)
+    assert not torch.equal(torch.cat([x for x, _ in loader]), first)
+    made.set_epoch(0)
+    assert torch.equal(torch.cat([x for x, _ in loader]), first)
+    # what a worker has drawn the others know, those of the next pass among them
+    apart = simulated(pictures, sensor)
+    assert torch.equal(torch.cat([x for x, _ in DataLoader(apart, batch_size=10, num_workers=1)]), first)
+    with pytest.raises(SpadError, match="simulated in epoch 0 already"):
+        apart.__getitems__([3])
+
+
+def test_a_range_of_light(sensor: Any) -> None:
+    """Each image has a level of its own, in each epoch another; evenly on a logarithmic scale."""
+    white = Pictures(np.full((400, 28, 28), 255, np.uint8))
+    made = simulated(white, sensor, lux=(0.5, 50.0))
+    levels = made._levels(np.arange(400), 0)
+    assert levels.min() >= 0.5 and levels.max() <= 50
+    from scipy import stats
+
+    share = np.log(levels / 0.5) / np.log(100)
+    assert stats.kstest(share, "uniform").pvalue > 1e-6
+    assert len(set(levels) | set(made._levels(np.arange(400), 1))) == 800
+    fluxes = torch.stack([x for x, _ in made.__getitems__(range(400))]).mean((1, 2, 3)).numpy()
+    alone = simulated(white, sensor, lux="50 lux")
+    per_lux = alone[0][0].mean().item() / 50
+    # the flux of counts falls below the light where the dead time takes its share: 50 ns at up to 1e6 photons/s
+    assert np.corrcoef(np.log(fluxes), np.log(levels))[0, 1] > 0.999
+    assert np.all(fluxes < 1.3 * per_lux * levels) and np.all(fluxes > 0.7 * per_lux * levels)
+
+
+def test_images_of_any_kind(pictures: Any, sensor: Any) -> None:
+    """PIL's, floats from 0 to 1, tensors with a channel: the same photons for the same grey levels."""
+    from PIL import Image
+
+    grey = pictures.images[:6]
+    kinds = [
+        grey, [Image.fromarray(x) for x in grey], torch.from_numpy(grey)[:, None], torch.from_numpy(grey / 255.0),
+        [(x, 3) for x in grey],
+    ]  # fmt: skip
+    found = [torch.stack([x for x, _ in simulated(kind, sensor).__getitems__(range(6))]) for kind in kinds]
+    assert all(torch.equal(one, found[0]) for one in found[1:])
+    bits = simulated((grey > 128), sensor)[0][0]
+    assert torch.equal(bits, simulated((grey > 128).astype(np.uint8) * 255, sensor)[0][0])
+    colour = simulated(np.stack([grey] * 3, axis=1), sensor)[0][0]
+    assert colour.shape == (3, 28, 28) and not torch.equal(colour[0], colour[1])
+    assert torch.equal(simulated(np.stack([grey] * 3, axis=-1), sensor)[0][0], colour)
+
+
+@pytest.mark.parametrize(
+    ("images", "more", "error", "says"),
+    [
+        (np.zeros((2, 20, 28), np.uint8), {}, SpadError, "images are 20 x 28 pixels, but the sensor 28 x 28"),
+        (np.full((2, 28, 28), 2.0), {}, SpadError, "is not from 0 to 1"),
+        (np.zeros((2, 28, 28), np.int64), {}, SpadError, "give uint8, uint16, or floats"),
+        (np.zeros((2, 28, 28), np.uint8), {"returns": "photons"}, SpadError, "neither a readout nor a reconstruction"),
+        (np.zeros((2, 28, 28), np.uint8), {"lux": (1, 2, 3)}, SpadError, "give one level, or"),
+        (np.zeros((2, 28, 28), np.uint8), {"lux": (2.0, 1.0)}, SpadError, r"is not below"),
+        (np.zeros((2, 28, 28), np.uint8), {"lux": "5 nm"}, ConfigError, "lux"),
+        (np.zeros((2, 28, 28), np.uint8), {"recording": {}}, ConfigError, "exposure"),
+        (np.zeros((2, 28, 28), np.uint8), {"recording": {"exposure": "1 ms"}, "returns": "qis"}, ConfigError, "frames"),
+    ],
+)
+def test_what_cannot_be_simulated_is_a_sentence(
+    images: Any, more: Any, error: type[Exception], says: str, sensor: Any
+) -> None:
+    with pytest.raises(error, match=says):
+        simulated(images, sensor, **more)[0]
+
+
+# --- without torch ------------------------------------------------------------------------------------------------
+
+
+def test_nothing_else_imports_torch() -> None:
+    code = (
+        "import sys, spadmnist; spadmnist.concatenate, spadmnist.read_sensor, spadmnist.Sensor; import spadmnist.cli; "
+    )
+    code += "print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_without_torch_it_says_what_to_install() -> None:
+    code = "import sys; sys.modules['torch'] = None; import spadmnist.torch"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "pip install 'spadmnist[train]'" in done.stderr.splitlines()[-1]
