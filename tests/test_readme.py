@@ -223,8 +223,9 @@ def test_what_the_python_of_the_readme_reads(reader: Reader) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="PyTorch is not installed")
-def test_the_loader_of_the_readme_loads(reader: Reader) -> None:
+def test_the_loader_of_the_readme_loads(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
     reader.read(having("st.Fluxes("))
+    monkeypatch.chdir(reader.folder)
     fluxes, labels = next(iter(reader.names["loader"]))
     assert fluxes.shape == (64, 1, 28, 28) and labels.shape == (64,)
     packed, (voxels, _) = next(iter(reader.names["events"])), next(iter(reader.names["voxels"]))
