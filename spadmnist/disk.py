@@ -188,9 +188,10 @@ def install(new: Path, final: Path, aside: Path) -> None:
     try:
         os.rename(new, final)
     except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
             raise
-        os.rename(final, aside)  # no full folder is replaced at once; for a moment none is there
+        # no full folder is replaced at once, nor a link by a folder; for a moment none is there
+        os.rename(final, aside)
         try:
             os.rename(new, final)
         except OSError:
