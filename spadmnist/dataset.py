@@ -476,8 +476,8 @@ def seal(manifest: dict[str, Any]) -> bytes:
 def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
     """(manifest, is every byte of it as it was sealed?). Raises InputError where there is none to read."""
     path = root / MANIFEST
-    if root.is_file():
-        raise InputError(f"{root} is a file; a dataset is a folder (spadmnist generate makes one from a config)")
+    if root.exists() and not root.is_dir():
+        raise InputError(f"{root} is no folder; a dataset is a folder (spadmnist generate makes one from a config)")
     try:
         raw = disk.read_file(path, _LARGEST_MANIFEST)
     except FileNotFoundError:
@@ -868,7 +868,7 @@ def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequenc
     root = Path(path)
     if not root.exists():
         raise InputError(f"{root}: there is no such dataset or config file")
-    if root.is_file():
+    if not root.is_dir():
         return simulated(config.read(root), Path(images_dir) if images_dir is not None else None)
     return stored(root)
 
