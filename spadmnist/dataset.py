@@ -31,7 +31,7 @@ from .gather import gather, indices_of, join
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
-from .store import Column, ShardReader
+from .store import Column, Expected, ShardReader
 
 FORMAT = "spadmnist-dataset/1"
 _LARGEST_MANIFEST = 1 << 30  # bytes
@@ -60,6 +60,67 @@ class Shard:
     @property
     def path(self) -> str:
         return f"{self.folder}/{self.split}/{self.number:05d}"
+
+    @property
+    def attributes(self) -> dict[str, str | int]:
+        """What a shard says of itself on disk, by which it is told from any other of the dataset."""
+        level = {} if self.level is None else {"level": self.level}
+        return {"split": self.split, "start": self.start, "stop": self.stop, **level}
+
+    def reader(self, root: Path, format: str, like: Likeness, files: Mapping[str, Files] | None = None) -> ShardReader:
+        """Reads the shard; a file in its place that is not its own is refused.
+
+        files: of each shard, by its place, as `files_by_shard` gives them, where they are known.
+        """
+        n, pixels, columns = self.stop - self.start, int(np.prod(like.shape)), like.shape[-1]
+        bits = {"frames": like.frames, "columns": columns, "lines_per_image": pixels // columns}
+        stamps = {"tick_s": like.tick} if like.tick > 0 else {}
+        sizes = {"image": n, "event_start": n + 1, "first_event_start": n + 1, "line": n * (pixels // columns)}
+        sizes |= {"frame_byte": -(-columns * like.frames // 8), **dict(zip(like.dims, like.shape, strict=True))}
+        # a shard of HDF5 is one file, which changes where reconstructions are added; its attributes do not
+        known = files if format == "zarr" or self.level is None else None
+        expected = Expected(
+            {
+                "": {"level": None, **self.attributes},
+                "frames/bits": bits,
+                "tr/ticks": {**stamps, "differences": 1},
+                "frames/ticks": stamps,
+            },
+            sizes,
+            None if known is None else known.get(store.location(self.path, format), {}),
+        )
+        return ShardReader(root, self.path, format, expected)
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What all shards of a dataset have in common: the shape of an image, the frames, and the tick (s, 0: none)."""
+
+    shape: tuple[int, ...]
+    frames: int
+    tick: float
+
+    @classmethod
+    def of(cls, manifest: Mapping[str, Any]) -> Likeness:
+        """As a manifest has it."""
+        settings = manifest["settings"]
+        return cls(tuple(manifest["images"]["shape"]), settings["frames"], settings["tick"])
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the axes of an image."""
+        return ("channel", "y", "x")[-len(self.shape) :]
+
+
+def files_by_shard(files: Files, format: str) -> dict[str, Files]:
+    """Those of a manifest's files that belong to shards, by the place of the shard."""
+    found: dict[str, Files] = {}
+    depth = len(store.location("folder/split/number", format).split("/"))
+    for name, facts in files.items():
+        parts = name.split("/")
+        if len(parts) >= depth:
+            found.setdefault("/".join(parts[:depth]), {})[name] = facts
+    return found
 
 
 def shards_of(experiment: Experiment, splits: Mapping[str, Images]) -> list[Shard]:
@@ -190,15 +251,16 @@ def _cause_columns(events: Events, group: str, axis: str) -> dict[str, Column]:
 
 def _read_causes(reader: ShardReader, group: str, start: int, stop: int, events: Events) -> None:
     """Give the events of some images their causes, where the shard has them."""
-    if f"{group}/cause" not in reader.names:
+    if not reader.has(f"{group}/cause"):
         return
-    if f"{group}/starts" in reader.names:
+    if reader.has(f"{group}/starts"):
         first, last = (int(x) for x in reader.read(f"{group}/starts")[[start, stop]])
     else:
         bits = reader.array_attributes("frames/bits")
         before = reader.read("frames/bits", 0, start * bits["lines_per_image"])
         first = int(np.bitwise_count(before).sum(dtype=np.int64))
         last = first + len(events)
+    _check_stamps(reader, f"{group}/cause", first, last, len(events))
     events.cause = reader.read(f"{group}/cause", first, last)
     parent = reader.read(f"{group}/parent", first, last).astype(np.int64)
     starts = np.repeat(events.image_offsets[:-1], np.diff(events.image_offsets))
@@ -349,7 +411,7 @@ def read_frames(
         counts = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
         first = _read_ragged(reader, "frames", start, stop, counts, pixels, tick)
     found = Frames(bits, first, frames, frame_time, pixels)
-    if "frames/cause" not in reader.names:
+    if not reader.has("frames/cause"):
         return found
     made = found.detections
     _read_causes(reader, "frames", start, stop, made)
@@ -362,16 +424,21 @@ def _read_ragged(
     first, last = (int(x) for x in reader.read(f"{group}/starts")[[start, stop]])
     offsets = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=offsets[1:])
-    if offsets[-1] != last - first:
-        raise InputError(
-            f"{reader.root / reader.path}: counts and stamps disagree; spadmnist verify {reader.root} says more"
-        )
+    _check_stamps(reader, f"{group}/{'ticks' if tick > 0 else 'times'}", first, last, int(offsets[-1]))
     if tick > 0:
         ticks = reader.read(f"{group}/ticks", first, last)
         if group == "tr":
             ticks = kernels.row_sums(ticks, offsets)
         return Events(None, offsets, pixels, ticks, tick)
     return Events(reader.read(f"{group}/times", first, last), offsets, pixels)
+
+
+def _check_stamps(reader: ShardReader, name: str, first: int, last: int, count: int) -> None:
+    """Raise InputError unless an array holds the entries `first` to `last`, which are `count`."""
+    if last - first != count or not 0 <= first <= last <= reader.shape(name)[0]:
+        raise InputError(
+            f"{reader.root / reader.path}: counts and stamps disagree; spadmnist verify {reader.root} says more"
+        )
 
 
 def statistics(recorded: Recorded, causes: Sequence[str] = ()) -> dict[str, Any]:
@@ -409,8 +476,8 @@ def seal(manifest: dict[str, Any]) -> bytes:
 def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
     """(manifest, is every byte of it as it was sealed?). Raises InputError where there is none to read."""
     path = root / MANIFEST
-    if root.is_file():
-        raise InputError(f"{root} is a file; a dataset is a folder (spadmnist generate makes one from a config)")
+    if root.exists() and not root.is_dir():
+        raise InputError(f"{root} is no folder; a dataset is a folder (spadmnist generate makes one from a config)")
     try:
         raw = disk.read_file(path, _LARGEST_MANIFEST)
     except FileNotFoundError:
@@ -766,10 +833,12 @@ class _Stored:
         format: str,
         shards: Sequence[Shard],
         originals: Sequence[Shard],
+        files: Mapping[str, Files],
+        like: Likeness,
         facts: dict[str, Any],
     ):
-        self._shards = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in shards]
-        self._originals = [(s.start, s.stop, ShardReader(root, s.path, format)) for s in originals]
+        self._shards = [(s.start, s.stop, s.reader(root, format, like, files)) for s in shards]
+        self._originals = [(s.start, s.stop, s.reader(root, format, like, files)) for s in originals]
         self._facts = facts
 
     def _pieces(self, shards: Any, start: int, stop: int) -> Iterator[tuple[ShardReader, int, int]]:
@@ -807,7 +876,7 @@ class _Stored:
         return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
 
     def labels(self) -> np.ndarray | None:
-        if "labels" not in self._originals[0][2].names:
+        if not self._originals[0][2].has("labels"):
             return None
         return np.concatenate([reader.read("labels") for _, _, reader in self._originals])
 
@@ -1025,7 +1094,7 @@ def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequenc
     root = Path(path)
     if not root.exists():
         raise InputError(f"{root}: there is no such dataset or config file")
-    if root.is_file():
+    if not root.is_dir():
         return simulated(config.read(root), Path(images_dir) if images_dir is not None else None)
     return stored(root)
 
@@ -1051,11 +1120,13 @@ def stored(root: Path) -> Dataset:
     manifest = intact_manifest(root)
     levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
     shards = [Shard(**x) for x in manifest["shards"]]
-    shape = tuple(manifest["images"]["shape"])
+    like = Likeness.of(manifest)
+    shape, format = like.shape, manifest["config"]["output"]["format"]
+    files = files_by_shard(manifest["files"], format)
     facts = {
         "pixels": int(np.prod(shape)),
-        "tick": manifest["settings"]["tick"],
-        "frames": manifest["settings"]["frames"],
+        "tick": like.tick,
+        "frames": like.frames,
         "frame_time": manifest["settings"]["frame_time"],
     }
 
@@ -1063,7 +1134,7 @@ def stored(root: Path) -> Dataset:
         mine = [s for s in shards if s.level == level.text and s.split == split]
         originals = [s for s in shards if s.level is None and s.split == split]
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
-        backend = _Stored(root, manifest["config"]["output"]["format"], mine, originals, own)
+        backend = _Stored(root, format, mine, originals, files, like, own)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
         length = manifest["images"]["splits"][split]["images"]
         return Part(length, backend, True, readouts, methods, shape, manifest.get("causes", ()))

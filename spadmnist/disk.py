@@ -10,14 +10,15 @@ import contextlib
 import errno
 import hashlib
 import os
+import re
 import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from .errors import SpadError
+from .errors import InputError, SpadError
 
 _LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 
@@ -42,6 +43,34 @@ def commit_file(path: str | os.PathLike[str], data: bytes, tmp: str | os.PathLik
         os.rename(work / "file", path)
         _sync(path.parent)
     return record
+
+
+def opened(path: str | os.PathLike[str]) -> IO[bytes]:
+    """A file that a user named, open for reading. It is never waited for.
+
+    What was handed over open (/dev/stdin, /dev/fd/63) may be a pipe: its writer is at work. Raises InputError for any
+    other pipe, a device and a socket, and OSError as `open` does.
+    """
+    if _HANDED_OVER.fullmatch(os.fspath(path)):
+        return open(path, "rb")
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # nobody listens at a socket, or there is no such device
+            raise InputError(f"{path}: is a socket or a device, and only a file is read; name a file") from None
+        raise
+    mode = os.fstat(handle).st_mode
+    if stat.S_ISREG(mode):
+        return open(handle, "rb")
+    os.close(handle)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise InputError(
+        f"{path}: is a {'pipe' if stat.S_ISFIFO(mode) else 'device'}, and only a file is read; name a file"
+    )
+
+
+_HANDED_OVER = re.compile(r"/dev/stdin|/dev/fd/[0-9]+|/proc/self/fd/[0-9]+")
 
 
 def read_file(path: str | os.PathLike[str], most: int) -> bytes:
@@ -188,9 +217,10 @@ def install(new: Path, final: Path, aside: Path) -> None:
     try:
         os.rename(new, final)
     except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
             raise
-        os.rename(final, aside)  # no full folder is replaced at once; for a moment none is there
+        # no full folder is replaced at once, nor a link by a folder; for a moment none is there
+        os.rename(final, aside)
         try:
             os.rename(new, final)
         except OSError:

@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from . import disk
 from .errors import ConfigError, InputError
 
 _MOST_BYTES = 1 << 20
@@ -71,7 +72,7 @@ def read(path: Path) -> Document:
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder; name a YAML file")
-        with open(path, "rb") as file:
+        with disk.opened(path) as file:
             raw = file.read(_MOST_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; name one that is there") from None

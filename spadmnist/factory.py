@@ -30,17 +30,17 @@ from typing import Any
 import numpy as np
 
 from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
-from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Shard
+from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .heap import keep_freed_memory
 from .images import Images
 from .reconstruct import median_of_nonzero
-from .store import ShardReader
 
 POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
+_LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
 
@@ -99,7 +99,7 @@ def make_shard(task: Task) -> tuple[str, Files]:
 def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.Column], dict[str, Any]]:
     """(columns, attributes) of a shard."""
     shard = task.shard
-    attributes: dict[str, Any] = {"split": shard.split, "start": shard.start, "stop": shard.stop}
+    attributes: dict[str, Any] = shard.attributes
     skip = shard.start - task.first
     if shard.level is None:
         images = Images(task.pixels, task.labels, task.white)
@@ -113,7 +113,6 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     columns |= dataset.reconstruction_columns(experiment, recorded, shape)
     return columns, {
         **attributes,
-        "level": shard.level,
         "statistics": json.dumps(dataset.statistics(recorded, experiment.sensor.causes)),
     }
 
@@ -416,7 +415,8 @@ def generate(
         begin(root, wanted)
         _check_space(root, experiment, splits)
         shards = dataset.shards_of(experiment, splits)
-        missing = [s for s in shards if not _is_made(root, s, experiment.format)]
+        like = _likeness(experiment, wanted)
+        missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
         _make(experiment, splits, root, shards, missing, jobs, progress)
         manifest = finish(experiment, root, wanted, shards, jobs, progress)
     return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
@@ -449,12 +449,21 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
                     "choose another folder with -o"
                 )
             return False
-    try:
-        there = json.loads(plan.read_bytes())
-    except ValueError:
-        raise SpadError(f"{plan}: is damaged; remove {root} and begin again") from None
-    _refuse_other(root, wanted, there)
+    _refuse_other(root, wanted, _plan(root))
     return False
+
+
+def _plan(root: Path) -> dict[str, Any]:
+    """What an unfinished run makes. Raises SpadError where that cannot be read."""
+    path = root / STATE / "plan.json"
+    try:
+        found = json.loads(disk.read_file(path, _LARGEST_NOTE))
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        again = "remove it" if os.path.lexists(root / MANIFEST) else f"remove {root}"
+        raise SpadError(f"{path}: is damaged; {again} and begin again")
+    return found
 
 
 def begin(root: Path, wanted: dict[str, Any]) -> None:
@@ -484,15 +493,29 @@ def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images
         )
 
 
-def _is_made(root: Path, shard: Shard, format: str) -> bool:
-    return _record(root, shard) is not None and store.exists(root, shard.path, format)
+def _likeness(experiment: Experiment, wanted: Mapping[str, Any]) -> Likeness:
+    """What the shards of an experiment have in common. wanted: its identity."""
+    return Likeness(tuple(wanted["images"]["shape"]), experiment.conditions.frames, experiment.settings.tick)
+
+
+def _is_made(root: Path, shard: Shard, format: str, like: Likeness) -> bool:
+    """Is a shard there as it was made? Its attributes and the sizes of its files say so; its data are not read."""
+    made = _record(root, shard)
+    if made is None or not store.exists(root, shard.path, format):
+        return False
+    reader = shard.reader(root, format, like)
+    try:
+        sizes = {name: os.lstat(root / name).st_size for name in made}
+        return bool(reader.names) and sizes == {name: facts["bytes"] for name, facts in made.items()}
+    except (InputError, OSError, KeyError, TypeError):
+        return False
 
 
 def _record(root: Path, shard: Shard) -> Files | None:
     """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
     try:
-        found = json.loads(_record_path(root, shard).read_bytes())
-    except (OSError, ValueError):
+        found = json.loads(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
+    except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
@@ -584,13 +607,15 @@ class Addition:
     root: str
     shard: Shard
     methods: tuple[str, ...]
+    like: Likeness
+    files: dict[str, Files]
 
 
 def add_methods(addition: Addition) -> tuple[str, Files]:
     """Reconstruct the images of one shard from its raw streams and add them to it."""
     experiment = _experiment(addition.job)
     root, shard = Path(addition.root), addition.shard
-    reader = ShardReader(root, shard.path, experiment.format)
+    reader = shard.reader(root, experiment.format, addition.like, addition.files)
     recorded, shape = dataset.read_shard(reader, experiment)
     columns = dataset.reconstruction_columns(experiment, recorded, shape, addition.methods)
     files = store.append_columns(root, shard.path, columns, experiment.format)
@@ -627,31 +652,33 @@ def add_reconstructions(
     with locked(root):
         plan = root / STATE / "plan.json"
         if plan.exists():
-            there = json.loads(plan.read_bytes())
+            there = _plan(root)
             if all(there.get(key) == manifest.get(key) for key in wanted):
                 clear_records(root)  # of the run that made what is here, and was killed at its very end
             else:
                 _refuse_other(root, wanted, there)
         begin(root, wanted)
         by_path = {s.path: s for s in shards if _record(root, s) is None}
-        job = job_of(after)
+        job, like = job_of(after), Likeness.of(manifest)
+        files = dataset.files_by_shard(manifest["files"], after.format)
 
-        def files_of(shard: Shard) -> Files:
+        def files_of(shard: Shard) -> dict[str, Files]:
             place = store.location(shard.path, after.format)
-            return {n: f for n, f in manifest["files"].items() if n == place or n.startswith(place + "/")}
+            return {place: files.get(place, {})}
 
         def done(path: str, result: tuple[str, Files]) -> None:
-            note(root, by_path[path], files_of(by_path[path]) | result[1])
+            known = files.get(store.location(path, after.format), {})
+            note(root, by_path[path], known | result[1])
             progress.advance(1, path)
 
         for path in [p for p, s in by_path.items() if s.level is None]:
-            note(root, by_path[path], files_of(by_path[path]))
+            note(root, by_path[path], files.get(store.location(path, after.format), {}))
             del by_path[path]
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
             run_tasks(
                 add_methods,
-                lambda paths: (Addition(job, str(root), by_path[p], new) for p in paths),
+                lambda paths: (Addition(job, str(root), by_path[p], new, like, files_of(by_path[p])) for p in paths),
                 list(by_path),
                 jobs,
                 done,
@@ -663,9 +690,9 @@ def add_reconstructions(
 # --- finishing ----------------------------------------------------------------------------------------------------
 
 
-def _normalise(arguments: tuple[str, str, list[str], str]) -> float | None:
-    root, format, paths, method = arguments
-    readers = [ShardReader(root, path, format) for path in paths]
+def _normalise(arguments: tuple[Path, str, Likeness, list[Shard], str]) -> float | None:
+    root, format, like, shards, method = arguments
+    readers = [shard.reader(root, format, like) for shard in shards]
     return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader in readers))
 
 
@@ -679,10 +706,11 @@ def finish(
 ) -> dict[str, Any]:
     """Normalisation, groups, config and manifest; then the state is removed."""
     split = shards[0].split
-    training: dict[str, list[str]] = {level.text: [] for level in experiment.levels}
+    like = _likeness(experiment, wanted)
+    training: dict[str, list[Shard]] = {level.text: [] for level in experiment.levels}
     for shard in shards:
         if shard.level is not None and shard.split == split:
-            training[shard.level].append(shard.path)
+            training[shard.level].append(shard)
     keys = [
         (level.text, method)
         for level in experiment.levels
@@ -693,7 +721,7 @@ def finish(
     progress.start("normalising", len(keys), 0)
 
     def tasks(which: Sequence[tuple[str, str]]) -> Iterator[Any]:
-        return ((str(root), experiment.format, training[level], method) for level, method in which)
+        return ((root, experiment.format, like, training[level], method) for level, method in which)
 
     def done(key: tuple[str, str], value: float | None) -> None:
         normalisation[key[0]][key[1]] = value
@@ -769,6 +797,7 @@ def _statistics(
 ) -> dict[str, Any]:
     """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data."""
     pixels = int(np.prod(wanted["images"]["shape"]))
+    like = _likeness(experiment, wanted)
     out: dict[str, Any] = {level.text: {} for level in experiment.levels}
     for shard in shards:
         if shard.level is None:
@@ -779,14 +808,20 @@ def _statistics(
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels
-        reader = ShardReader(root, shard.path, experiment.format)
-        for readout, numbers in json.loads(reader.attributes["statistics"]).items():
-            sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
-            for key, value in numbers.items():
-                sums[key] += value
-        for method in experiment.methods:
-            found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
-            total["saturated_pixels"][method] += int(found)
+        reader = shard.reader(root, experiment.format, like)
+        try:
+            for readout, numbers in json.loads(reader.attributes["statistics"]).items():
+                sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
+                for key, value in numbers.items():
+                    sums[key] += value
+            for method in experiment.methods:
+                found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
+                total["saturated_pixels"][method] += int(found)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise InputError(
+                f"{root / store.location(shard.path, experiment.format)}: what it says of its own detections is "
+                "damaged; remove it and type the same command again"
+            ) from None
         place = store.location(shard.path, experiment.format)
         for name, facts in files.items():
             if name.startswith(place):

@@ -18,6 +18,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.lib import format as npy
 
+from . import disk
 from .errors import InputError
 
 MAX_BYTES = 8 * 2**30  # the images of one source; beyond it a header is taken for damaged or hostile
@@ -62,7 +63,7 @@ def read_idx(path: Path, ndim: int) -> np.ndarray:
     Raises InputError for anything but a whole, undamaged file; never reads more than the header declares.
     """
     try:
-        with open(path, "rb") as file:
+        with disk.opened(path) as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             stream = gzip.GzipFile(fileobj=file) if packed else file
@@ -154,10 +155,12 @@ def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            with Image.open(path, formats=_FORMATS) as image:
-                image.verify()  # PNG's checksums, which decoding leaves out
-            with Image.open(path, formats=_FORMATS) as image:
-                return _to_pixels(image, path, grey_palettes)
+            with disk.opened(path) as file:
+                with Image.open(file, formats=_FORMATS) as image:
+                    image.verify()  # PNG's checksums, which decoding leaves out
+                file.seek(0)
+                with Image.open(file, formats=_FORMATS) as image:
+                    return _to_pixels(image, path, grey_palettes)
         except InputError:
             raise
         except UnidentifiedImageError as error:

@@ -22,7 +22,7 @@ from typing import IO, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from . import image_files
+from . import disk, image_files
 from .digits import draw_digit
 from .errors import InputError
 from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
@@ -600,7 +600,7 @@ class Array(_Source):
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
         path = _find(self.path, [images_dir if images_dir is not None else base], Path.is_file)
-        with open(path, "rb") as file:
+        with disk.opened(path) as file:
             head = file.read(image_files.HEAD)
             file.seek(0)
             if head.startswith(b"\x93NUMPY"):

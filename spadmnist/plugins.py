@@ -13,6 +13,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
+import io
 import pkgutil
 import re
 import sys
@@ -24,7 +25,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from . import units
+from . import disk, units
 from .errors import EffectError, InputError, did_you_mean
 
 PLACES = ("spadmnist.effects", "spadmnist.reconstruct", "spadmnist.statistics")  # packages or modules
@@ -330,7 +331,8 @@ def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...],
 
 def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     try:
-        values = np.load(path, allow_pickle=False)
+        with disk.opened(path) as file:
+            values = np.load(file, allow_pickle=False)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
     except OSError as error:
@@ -473,7 +475,10 @@ def load_file(path: str | Path) -> None:
     if file in _loaded:
         return
     try:
-        text = file.read_text(encoding="utf-8")
+        with io.TextIOWrapper(disk.opened(path), encoding="utf-8") as opened:
+            text = opened.read()
+    except InputError as error:
+        raise EffectError(str(error)) from None
     except (OSError, UnicodeDecodeError) as error:
         if not file.exists():
             raise EffectError(

@@ -21,6 +21,7 @@ to read one image's part. The reader accepts exactly the layout that the writer 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -553,38 +554,77 @@ class _Array:
     places: list[tuple[int, int]]  # offset and length of each chunk in the file
 
 
+@dataclass(frozen=True)
+class Expected:
+    """What is known of a shard before it is read. Another shard in its place is told by it.
+
+    attributes: by array, those of the shard itself under ""; None stands for one that must not be there.
+    sizes: of dimensions, by name. files: what is known of each file, or None where nothing is; one that is not listed
+    does not belong there.
+    """
+
+    attributes: Mapping[str, Mapping[str, Any]]
+    sizes: Mapping[str, int]
+    files: Files | None = None
+
+
 class ShardReader:
     """Reads arrays of a shard, or parts of them along axis 0.
 
+    expected: what is compared when the shard and its arrays are opened, once for each.
     It keeps descriptions, never an open file: it may be pickled, and used after a fork.
     """
 
-    def __init__(self, root: str | os.PathLike[str], path: str, format: str):
+    def __init__(self, root: str | os.PathLike[str], path: str, format: str, expected: Expected | None = None):
         self.root, self.path, self.format = Path(root), path, format
+        self._expected = expected
         self._place = location(path, format)
         self._arrays: dict[str, _Array] = {}
         self._attributes: dict[str, Any] | None = None
         self._names: tuple[str, ...] | None = None
 
-    def __getstate__(self) -> tuple[Path, str, str]:
-        return self.root, self.path, self.format
+    def __getstate__(self) -> tuple[Path, str, str, Expected | None]:
+        return self.root, self.path, self.format, self._expected
 
-    def __setstate__(self, state: tuple[Path, str, str]) -> None:
+    def __setstate__(self, state: tuple[Path, str, str, Expected | None]) -> None:
         self.__init__(*state)  # type: ignore[misc]
 
     @property
     def names(self) -> tuple[str, ...]:
         """The arrays, sorted."""
         if self._names is None:
-            self._names = tuple(sorted(self._walk_zarr())) if self.format == "zarr" else self._load_hdf5()
-        return self._names
+            if self.format == "zarr":
+                self._compare_shard()
+                self._names = tuple(sorted(self._walk_zarr()))
+            else:
+                self._load_hdf5()
+        return self._names or ()
+
+    def has(self, name: str) -> bool:
+        """Whether there is such an array. Raises InputError where it was written and is there no more."""
+        there = name in self.names
+        known = None if self._expected is None else self._expected.files
+        if there or known is None:
+            return there
+        description = f"{self._place}/{name}/zarr.json"
+        if self.format == "zarr" and description in known:
+            raise self._refuse(description, "this file is missing")
+        if self.format == "hdf5" and self._digest(self._place) != known[self._place]["sha256"]:
+            raise self._refuse(self._place, f"there is no {name}, and this is not the file that was written")
+        return False
+
+    def _digest(self, file: str) -> str:
+        with open(self._open(file), "rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
 
     @property
     def attributes(self) -> dict[str, Any]:
         """The attributes of the shard."""
         if self._attributes is None:
             if self.format == "zarr":
-                self._attributes = self._group_attributes()
+                attributes = self._group_attributes()
+                self._compare("", attributes)
+                self._attributes = attributes
             else:
                 self._load_hdf5()
         return dict(self._attributes or {})
@@ -676,12 +716,34 @@ class ShardReader:
             "names every such file, and with --repair it makes them again"
         )
 
+    # what is expected
+    def _compare_shard(self) -> None:
+        """The shard is the one that belongs here. Its attributes are read for that, once."""
+        if self._expected is not None:
+            _ = self.attributes
+
+    def _compare(self, name: str, attributes: Mapping[str, Any], array: _Array | None = None) -> None:
+        """Attributes and sizes of an array, or of the shard (""), are those that belong here."""
+        if self._expected is None:
+            return
+        place = f"{self._place}/{name}".rstrip("/") if self.format == "zarr" else self._place
+        what = f"{name}: its" if name and self.format == "hdf5" else "its"
+        for key, value in self._expected.attributes.get(name, {}).items():
+            found = attributes.get(key)
+            if type(found) is not type(value) or found != value:
+                raise self._refuse(place, f"{what} {key} is {_said(found)}, and {_said(value)} belongs here")
+        for dim, size in zip(array.dims, array.shape, strict=True) if array is not None else ():
+            wanted = self._expected.sizes.get(dim, size)
+            if size != wanted:
+                raise self._refuse(place, f"{what} size along {dim} is {size}, and {wanted} belongs here")
+
     def _array(self, name: str) -> _Array:
         if name not in self._arrays:
             try:
                 if self.format == "hdf5":
                     self._load_hdf5()
                 elif all(map(_NAME.fullmatch, name.split("/"))):
+                    self._compare_shard()
                     self._arrays[name] = self._load_zarr(name)
             except _Missing:
                 if name in self.names:
@@ -709,17 +771,32 @@ class ShardReader:
                 raise _Missing(self._refuse(file, "this file is missing")) from None
             if error.errno in (errno.ELOOP, errno.ENOTDIR):
                 raise self._refuse(file, "a symbolic link, or a file in place of a folder, is in the way") from None
+            if error.errno == errno.ENXIO:
+                raise self._refuse(file, "this is not a file") from None
             raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
+        if not folder:
+            try:
+                self._compare_file(file, os.fstat(at))
+            except BaseException:
+                os.close(at)
+                raise
         return at
+
+    def _compare_file(self, file: str, status: os.stat_result) -> None:
+        if not stat.S_ISREG(status.st_mode):
+            raise self._refuse(file, "this is not a file")
+        if self._expected is not None and self._expected.files is not None:
+            known = self._expected.files.get(file)
+            if known is None:
+                raise self._refuse(file, "this file does not belong here")
+            if status.st_size != known["bytes"]:
+                raise self._refuse(file, f"this file has {status.st_size} bytes, and it had {known['bytes']}")
 
     def _tail(self, file: str, size: int) -> tuple[bytes, int]:
         """The last `size` bytes of a file (fewer where it is smaller), and its length."""
         handle = self._open(file)
         try:
-            status = os.fstat(handle)
-            if not stat.S_ISREG(status.st_mode):
-                raise self._refuse(file, "this is not a file")
-            length = status.st_size
+            length = os.fstat(handle).st_size
             return os.pread(handle, size, max(0, length - size)), length
         except OSError as error:
             raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
@@ -737,6 +814,9 @@ class ShardReader:
                 raise ValueError("it is not a mapping")
         except (ValueError, RecursionError) as error:
             raise self._refuse(file, f"this is not a description of an array or group ({error})") from None
+        known = None if self._expected is None else self._expected.files
+        if known is not None and hashlib.sha256(text).hexdigest() != known[file]["sha256"]:
+            raise self._refuse(file, "this description is not the one that was written")
         return document
 
     def _group_attributes(self) -> dict[str, Any]:
@@ -787,7 +867,9 @@ class ShardReader:
             raise self._refuse(file, "this is not an array as spadmnist writes it") from None
         file = f"{self._place}/{name}/{_chunk_file(shape)}"
         places = self._zarr_places(file, -(-shape[0] // rows)) if math.prod(shape) else []
-        return _Array(file, shape, dtype, dims, rows, codec, attributes, places)
+        array = _Array(file, shape, dtype, dims, rows, codec, attributes, places)
+        self._compare(name, attributes, array)
+        return array
 
     def _zarr_places(self, file: str, count: int) -> list[tuple[int, int]]:
         """The table at the end of an array's file: the chunks must follow each other without a gap."""
@@ -809,23 +891,31 @@ class ShardReader:
         return [(int(offset), int(size)) for offset, size in places]
 
     # HDF5
-    def _load_hdf5(self) -> tuple[str, ...]:
+    def _load_hdf5(self) -> None:
         """Read every description in the file, and where each chunk lies in it; HDF5 decodes no data."""
         import h5py
 
-        os.close(self._open(self._place))  # refuses links
+        os.close(self._open(self._place))  # refuses links, and what would keep HDF5 waiting
+        arrays: dict[str, _Array] = {}
         try:
             with h5py.File(self.root / self._place, "r", locking=False) as file:
                 if file.userblock_size:
                     raise _Damaged("it does not begin at its beginning")
-                self._attributes = _get_attributes(file)
+                attributes = _get_attributes(file)
                 for name, dataset in _walk_hdf5(file, h5py):
-                    self._arrays[name] = _hdf5_array(dataset, self._place)
+                    arrays[name] = _hdf5_array(dataset, self._place)
         except _Damaged as error:
             raise self._refuse(self._place, str(error)) from None
         except (OSError, RuntimeError, KeyError, OverflowError, ValueError, TypeError, MemoryError) as error:
             raise self._refuse(self._place, f"HDF5 cannot read it ({error})") from None
-        return tuple(sorted(self._arrays))
+        self._compare("", attributes)
+        for name, array in arrays.items():
+            self._compare(name, array.attributes, array)
+        self._attributes, self._arrays, self._names = attributes, arrays, tuple(sorted(arrays))
+
+
+def _said(value: Any) -> str:
+    return "not said" if value is None else repr(value)
 
 
 class _Missing(InputError):

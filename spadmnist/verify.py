@@ -23,7 +23,6 @@ from .errors import InputError, SpadError
 from .experiment import Experiment
 from .factory import POSITIONS, Progress
 from .images import Images
-from .store import ShardReader
 
 _PIECE = 1 << 22
 
@@ -210,10 +209,13 @@ def _images(
         own = [s for s in dataset.shards_in(manifest) if s.level is None]
         if not any(_belongs(name, s, experiment.format) for s in own for name in bad):
             splits: dict[str, Images] = {}
+            like = dataset.Likeness.of(manifest)
+            files = dataset.files_by_shard(manifest["files"], experiment.format)
             for split in dict.fromkeys(s.split for s in own):
-                readers = [ShardReader(root, s.path, experiment.format) for s in own if s.split == split]
+                mine = [s for s in own if s.split == split]
+                readers = [s.reader(root, experiment.format, like, files) for s in mine]
                 pixels = np.concatenate([r.read("pixels") for r in readers])
-                labelled = "labels" in readers[0].names
+                labelled = readers[0].has("labels")
                 labels = np.concatenate([r.read("labels") for r in readers]) if labelled else None
                 splits[split] = Images(pixels, labels, manifest["images"]["white"])
             if all(splits[s].sha256 == facts["sha256"] for s, facts in manifest["images"]["splits"].items()):

@@ -42,7 +42,10 @@ def check_place(source: Path, out: Path, ours: bool = False) -> None:
 
 
 def _is_ours(file: Path) -> bool:
-    return disk.read_file(file, 1 << 24).decode(errors="replace").startswith(_OURS)
+    try:
+        return disk.read_file(file, 1 << 24).decode(errors="replace").startswith(_OURS)
+    except OSError:  # a link, a pipe and the like are nothing that was written here
+        return False
 
 
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, window: Window | None = None) -> Path:

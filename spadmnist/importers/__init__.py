@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import image_files
+from .. import disk, image_files
 from ..errors import InputError
 from ..import_options import Said, ask
 from ..recording import MODALITIES
@@ -164,7 +164,7 @@ def recognise(path: Path) -> type[Format]:
     try:
         if not path.is_file():
             raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}; name a file to import")
-        with open(path, "rb") as file:
+        with disk.opened(path) as file:
             head = _head(file)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import image_files, units
+from .. import disk, image_files, units
 from ..errors import InputError
 from ..import_options import LINOSPAD2
 from . import PICOSECOND, Format, Found, Said, ask, frames_in_file
@@ -117,9 +117,10 @@ class LinoSpad2(Format):
 def _calibration(path: Path) -> tuple[np.ndarray, int]:
     """((256, 140) ps, the end of each code; pixels that were not calibrated (all zero), whose codes are equal)."""
     try:
-        if path.stat().st_size > _LARGEST_TABLE:
-            raise ValueError("it is too large")
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        with disk.opened(path) as file:
+            if path.stat().st_size > _LARGEST_TABLE:
+                raise ValueError("it is too large")
+            table = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
         if table.shape != (256, 1 + _CODES) or (table[:, 0] != np.arange(256)).any():
             raise ValueError(f"it holds {table.shape[0]} x {table.shape[1]} numbers")
         ends = table[:, 1:]
@@ -137,7 +138,7 @@ def _calibration(path: Path) -> tuple[np.ndarray, int]:
 
 def _offsets(path: Path) -> np.ndarray:
     try:
-        with open(path, "rb") as file:
+        with disk.opened(path) as file:
             found = image_files.read_npy(file, path.stat().st_size, str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); name another file") from None
