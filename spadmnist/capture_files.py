@@ -31,6 +31,7 @@ from . import units
 from .effects import Conditions
 from .errors import InputError, SpadError
 from .events import Events, Layout
+from .foreign import visible
 from .kernels import jit
 from .readout import counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
@@ -78,22 +79,17 @@ def opened(path: Path) -> Iterator[Any]:
     except MemoryError:
         raise InputError(f"{path}: needs more memory than there is; cut the capture into several") from None
     except _DAMAGE as error:
-        reason = " ".join(printable(str(error)).split())
+        reason = visible(" ".join(str(error).split()))
         raise InputError(
             f"{path}: is damaged, cut short or was never closed ({reason[:120]}); copy it again from where it was made"
         ) from None
-
-
-def printable(text: str) -> str:
-    """A name or sentence from a file on one line."""
-    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _data_set(file: Any, name: str, path: Path) -> Any:
     """A plain data set of unsigned integers (or of booleans) in the file itself."""
     import h5py
 
-    there = ", ".join(sorted(printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
+    there = ", ".join(sorted(visible(key)[:40] for key in list(file)[:10])) or "nothing"
     link = file.get(name, getlink=True)
     if link is None:
         raise InputError(f"{path}: has no data set {name}; there is {there}")

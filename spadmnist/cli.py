@@ -8,6 +8,7 @@ nor numba.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+from .foreign import quoted, visible, visible_lines
 
 if TYPE_CHECKING:
     from .factory import Progress
@@ -188,24 +191,28 @@ def generate(
         from . import plan
 
         estimate = plan.estimate(experiment, images, workers)
-        click.echo(json.dumps(estimate) if as_json else plan.text(estimate, root))
+        if as_json:
+            _print_json(estimate)
+        else:
+            _print_lines(plan.text(estimate, root))
         return
     with _terminal() as progress:
         outcome = factory.generate(experiment, images, root, workers, progress)
     if as_json:
-        click.echo(
-            json.dumps({"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds})
-        )
+        _print_json({"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds})
         return
     from . import report
 
-    click.echo(report.level_table(outcome.manifest))
+    _print_lines(report.level_table(outcome.manifest))
     if outcome.made == 0 and outcome.kept == 0:
-        _say(f"\n{root} was complete already; nothing was done. spadmnist verify {root} reads every byte of it.")
+        _say("")
+        again = f"spadmnist verify {quoted(root)} reads every byte of it"
+        _say(f"{root} was complete already; nothing was done. {again}.")
     else:
         kept = f", {outcome.kept} were there already" if outcome.kept else ""
-        _say(f"\nMade {outcome.made} shards in {_duration(outcome.seconds)}{kept}: {root}")
-        _say(f"Look at it:  spadmnist inspect {root} --plot {root.name}.png")
+        _say("")
+        _say(f"Made {outcome.made} shards in {_duration(outcome.seconds)}{kept}: {root}")
+        _say(f"Look at it:  spadmnist inspect {quoted(root)} --plot {quoted(f'{root.name}.png')}")
 
 
 @cli.command("reconstruct", short_help="Make flux images of a dataset or a measurement.")
@@ -278,13 +285,14 @@ def reconstruct_(
     with _terminal() as progress:
         added, manifest = factory.add_reconstructions(dataset, methods, jobs or _processors(), progress)
     if as_json:
-        click.echo(json.dumps({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]}))
+        _print_json({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
         return
     if added:
-        _say(f"Added to {dataset}: {', '.join(added)}\n")
+        _say(f"Added to {dataset}: {', '.join(added)}")
     else:
-        _say(f"{dataset} holds these reconstructions already; nothing was done.\n")
-    click.echo(report.level_table(manifest))
+        _say(f"{dataset} holds these reconstructions already; nothing was done.")
+    _say("")
+    _print_lines(report.level_table(manifest))
 
 
 def _reconstruct_measurement(
@@ -304,10 +312,11 @@ def _reconstruct_measurement(
     rows = found.rows()
     if as_json:
         answer = {"measurement": opened.name, "folder": str(folder), "images": rows, "notes": found.notes}
-        click.echo(json.dumps(answer))
+        _print_json(answer)
         return
-    click.echo(report.flux_table(rows))
-    _say(f"\nMade {len(rows)} image{'s' if len(rows) > 1 else ''}: {folder}. Look at {folder / fluxes.SHEET}")
+    _print_lines(report.flux_table(rows))
+    _say("")
+    _say(f"Made {len(rows)} image{'s' if len(rows) > 1 else ''}: {folder}. Look at {folder / fluxes.SHEET}")
 
 
 @cli.command(short_help="Say and show what a dataset or a measurement holds.")
@@ -338,17 +347,15 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         return
     manifest = library.intact_manifest(dataset)
     if as_json:
-        click.echo(
-            json.dumps(
-                {
-                    "levels": report.level_rows(manifest),
-                    "normalisation": manifest["normalisation"],
-                    "config": manifest["config"],
-                }
-            )
+        _print_json(
+            {
+                "levels": report.level_rows(manifest),
+                "normalisation": manifest["normalisation"],
+                "config": manifest["config"],
+            }
         )
     else:
-        click.echo(report.level_table(manifest))
+        _print_lines(report.level_table(manifest))
     if plot is not None:
         with _writing(plot):
             report.sheet(library.open(dataset), plot, places=report.places_of(manifest, dataset))
@@ -361,9 +368,9 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
     opened = measurement.open(path)
     looks = report.looks(opened, plot is not None)
     if as_json:
-        click.echo(json.dumps({"measurement": opened.name, "captures": [one.numbers for one in looks]}))
+        _print_json({"measurement": opened.name, "captures": [one.numbers for one in looks]})
     else:
-        click.echo(report.capture_table(opened, looks))
+        _print_lines(report.capture_table(opened, looks))
     if plot is not None:
         with _writing(plot):
             report.capture_sheet(opened, looks, plot)
@@ -411,10 +418,10 @@ def simulate(
     with _terminal() as progress:
         twin.simulate(model, opened, output, seed, progress)
     if as_json:
-        click.echo(json.dumps({"measurement": str(output), "captures": [c.id for c in opened.captures]}))
+        _print_json({"measurement": str(output), "captures": [c.id for c in opened.captures]})
     else:
         _say(f"Simulated {len(opened.captures)} captures: {output}")
-        _say(f"Look at them:  spadmnist inspect {output} --plot {output.name}.png")
+        _say(f"Look at them:  spadmnist inspect {quoted(output)} --plot {quoted(f'{output.name}.png')}")
 
 
 @cli.command(short_help="Compare every byte with the manifest; repair.")
@@ -457,19 +464,20 @@ def verify(
             "extra": damage.extra,
             "files": damage.files,
         }
-        click.echo(json.dumps({"dataset": str(dataset), **found, "repaired": did, "intact": not left}))
+        _print_json({"dataset": str(dataset), **found, "repaired": did, "intact": not left})
     else:
         for kind in ("changed", "missing", "extra"):
             for name in getattr(damage, kind):
-                click.echo(f"{kind}: {name}")
+                _print(f"{kind}: {name}")
         for line in did:
-            click.echo(line)
+            _print(line)
         if not damage:
-            click.echo(f"{dataset}: all {damage.files} files are as they were made")
+            _print(f"{dataset}: all {damage.files} files are as they were made")
         elif not left:
-            click.echo(f"{dataset}: repaired; all {left.files} files are as they were made")
+            _print(f"{dataset}: repaired; all {left.files} files are as they were made")
         else:
-            click.echo(f"{dataset}: {_count(damage)} not as made; spadmnist verify {dataset} --repair makes them again")
+            again = f"spadmnist verify {quoted(dataset)} --repair makes them again"
+            _print(f"{dataset}: {_count(damage)} not as made; {again}")
     if left:
         sys.exit(1)
 
@@ -557,16 +565,16 @@ def import_(
     if as_json:
         captures = [one.as_data() for one in made.took]
         told = {"measurement": str(made.folder), "captures": captures, "notes": made.notes, "missing": made.missing}
-        click.echo(json.dumps(told))
+        _print_json(told)
     else:
         for one in made.took:
-            click.echo(one.text())
+            _print_lines(one.text())
     for note in made.notes:
         _say(f"Note: {note}.")
     if made.missing:
-        _say(f"Still missing: {', '.join(made.missing)}. Next:  spadmnist import FILE -o {made.folder}")
+        _say(f"Still missing: {', '.join(made.missing)}. Next:  spadmnist import FILE -o {quoted(made.folder)}")
     elif not as_json:
-        _say(f"Made: {made.folder}. Look at it:  spadmnist inspect {made.folder}")
+        _say(f"Made: {made.folder}. Look at it:  spadmnist inspect {quoted(made.folder)}")
 
 
 @cli.command(short_help="Write captures to files that other programs read.")
@@ -611,10 +619,10 @@ def export(
     with _terminal() as progress:
         paths = exporters.export(library.open(measurement, readout), output, format_, ids, progress)
     if as_json:
-        click.echo(json.dumps({"files": [str(path) for path in paths]}))
+        _print_json({"files": [str(path) for path in paths]})
         return
     for path in paths:
-        click.echo(str(path))
+        _print(str(path))
 
 
 @cli.command("effects", short_help="List physical effects, describe one, or begin one of your own.")
@@ -654,12 +662,13 @@ def _begin_effect(name: str, stage: str | None, as_json: bool) -> None:
     plugins.load_file(path)
     cls = Effect.registry.find(name)
     if as_json:
-        click.echo(json.dumps({"file": str(path), "effect": name, "stage": cls.stage}))
+        _print_json({"file": str(path), "effect": name, "stage": cls.stage})
         return
     lines = [f"Wrote {path}, an effect of the stage {cls.stage} that works as it is. Read about it:", ""]
-    lines += [f"  spadmnist effects {name} --plugin {path}", "", "Put it into a config, say my.yaml:", ""]
+    lines += [f"  spadmnist effects {name} --plugin {quoted(path)}", "", "Put it into a config, say my.yaml:", ""]
     lines += [*reference.effect_yaml(cls), "", "And simulate it:", ""]
-    click.echo("\n".join([*lines, f"  spadmnist generate my.yaml -o out --plugin {path}"]))
+    for line in [*lines, f"  spadmnist generate my.yaml -o out --plugin {quoted(path)}"]:
+        _print(line)
 
 
 @cli.command("statistics", short_help="List what measurements are compared by, or describe one.")
@@ -745,7 +754,7 @@ def compare(
     if output is not None:
         page = pages.comparison(found, output)
         _say(f"Report: {page}")
-    click.echo(criticism.table(found))
+    _print_lines(criticism.table(found))
     if found.verdict != "adequate":
         sys.exit(1)
 
@@ -802,7 +811,7 @@ def diagnose(
         page = pages.diagnosis(found, output)
         _say(f"Report: {page}")
     _write_answer(json_file, answer.canonical(found))
-    click.echo(answer.table(found))
+    _print_lines(answer.table(found))
 
 
 @cli.command(short_help="Settle parameters of a model.")
@@ -842,7 +851,7 @@ def fit(
     with _writing(output):
         found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found), model.window))
     _write_answer(json_file, answer.canonical(found))
-    click.echo(answer.table(found))
+    _print_lines(answer.table(found))
 
 
 def _model(sensor: Path, crop: str | None) -> Sensor:
@@ -900,9 +909,9 @@ def _describe(kind: str, name: str | None, as_json: bool) -> None:
 
     try:
         if as_json:
-            click.echo(json.dumps(reference.as_data(kind, name)))
+            _print_json(reference.as_data(kind, name))
         else:
-            click.echo(reference.text(kind, name))
+            _print_lines(reference.text(kind, name))
     except KeyError as error:
         raise SpadError(str(error.args[0])) from None
 
@@ -910,10 +919,29 @@ def _describe(kind: str, name: str | None, as_json: bool) -> None:
 # --- talking to people --------------------------------------------------------------------------------------------
 
 
+# Nothing else in this module writes: names and texts of files never reach a terminal as they are.
+
+
 def _say(text: str) -> None:
+    """One line, for people."""
     # where nobody can be told there is nothing to do about it
     with contextlib.suppress(OSError, ValueError):
-        click.echo(text, err=True)
+        click.echo(visible(text), err=True)
+
+
+def _print(text: str) -> None:
+    """One line that a program may read."""
+    click.echo(visible(text))
+
+
+def _print_lines(text: str) -> None:
+    """A table or a page: who made it has seen to it that only its own lines end."""
+    click.echo(visible_lines(text))
+
+
+def _print_json(answer: Any) -> None:
+    """All but DEL is escaped by itself."""
+    click.echo(json.dumps(answer).replace("\x7f", "\\u007f"))
 
 
 def _duration(seconds: float) -> str:
@@ -970,7 +998,7 @@ class _terminal:
                 tqdm(
                     total=total,
                     initial=done,
-                    desc=what,
+                    desc=visible(what),
                     disable=None,
                     leave=False,
                     bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
@@ -978,7 +1006,7 @@ class _terminal:
             )
 
         def advance(work: float, note: str) -> None:
-            bar[-1].set_postfix_str(note, refresh=False)
+            bar[-1].set_postfix_str(visible(note), refresh=False)
             bar[-1].update(work)
 
         def stop() -> None:
@@ -1016,8 +1044,10 @@ def _run(arguments: list[str] | None) -> int:
     except (click.Abort, KeyboardInterrupt):
         return _interrupted()
     except click.ClickException as error:
-        with contextlib.suppress(OSError, ValueError):
-            error.show()
+        shown, words = io.StringIO(), error.format_message()
+        error.show(shown)
+        for line in shown.getvalue().replace(words, visible(words)).rstrip("\n").split("\n"):
+            _say(line)
         return 2
     except ConfigError as error:
         for problem in error.problems:
@@ -1043,13 +1073,18 @@ def _run(arguments: list[str] | None) -> int:
             return 143
         if os.environ.get("SPADMNIST_DEBUG"):
             raise
-        _say(f"Error: this should not have happened, and is a fault of the program: {type(error).__name__}: {error}")
+        _say(f"Error: this should not have happened, and is a fault of the program: {_kind_of(error)}")
         _say("SPADMNIST_DEBUG=1 shows where; please report it.")
         return 2
 
 
+def _kind_of(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
 def _interrupted() -> int:
-    _say("\nInterrupted. What is complete is kept: the same command goes on from there.")
+    _say("")
+    _say("Interrupted. What is complete is kept: the same command goes on from there.")
     return 130
 
 

@@ -153,7 +153,9 @@ def build(
     causes: bool = False,
 ) -> Experiment:
     """An Experiment from a parsed config; see `read`. base: the folder that relative paths in it refer to."""
-    if not isinstance(source.value, Mapping):
+    entries = source.value if isinstance(source.value, Mapping) else {}
+    # of a file that has none of a config's entries nothing is quoted: it is perhaps one that nobody may read
+    if not entries or not any(key in _SECTIONS or did_you_mean(str(key), _SECTIONS) for key in entries):
         raise ConfigError(
             [f"{source.name}: is not a config; it begins with seed, scene, recording, ... (see configs/)"]
         )

@@ -27,6 +27,7 @@ from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
 from .experiment import Experiment, Level, level_of
+from .foreign import quoted
 from .gather import gather, indices_of, join
 from .images import Images
 from .readout import Frames, Recorded, summarised
@@ -437,7 +438,7 @@ def _check_stamps(reader: ShardReader, name: str, first: int, last: int, count: 
     """Raise InputError unless an array holds the entries `first` to `last`, which are `count`."""
     if last - first != count or not 0 <= first <= last <= reader.shape(name)[0]:
         raise InputError(
-            f"{reader.root / reader.path}: counts and stamps disagree; spadmnist verify {reader.root} says more"
+            f"{reader.root / reader.path}: counts and stamps disagree; spadmnist verify {quoted(reader.root)} says more"
         )
 
 
@@ -489,12 +490,16 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
             raise InputError(f"{root}: there is no such folder") from None
         raise InputError(f"{root} is not a dataset: it has no {MANIFEST}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); spadmnist verify {root} says more") from None
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); spadmnist verify {quoted(root)} says more"
+        ) from None
     try:
         manifest = json.loads(raw)
         intact = isinstance(manifest, dict) and seal(manifest) == raw
     except (ValueError, RecursionError):
-        raise InputError(f"{path}: is damaged (not JSON); spadmnist verify {root} --repair makes it again") from None
+        raise InputError(
+            f"{path}: is damaged (not JSON); spadmnist verify {quoted(root)} --repair makes it again"
+        ) from None
     if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
         raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
     if manifest["format"] != FORMAT:
@@ -506,7 +511,7 @@ def intact_manifest(root: Path) -> dict[str, Any]:
     """The manifest as it was sealed. Raises InputError where it is not."""
     manifest, intact = read_manifest(root)
     if not intact:
-        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {root} --repair makes it again")
+        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {quoted(root)} --repair makes it again")
     return manifest
 
 

@@ -105,11 +105,21 @@ def _compose(text: str, name: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f":{mark.line + 1}" if mark else ""
-        raise ConfigError([f"{name}{line}: is not well-formed YAML: {error.problem or error.context}"]) from None
+        raise ConfigError([f"{name}{line}: is not well-formed YAML: {_without_text(error)}"]) from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError([f"{name}: is not well-formed YAML: {' '.join(str(error).split())}"]) from None
     except RecursionError:
         raise ConfigError([f"{name}: is nested too deeply"]) from None
+
+
+_QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""")
+_OF_YAML = re.compile(r"<[a-z ]+>|[^\w\s]{1,3}|\\t")  # what the parser names, and signs
+
+
+def _without_text(error: yaml.MarkedYAMLError) -> str:
+    """What the parser says, without what it quotes of the file: that is perhaps none of ours."""
+    said = str(error.problem or error.context)
+    return " ".join(_QUOTED.sub(lambda m: m[0] if _OF_YAML.fullmatch(m[0][1:-1]) else "", said).split())
 
 
 def _value(node: Any, path: Path_, document: Document, problems: list[str], seen: set[int]) -> Any:
@@ -130,7 +140,7 @@ def _value(node: Any, path: Path_, document: Document, problems: list[str], seen
             key_line = key_node.start_mark.line + 1
             if key in first:
                 problems.append(
-                    f"{document.name}:{key_line}: {key} stands here a second time (first on line {first[key]}); "
+                    f"{document.name}:{key_line}: {_word(key)} stands here a second time (first on line {first[key]}); "
                     "keep one of them"
                 )
                 continue
@@ -141,6 +151,11 @@ def _value(node: Any, path: Path_, document: Document, problems: list[str], seen
     if isinstance(node, yaml.SequenceNode):
         return [_value(item, (*path, i), document, problems, seen) for i, item in enumerate(node.value)]
     return _scalar(node, path, document, problems)
+
+
+def _word(key: Any) -> str:
+    """A key as an error may say it; a line of a file that is no config is no word."""
+    return str(key) if re.fullmatch(r"[\w.-]{1,60}", str(key)) else "an entry"
 
 
 def _scalar(node: Any, path: Path_, document: Document, problems: list[str]) -> Any:

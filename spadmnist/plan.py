@@ -11,6 +11,7 @@ import numpy as np
 
 from . import dataset, factory, store
 from .experiment import Experiment
+from .foreign import visible
 from .images import Images
 
 _PROBE = 64  # images a level
@@ -118,14 +119,14 @@ def text(estimated: Mapping[str, Any], root: Path) -> str:
     lines = [f"{'light level':>14}  {'images':>9}  {'photons':>9}  {'detections':>10}  {'size':>8}  {'time':>8}"]
     for row in [*estimated["levels"], {"level": "all", **estimated["total"]}]:
         lines.append(
-            f"{row['level']:>14}  {row['images']:>9,}  {row['photons']:>9.3g}  {row['detections']:>10.4g}  "
+            f"{visible(row['level']):>14}  {row['images']:>9,}  {row['photons']:>9.3g}  {row['detections']:>10.4g}  "
             f"{_bytes(row['bytes']):>8}  {_seconds(row['seconds']):>8}"
         )
     jobs = estimated["jobs"]
     lines += [
         "",
         f"{estimated['shards']} shards with {jobs} worker{'s' if jobs > 1 else ''}, "
-        f"about {_bytes(estimated['memory_per_worker'])} of memory each. Nothing was made in {root}.",
+        f"about {_bytes(estimated['memory_per_worker'])} of memory each. Nothing was made in {visible(root)}.",
         "Photons and detections are expectations; size and time are scaled up from some images simulated just now.",
     ]
     return "\n".join(lines)

@@ -10,6 +10,7 @@ from typing import Any
 
 from . import effects, units
 from .effects import STAGES, Effect
+from .foreign import visible
 from .plugins import Parameter, Plugin, Registry, source_file
 from .readout import READOUTS
 from .reconstruct import Method
@@ -147,7 +148,7 @@ def _page(
     """Name, facts and hooks, the file if it is a user's, docstring, law of the mean, parameters, YAML."""
     head = [cls.name, "; ".join(facts), *acts]
     if cls.__module__.partition(".")[0] != __package__:
-        head.append(f"file: {source_file(cls)}")
+        head.append(f"file: {visible(source_file(cls))}")
     blocks = [head, _docstring(cls), mean, _parameters(list(cls.parameters.values())), paste]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
@@ -225,6 +226,7 @@ def _listing(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _aligned(rows: Sequence[Sequence[str]], pad_last: bool = False) -> list[str]:
+    rows = [list(map(visible, row)) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     return lines if pad_last else [line.rstrip() for line in lines]

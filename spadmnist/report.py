@@ -22,6 +22,7 @@ from . import look, pictures, reconstruct, units
 from .dataset import Dataset, Part
 from .errors import SpadError
 from .events import Events
+from .foreign import visible
 from .measurement import Measurement
 from .readout import Frames
 from .recording import Capture, Recording
@@ -109,7 +110,11 @@ def _about(manifest: Mapping[str, Any]) -> str:
         "seed": str(manifest["seed"]),
         "stored": f"{_bytes(stored)} in {len(manifest['files']) + 1:,} files, {config['output']['format']}",
     }
-    return "\n".join(f"{name:<9}  {text}" for name, text in facts.items())
+    return _facts(facts)
+
+
+def _facts(facts: Mapping[str, str]) -> str:
+    return "\n".join(f"{name:<9}  {visible(text)}" for name, text in facts.items())
 
 
 _HEADER = ("level", "images", "detections", "mean", "empty", "ones", "density", "saturated", "size", "bits")
@@ -193,6 +198,7 @@ def _normalisation(manifest: Mapping[str, Any]) -> str:
 
 def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """First column to the left, the others to the right; more columns than fit go into a table below."""
+    header, rows = list(map(visible, header)), [list(map(visible, row)) for row in rows]
     widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
     groups: list[list[int]] = [[]]
     for i in range(1, len(header)):
@@ -700,7 +706,6 @@ def capture_table(measurement: Measurement, looks: Sequence[Look]) -> str:
         "pixels": f"{layout.rows} x {layout.columns}{places}",
         "captures": f"{len(looks)}",
     }
-    about = "\n".join(f"{name:<9}  {text}" for name, text in facts.items())
     head = ("capture", "modality", "light", "recorded", "detections", "a pixel", "ones")
     made, seen = [], []
     for one in looks:
@@ -712,7 +717,7 @@ def capture_table(measurement: Measurement, looks: Sequence[Look]) -> str:
             odd = [_integer(n[f"{what}_pixels"]) for what in ("empty", "dead", "hot")]
             shortest = n["shortest_interval"]
             seen.append((row[0], *rates, *odd, "-" if shortest is None else units.show(shortest, "s")))
-    blocks = [about, _aligned(head, made)]
+    blocks = [_facts(facts), _aligned(head, made)]
     if seen:
         blocks += [_aligned(_LOOK_HEADER, seen), _LOOK_LEGEND]
     blocks += [_wrapped(f"{one.capture.id}: {note}.") for one in looks for note in one.numbers["notes"]]

@@ -42,6 +42,7 @@ from numcodecs.fletcher32 import Fletcher32
 
 from .disk import Files, commit_file, inside, install, put_tree, temporary, workspace, writing
 from .errors import InputError
+from .foreign import quoted
 
 # One task is one core; with threads of its own Blosc would use more of them without need.
 numcodecs.blosc.use_threads = False
@@ -712,7 +713,7 @@ class ShardReader:
 
     def _refuse(self, file: str, problem: str) -> InputError:
         return InputError(
-            f"{self.root / file}: {problem}; the file was changed or damaged: `spadmnist verify {self.root}` "
+            f"{self.root / file}: {problem}; the file was changed or damaged: `spadmnist verify {quoted(self.root)}` "
             "names every such file, and with --repair it makes them again"
         )
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import units
 from ..effects import Effect, Mimic
+from ..foreign import visible
 from ..statistics import Statistic, Summary
 from .candidates import Change, Dial, Key
 from .fit import Cell
@@ -27,6 +28,7 @@ def plain(value: float) -> float:
 
 def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
     """Lines of a table."""
+    rows = [tuple(map(visible, row)) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 

@@ -15,7 +15,6 @@ import importlib
 import logging
 import math
 import pkgutil
-import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 
 from .. import disk, image_files
 from ..errors import InputError
+from ..foreign import quoted
 from ..import_options import Said, ask
 from ..recording import MODALITIES
 from ..units import LONGEST, SHORTEST
@@ -172,7 +172,7 @@ def recognise(path: Path) -> type[Format]:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")
     kinds = formats()
     if head.startswith(_GZIP) and not any(path.suffix.lower() in kind.ends for kind in kinds if kind.binary):
-        name = shlex.quote(path.name)
+        name = quoted(path.name)
         raise InputError(f"{path}: is packed by gzip; unpack it (gunzip -k {name}) and import what comes out")
     for kind in kinds:
         if kind.fits(path, head):

@@ -11,6 +11,7 @@ from .. import config, look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
+from ..foreign import visible
 from ..import_options import without_effect, word
 from ..recording import Capture, Light, Recording
 from . import FACTS, Format, Found, Said, ask, pixels, plan, recognise, stacks
@@ -87,8 +88,10 @@ class Took:
             parts.append(f"frame time {units.show(c.frame_time, 's', 9)}{self._from('frame_time')}")
         if self.tick is not None:
             parts.append(f"ticks of {units.show(self.tick, 's', 6)}{self._from('tick')}")
-        lines = [f"{capture.id}: {capture.modality}, {head}, {', '.join(parts)}; from {self.file} ({self.kind})"]
-        return "\n".join([*lines, *(f"  left out: {what}" for what in self.left_out)])
+        lines = [
+            f"{capture.id}: {capture.modality}, {head}, {', '.join(parts)}; from {visible(self.file)} ({self.kind})"
+        ]
+        return "\n".join([*lines, *(f"  left out: {visible(what)}" for what in self.left_out)])
 
     def _from(self, name: str) -> str:
         return f" ({self.sources[name]})" if name in self.sources else ""

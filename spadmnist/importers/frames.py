@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .. import image_files
-from ..capture_files import printable
 from ..errors import InputError
+from ..foreign import visible
 from ..import_options import BITS, STACKS
 from ..recording import MODALITIES
 from . import (
@@ -119,7 +119,7 @@ class Npz(Format):
             refuse_fine_times(path, held)
             time, pixel = (whole(one_axis(plain[name], name, path), name, path) for name in ("time", "pixel"))
             return Found(known, pixel, time, sources=sources)
-        there = ", ".join(printable(name) for name in sorted(held)[:8])[:200]
+        there = ", ".join(visible(name) for name in sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"
         )

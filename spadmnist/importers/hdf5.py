@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..capture_files import FILTERS, attribute, check_stored, opened, printable
+from ..capture_files import FILTERS, attribute, check_stored, opened
 from ..errors import InputError
+from ..foreign import visible
 from ..import_options import BITS, PLAIN_HDF5, STACKS
 from . import (
     HDF5,
@@ -53,7 +54,7 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
     """A plain data set of whole numbers that is there as a whole."""
     found = _node(file, name, path)
     if found is None:
-        there = ", ".join(sorted(printable(str(key))[:40] for key in list(file)[:10])) or "nothing"
+        there = ", ".join(sorted(visible(key)[:40] for key in list(file)[:10])) or "nothing"
         raise InputError(f"{path}: has no data set {name}; there is {there} (--dataset names one of frames)")
     line = axes == 1 and found.ndim == 2 and 1 in found.shape  # MATLAB has no arrays of one axis
     if found.dtype.kind not in "iubf" or (found.ndim != axes and not line):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from ..errors import InputError, did_you_mean
 from ..events import Layout
+from ..foreign import quoted
 from ..plugins import ByWavelength
 from ..recording import Capture, Recording
 from ..sensor import Sensor
@@ -137,5 +137,5 @@ def _row(names: Sequence[str]) -> str:
 def without_file(file: Path, id: Any) -> str:
     """What is said of a capture that has yet to be recorded. file: the YAML file of its measurement."""
     plan = file.parent if file.name == FILE else file
-    name = shlex.quote(id) if isinstance(id, str) and id else "ID"
-    return f"has no file yet; record it, then: spadmnist import FILE -o {shlex.quote(str(plan))} --capture {name}"
+    name = quoted(id) if isinstance(id, str) and id else "ID"
+    return f"has no file yet; record it, then: spadmnist import FILE -o {quoted(plan)} --capture {name}"

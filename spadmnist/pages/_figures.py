@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import units
+from ..foreign import visible
 from ..statistics import Statistic, Summary
 from ._frame import SUPERSCRIPT
 
@@ -144,7 +145,7 @@ def _axis_of(summary: Summary) -> tuple[np.ndarray | None, str, bool]:
     if usable and axis is not None:
         rising = np.diff(axis)
         if (rising > 0).all() or (rising < 0).all():
-            return np.asarray(axis, np.float64), _printable(summary.label), summary.log and bool((axis > 0).all())
+            return np.asarray(axis, np.float64), visible(summary.label), summary.log and bool((axis > 0).all())
     if n <= _FEW_CELLS:
         return None, "", False
     return np.arange(n, dtype=np.float64), f"cell, 0 to {n - 1}", False
@@ -501,9 +502,5 @@ def _where(summary: Summary, cell: int) -> str:
 
 def shortened(text: str, most: int) -> str:
     """Text without its middle where it is too long for a picture; the page has it whole."""
-    text = _printable(text)
+    text = visible(text)
     return text if len(text) <= most else f"{text[: (most - 1) // 2]}…{text[-(most // 2) :]}"
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)

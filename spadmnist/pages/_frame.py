@@ -11,6 +11,7 @@ import jinja2
 
 from .. import dataset, disk, units
 from ..errors import SpadError
+from ..foreign import visible_lines
 from ..statistics import Statistic
 
 # kind of page -> its file in the folder
@@ -35,6 +36,7 @@ def write(folder: Path, kind: str, template: str, words: dict[str, Any]) -> Path
     check_place(folder, kind)
     environment = jinja2.Environment(
         autoescape=True,
+        finalize=_seen,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -52,6 +54,11 @@ def write(folder: Path, kind: str, template: str, words: dict[str, Any]) -> Path
     page = Path(folder) / FILES[kind]
     disk.commit_file(page, text.encode("utf-8", "replace"), page.parent)
     return page
+
+
+def _seen(value: object) -> object:
+    """What stands in a template's braces, without what moves or turns the text around it."""
+    return visible_lines(value) if type(value) is str else value
 
 
 def check_place(folder: Path, kind: str = "comparison") -> None:

@@ -1,0 +1,54 @@
+"""Text that others wrote, as it may be shown: on a terminal, in a page, in a command to paste.
+
+The name of a file or of a sensor may hold characters that move the cursor, end a line or turn the order of what
+follows. Nothing that cannot be seen is passed on as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+
+
+def visible(text: object) -> str:
+    r"""One line, in which every character that cannot be printed stands as its number: ESC as `\x1b`.
+
+    These are control characters, ends of lines, marks of direction, blanks other than a space, and bytes of a file's
+    name that are no text.
+    """
+    shown = str(text)
+    return shown if shown.isprintable() else "".join(map(_seen, shown))
+
+
+def visible_lines(text: str) -> str:
+    r"""As `visible`, of several lines: only `\n` ends one."""
+    return "\n".join(map(visible, text.split("\n")))
+
+
+def quoted(word: str | os.PathLike[str]) -> str:
+    """A word of a command to paste into a shell, where it stands for itself: a path, or what a user has named."""
+    text = str(word)
+    if text.startswith("-"):
+        text = f"./{text}"
+    if text.isprintable():
+        return shlex.quote(text)
+    # what a shell calls ANSI-C quoting takes bytes by their numbers
+    escapes = {"'": "\\'", "\\": "\\\\"}
+    return "$'" + "".join(escapes.get(c) or (c if c.isprintable() else _bytes_of(c)) for c in text) + "'"
+
+
+def _seen(character: str) -> str:
+    if character.isprintable():
+        return character
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a name that is no text, as Python holds it
+        code -= 0xDC00
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def _bytes_of(character: str) -> str:
+    try:
+        held = os.fsencode(character)
+    except UnicodeEncodeError:  # half of a character: no file's name
+        held = character.encode("utf-8", "surrogatepass")
+    return "".join(f"\\x{byte:02x}" for byte in held)
