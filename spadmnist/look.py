@@ -136,7 +136,8 @@ def _silent_stamps(recorded: Recording, events: Events) -> list[str]:
             "if its clock did not start at 0, import it again with --subtract-start and the --exposure since then"
         )
     if _chance(count, last, end) < _CHANCE and _is_unusual(behind, moments, width):
-        step = 10.0 ** (math.floor(math.log10(behind * tick)) - 2)  # three digits of the silence
+        # three digits of the shorter one, the silence or what was recorded
+        step = 10.0 ** (math.floor(math.log10(min(behind, last) * tick)) - 2)
         at = units.show(math.ceil(last * tick / step) * step, "s", 12)
         notes.append(
             f"nothing was recorded in the last {units.show(behind * tick, 's', 3)} of {units.show(exposure, 's', 6)}; "

@@ -879,7 +879,8 @@ def _interval_plot(axes: Any, one: Look) -> None:
 def _course_plot(axes: Any, one: Look) -> None:
     assert one.course is not None
     time, means, errors = one.course
-    mean = float(np.average(means, weights=1 / np.maximum(errors, 1e-300) ** 2))
+    # where frames are all alike, the errors are 0 and the means the same
+    mean = float(np.average(means, weights=errors**-2) if (errors > 0).all() else means.mean())
     factor = next(f for f, _ in _TIMES if time[-1] * f >= 1 or f == _TIMES[-1][0])
     unit = dict(_TIMES)[factor]
     axes.fill_between(time * factor, mean - 2 * errors, mean + 2 * errors, color="0.88", label="2 standard errors")

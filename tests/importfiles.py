@@ -185,7 +185,7 @@ def _photons(path: Path) -> None:
 
 def _words(path: Path) -> None:
     words = np.zeros((2, 65, 4), "<u4")
-    words[0, 5, 0], words[1, 63, 1], words[1, 2, 0] = 1 << 31 | 2 << 28 | 281, 1 << 31 | 3 << 28 | 7, 1 << 31 | 9
+    words[0, 5, 0], words[1, 63, 0], words[1, 2, 0] = 1 << 31 | 2 << 28 | 281, 1 << 31 | 3 << 28 | 7, 1 << 31 | 9
     path.write_bytes(words.tobytes())
 
 

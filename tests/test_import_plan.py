@@ -116,7 +116,7 @@ def test_a_plan_is_filled_in_order_or_by_capture(tmp_path: Path) -> None:
             assert np.array_equal(frames[:], np.packbits(arrays[i], axis=2))  # type: ignore[index]
     lab = plan(tmp_path / "many")
     for said, ids in (
-        ("2 files for 4 captures that are missing (dark, flat 1, counts, tags)", ()),
+        ("000.npy, 001.npy: not named as a capture is, and 4 captures are missing (dark, flat 1, counts, tags)", ()),
         ("--capture: 1 for 2 files", ("dark",)),
         ("has no capture 'drak'", ("drak", "flat 1")),
     ):

@@ -68,6 +68,26 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
     return found
 
 
+def said_in_words(path: Path, get: Callable[[str], Any], detections: bool, said: Said) -> dict[str, int]:
+    """Further facts: the `counter` of a file that says how it counts. get: by name, None where the file does not say.
+
+    Raises InputError for another word, and where modality contradicts what is there or what the user says.
+    """
+    modality, counting = get("modality"), get("counting")
+    if modality is not None and modality not in MODALITIES:
+        raise InputError(f"{path}: says that its modality is {_shown(modality)}; it is one of {', '.join(MODALITIES)}")
+    if counting is not None and counting not in ("frames", "counter"):
+        raise InputError(f"{path}: says that its counting is {_shown(counting)}; it is frames or counter")
+    if modality is not None and (modality == "tr") != detections:
+        held = "time stamps (tr)" if detections else "frames"
+        raise InputError(f"{path}: says that its modality is {modality}, but holds {held}; correct it")
+    if modality is not None and said.modality not in (None, modality):
+        raise InputError(f"{path}: says that its modality is {modality}; leave out --modality")
+    if modality is not None and modality != "counts" and said.bits is not None:
+        raise InputError(f"{path}: says that its modality is {modality}, which has no --bits; leave it out")
+    return {"counter": int(counting == "counter")} if counting is not None else {}
+
+
 def _shown(value: Any) -> str:
     return repr(value[:40]) if isinstance(value, str) else f"{value}"
 
@@ -106,8 +126,9 @@ class Found:
     channel, ticks: (detections,) integers in any order, which input and when, in `facts["tick"]` since the start.
     pixels: the channels that are pixels, in the pixels' order, silent ones too; None where the file does not say.
     names: channels that the file does not call by their number. bits: each number of the frames is a bit, and they are
-    `packed` where eight columns are a byte. facts: what the file says of itself, see `FACTS`; sources: where, by the
-    name of the fact. notes: what is to be known of it; left_out: what of the file is no detection of a pixel.
+    `packed` where eight columns are a byte; arranged: the kind of file says which axis is which. facts: what the file
+    says of itself, see `FACTS`; sources: where, by the name of the fact. notes: what is to be known of it; left_out:
+    what of the file is no detection of a pixel.
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -116,6 +137,7 @@ class Found:
     frames: Stack | None = None
     bits: bool = False
     packed: bool = False
+    arranged: bool = False
     notes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     pixels: tuple[int, ...] | None = None
@@ -307,6 +329,8 @@ def heard(name: str) -> Iterator[None]:
 def frames_in_file(path: Path, at: int, dtype: Any, shape: tuple[int, ...]) -> Stack:
     """Frames that lie in a file as they are in memory, from byte `at` on."""
     kind, each = np.dtype(dtype), math.prod(shape[1:])
+    if not each:
+        raise InputError(f"{path}: its frames are {' x '.join(map(str, shape[1:]))}; store frames that have pixels")
 
     def get(start: int, stop: int) -> np.ndarray:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,9 +13,10 @@ from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
 from ..foreign import visible
-from ..import_options import without_effect, word
+from ..import_options import UNCERTAIN, without_effect, word
+from ..measurement.entries import MOST_FRAMES
 from ..recording import Capture, Light, Recording
-from . import FACTS, Format, Found, Said, ask, pixels, plan, recognise, stacks
+from . import FACTS, Format, Found, Said, ask, lights, pixels, plan, recognise, stacks
 from .names import safe_name
 from .pixels import Channels
 
@@ -147,7 +149,8 @@ def import_files(
     channels = Channels()
     for one in ones:
         found = one.read()
-        one.capture = _capture(one, found, said, planned, [other.capture for other in ones if other.capture])
+        others = [other.capture for other in ones if other.capture]
+        one.capture = _capture(one, found, said, planned, others, notes)
         notes += [f"{one.path}: {note}" for note in (*found.notes, *stacks.axes_note(found, one.said))]
         shape = _shape(one.path, found, one.said)
         if shape is not None:
@@ -177,9 +180,7 @@ def import_files(
     measurement.write(out, name or safe_name(default), array.layout, recordings, captures)
     if said.relative_uncertainty is None and (levels := [lit for lit in lights if lit.level is not None]):
         share = levels[0].relative_uncertainty
-        notes.append(
-            f"the light's level is taken as good to {share:.1%} (one standard deviation); --relative-uncertainty tells"
-        )
+        notes.append(_uncertain_note(None, share))
     return Imported(out, tuple(captures), tuple(notes), tuple(took))
 
 
@@ -306,7 +307,12 @@ def _by(shape: Sequence[int]) -> str:
 
 
 def _capture(
-    one: _One, found: Found, said: Said, planned: measurement.Measurement | None, before: Sequence[Capture]
+    one: _One,
+    found: Found,
+    said: Said,
+    planned: measurement.Measurement | None,
+    before: Sequence[Capture],
+    notes: list[str],
 ) -> Capture:
     """The capture that a file is: as the plan says, where there is one."""
     if planned is not None and one.target is not None:
@@ -318,13 +324,19 @@ def _capture(
             raise ask(one.path, ["tick"])
         return replace(one.target, conditions=plan.clock(found, one.path, one.said, planned, one.target))
     modality = stacks.modality(one.path, found, one.said)
-    return _described(one.path, found, one.said, modality, one.light, before)
+    return _described(one.path, found, one.said, modality, one.light, before, notes)
 
 
 def _described(
-    path: Path, found: Found, said: Said, modality: str, lit: Light | None, before: Sequence[Capture]
+    path: Path,
+    found: Found,
+    said: Said,
+    modality: str,
+    lit: Light | None,
+    before: Sequence[Capture],
+    notes: list[str],
 ) -> Capture:
-    """What the user says, else what the file says, else a question."""
+    """What the user says, else what the file says, else a question. What the two say unlike goes to `notes`."""
     told = {key: value for key in FACTS if (value := getattr(said, key, None)) is not None}
     known = {**found.facts, **told}
     if said.tick is not None and found.facts.get("tick", said.tick) != said.tick:
@@ -334,14 +346,20 @@ def _described(
             raise InputError(f"{path}: says that its {key} are {found.facts[key]}; leave out {word(key)}")
     if said.counting == "frames" and found.facts.get("counter"):
         raise InputError(f"{path}: says that its counts are those of a counter; leave out --counting")
+    for key in ("exposure", "frame_time", "frame_period"):
+        if key in told and not math.isclose(found.facts.get(key, told[key]), told[key], rel_tol=1e-9):
+            there = units.show(found.facts[key], "s", 9)
+            notes.append(
+                f"{path}: says that its {key} is {there}; {word(key)} is taken, {units.show(told[key], 's', 9)}"
+            )
     missing = ["exposure"] if modality == "tr" else ["frame_time", "frame_period"]
     missing += {"tr": ["tick"], "str": ["tick"], "counts": ["bits"]}.get(modality, [])
     missing = [key for key in missing if key not in known]
     described = lit is None  # by the file
-    if lit is None and "relative_uncertainty" in found.facts:
-        kind = "lux" if "lux" in known else "irradiance"
-        uncertain = found.facts["relative_uncertainty"], known.get("own_uncertainty", 0.0)
-        lit = Light(known.get("wavelength"), known.get(kind), kind, *uncertain)
+    own = _light(path, found, notes if lit is None and said.relative_uncertainty is None else [])
+    if lit is not None and own is not None and not _alike(lit, own):
+        notes.append(f"{path}: says that its light is {look.light_text(own)}; --light is taken")
+    lit = own if lit is None else lit
     if missing or lit is None:
         raise ask(path, missing + ["light"] * (lit is None))
     if said.relative_uncertainty is not None and lit.level is None and described:
@@ -359,6 +377,11 @@ def _described(
             raise InputError(f"{path}: counts of {bits} bits are not possible; give --bits from 1 to 16")
         held, each = found.frames.shape[0], 1 if counting == "counter" or not bits else (1 << bits) - 1
         frames, time, period = held * each, known["frame_time"], known["frame_period"]
+        if frames > MOST_FRAMES:
+            raise InputError(
+                f"{path}: {held:,} counts of {bits} bits are sums of {frames:,} binary frames, more than the "
+                f"{MOST_FRAMES:,} that a capture may have; cut it into several, or give --counting counter"
+            )
         if not held:
             raise InputError(f"{path}: holds no frame; name another file")
         if said.frames not in (None, held, frames):
@@ -369,6 +392,45 @@ def _described(
             raise InputError(f"{path}: a frame of {times[0]} does not fit into the frame period of {times[1]}")
         clock = Conditions(frames * period, frames, time, period, lit.wavelength, bits, counting)
     return Capture(safe_name(path.stem, [one.id for one in before]), modality, lit, clock)
+
+
+def _light(path: Path, found: Found, notes: list[str]) -> Light | None:
+    """The light that a file gives, None where it gives none. Raises InputError where it is no one light."""
+    known = found.facts
+    levels = [kind for kind in ("lux", "irradiance") if kind in known]
+    if len(levels) == 2:
+        raise InputError(f"{path}: gives the light as lux and as irradiance; keep one of the two")
+    uncertain = known.get("relative_uncertainty"), known.get("own_uncertainty", 0.0)
+    if not levels:
+        if "wavelength" not in known and uncertain[0] is None:
+            return None
+        return Light(known.get("wavelength"), None, "irradiance", uncertain[0] or 0.0, uncertain[1])
+    kind = levels[0]
+    wavelength = known.get("wavelength", lights.PLAIN_COLOUR if kind == "lux" else None)
+    if wavelength is None:
+        raise InputError(
+            f'{path}: gives an irradiance and no wavelength; add --light, for example "500 nm '
+            f'{units.show(known[kind], "W/m^2", 9)}"'
+        )
+    if uncertain[0] is None:
+        notes.append(_uncertain_note(path, UNCERTAIN))
+    return Light(wavelength, known[kind], kind, UNCERTAIN if uncertain[0] is None else uncertain[0], uncertain[1])
+
+
+def _uncertain_note(path: Path | None, share: float) -> str:
+    where = "" if path is None else f"{path}: "
+    return (
+        f"{where}the light's level is taken as good to {share:.1%} (one standard deviation); give "
+        "--relative-uncertainty where you know better"
+    )
+
+
+def _alike(one: Light, other: Light) -> bool:
+    """Are they one light, as far as both say?"""
+    same = one.dark == other.dark
+    for a, b in ((one.wavelength, other.wavelength), (one.level, other.level)):
+        same = same and (a is None or b is None or math.isclose(a, b, rel_tol=1e-9))
+    return same and (None in (one.level, other.level) or one.kind_of_level == other.kind_of_level)
 
 
 def _shape(path: Path, found: Found, said: Said) -> tuple[int, int] | None:

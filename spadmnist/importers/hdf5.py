@@ -24,6 +24,7 @@ from . import (
     holds_detections,
     is_packed,
     refuse_fine_times,
+    said_in_words,
     whole,
 )
 from .stacks import arranged, cut
@@ -318,8 +319,7 @@ class PlainHdf5(Format):
             nodes = (stored, file)
             known = facts(path, lambda key: attribute(nodes, key, path))
             sources = dict.fromkeys(known, "the file")
-            if attribute(nodes, "counting", path) == "counter":
-                known["counter"] = 1
+            known |= said_in_words(path, lambda key: attribute(nodes, key, path), detections, said)
             if detections:
                 refuse_fine_times(path, set(file))
                 time, pixel = (_numbers(file, key, path) for key in ("time", "pixel"))
@@ -341,4 +341,5 @@ class PlainHdf5(Format):
             )
         bits = dtype.kind == "b"
         frames = arranged(shape, dtype, letters, get)
-        return Found(known, frames=frames, bits=bits, packed=packed, sources=sources, notes=notes)
+        own = {"bits": bits, "packed": packed, "arranged": matlab}
+        return Found(known, frames=frames, sources=sources, notes=notes, **own)

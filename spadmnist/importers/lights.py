@@ -11,7 +11,8 @@ from ..import_options import UNCERTAIN
 from ..recording import Light
 
 _LIGHT = 'dark, free, "500 nm free", "500 nm 75.67 nW/cm^2" or "500 nm 5 mlux"'
-_PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
+PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
+_SHORTEST_WAVE, _LONGEST_WAVE = 10e-9, 100e-6  # m: what is beyond is another unit, mistaken
 
 
 def light(text: str, relative_uncertainty: float | None = None) -> Light:
@@ -37,9 +38,14 @@ def light(text: str, relative_uncertainty: float | None = None) -> Light:
                 break
         else:
             raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
+    if not _SHORTEST_WAVE <= found.get("m", PLAIN_COLOUR) <= _LONGEST_WAVE:
+        raise SpadError(
+            f"--light: {text!r} has a wavelength that is none of light, which is {units.show(_SHORTEST_WAVE, 'm')} to "
+            f"{units.show(_LONGEST_WAVE, 'm')}; write {_LIGHT}"
+        )
     levels = found.keys() - {"m"}
     if len(levels) + words.count("free") > 1 or ("W/m^2" in found and "m" not in found):
         raise SpadError(f"--light: {text!r} needs a wavelength and one level; write {_LIGHT}")
     level = found.get("W/m^2", found.get("lux"))
     share = 0.0 if level is None else UNCERTAIN if relative_uncertainty is None else relative_uncertainty
-    return Light(found.get("m", _PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance", share)
+    return Light(found.get("m", PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance", share)

@@ -82,6 +82,13 @@ class LinoSpad2(Format):
             some = words[start : start + step][:, :kept]
             valid = some >> 31 == 1
             full += int(valid.all(axis=2).sum())
+            behind = valid[:, :, 1:] & ~valid[:, :, :-1]
+            if behind.any():
+                bad, list_, word_ = (int(x) for x in np.argwhere(behind)[0])
+                raise InputError(
+                    f"{path}: in cycle {start + bad} of the list {list_} a time stands behind an empty word (at "
+                    f"{word_ + 1}), where none can; give another --timestamps or --firmware"
+                )
             cycle, line, _ = np.nonzero(valid)
             word = some[valid].astype(np.int64)
             address, codes = word >> 28 & 3, word & 0xFFFFFFF

@@ -122,7 +122,10 @@ def array(
     shape = shapes[0] if shapes else None
     if positions is not None:
         if shape is not None and shape != (1, len(positions)):
-            raise InputError(f"{said.positions}: names {len(positions)} pixels, but {path} has {_by(shape)}")
+            named = "the plan" if said.positions is None else said.positions
+            raise InputError(
+                f"{named}: names {len(positions)} pixels, but {path} has {_by(shape)}; correct one of them"
+            )
         shape = (1, len(positions))
     numbers = None
     if said.channels is not None:
@@ -180,6 +183,7 @@ def events(path: Path, found: Found, said: Said, capture: Capture, array: Array,
         notes.append(f"its clock is counted from the first detection, at {units.show(float(start) * tick, 's', 12)}")
         ticks = ticks - start
     end = _check_times(path, ticks, tick, exposure, said)
+    _check_wrapped(path, channel if not outside.any() else channel[~outside], ticks, tick, exposure)
     # the stable sort of 16-bit integers counts them
     order = np.argsort(pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))]).astype(np.int64)
@@ -217,6 +221,39 @@ def _pixels(path: Path, channel: np.ndarray, array: Array, channels: Channels) -
     return np.asarray(pixel_of[channel])
 
 
+_COUNTERS = (16, 24, 32, 40, 48)  # bits of counters of time, as converters have them
+_FEW = 30  # detections below which an order in the file tells nothing of a counter
+_FILLED = 15  # mean intervals that the last time may lie below the counter's end: by chance it lies lower in e^-15
+
+
+def _check_wrapped(path: Path, channel: np.ndarray, ticks: np.ndarray, tick: float, exposure: float) -> None:
+    """Raise InputError where the times, in the order of the file, look like those of a counter that began anew.
+
+    It counts less far than the exposure lasts, the times fill it, and where they fall back by more than a hundredth of
+    it, they nearly always fall back by more than half. In a file that is in the order of its pixels, times fall back
+    from one pixel to the next.
+    """
+    if len(ticks) < _FEW:
+        return
+    most = int(ticks.max())
+    bits = next((bits for bits in _COUNTERS if most < 1 << bits), None)
+    if bits is None or exposure / tick <= 1 << bits or most < (1 << bits) * (1 - _FILLED / len(ticks)):
+        return
+    fall = np.where(ticks[:-1] > ticks[1:], ticks[:-1] - ticks[1:], 0)
+    changes = channel[1:] != channel[:-1]
+    if np.count_nonzero(changes) < len(np.unique(channel)):
+        fall[changes] = 0
+    wide, far = np.count_nonzero(fall > (1 << bits) // 100), fall > 1 << (bits - 1)
+    if far.any() and np.count_nonzero(far) >= 0.9 * wide:
+        at = int(far.argmax())
+        times = units.show(float(ticks[at]) * tick, "s"), units.show(float(ticks[at + 1]) * tick, "s")
+        raise InputError(
+            f"{path}: its times fall back {int(far.sum()):,} times by more than half of what {bits} bits count (first "
+            f"from {times[0]} to {times[1]}): the counter began anew; store times that go on, in 64 bits, or, where "
+            "the recording was no longer than them, sort them"
+        )
+
+
 def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, said: Said) -> int:
     """The last tick of the exposure. Raises InputError where a stamp lies outside."""
     if tick > exposure:
@@ -225,13 +262,17 @@ def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, sa
     end = no_detection(exposure, tick)
     if not len(ticks) or (int(ticks.min()) >= 0 and int(ticks.max()) <= end):
         return end
-    low, high = (units.show(float(t) * tick, "s", 9) for t in (ticks.min(), ticks.max()))
+    # as many digits as tell the last time from the exposure
+    digits = next(
+        (n for n in (9, 12, 15) if units.show(float(ticks.max()) * tick, "s", n) != units.show(exposure, "s", n)), 17
+    )
+    low, high = (units.show(float(t) * tick, "s", digits) for t in (ticks.min(), ticks.max()))
     advice = "give another --exposure"
     if 0 <= int(ticks.max()) - int(ticks.min()) <= end and not said.subtract_start:
         advice = "if its clock does not start at 0, give --subtract-start, otherwise another --exposure"
     raise InputError(
         f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {low} to {high}, outside the exposure "
-        f"of {units.show(exposure, 's', 9)}; {advice}"
+        f"of {units.show(exposure, 's', digits)}; {advice}"
     )
 
 

@@ -43,18 +43,38 @@ def match(plan: Measurement, files: Sequence[Path], ids: Sequence[str]) -> list[
         if len(ids) != len(files) or len(set(ids)) != len(ids):
             raise SpadError(f"--capture: {len(ids)} for {len(files)} files; give one for each file, in their order")
         return [plan.capture(id) for id in ids]
-    by_name = {safe_name(id).lower(): id for id in missing}
-    named = [by_name.get(safe_name(path.stem).lower()) for path in files]
+    named = [_named(plan, path) for path in files]
+    for path, one in zip(files, named, strict=True):
+        if one is not None and named.count(one) > 1:
+            raise SpadError(
+                f"{path}: is the capture {one} by its name, and so is another file; say which they are with --capture, "
+                "one for each file, in their order"
+            )
     rest = [id for id in missing if id not in named]
-    unnamed = named.count(None)
-    known = [one for one in named if one is not None]
-    if unnamed not in (0, len(rest)) or len(set(known)) != len(known):
+    unnamed = [path for path, id in zip(files, named, strict=True) if id is None]
+    if unnamed and len(unnamed) != len(rest):
+        which = f"{len(rest)} captures are missing ({', '.join(rest)})" if rest else "no other capture is missing"
+        names = ", ".join(path.name for path in unnamed[:8])
         raise SpadError(
-            f"{plan.source}: {unnamed or len(files)} files for {len(rest) or len(missing)} captures that are missing "
-            f"({', '.join(rest or missing)}); say which they are with --capture, one for each file, in their order"
+            f"{plan.source}: {names}: not named as a capture is, and {which}; say which captures the files are with "
+            "--capture, one for each file, in their order"
         )
     order = iter(rest)
     return [plan.capture(id if id is not None else next(order)) for id in named]
+
+
+def _named(plan: Measurement, path: Path) -> str | None:
+    """The capture that a file is called as, recorded already or not: to the letter, else as its file would be called.
+
+    Raises SpadError where several would be called so.
+    """
+    ids = [capture.id for capture in plan.captures]
+    if path.stem in ids:
+        return path.stem
+    alike = [id for id in ids if safe_name(id).lower() == safe_name(path.stem).lower()]
+    if len(alike) > 1:
+        raise SpadError(f"{path}: may be the capture {' or '.join(alike)}; say which it is with --capture")
+    return alike[0] if alike else None
 
 
 def stated(plan: Measurement, capture: Capture) -> dict[str, Any]:
@@ -108,8 +128,14 @@ def check(found: Found, path: Path, said: Said, plan: Measurement, capture: Capt
         if name in here and getattr(said, name, None) is None and not _same(value, here[name]):
             where = f" ({found.sources[name]})" if name in found.sources else ""
             raise _contradiction(plan, capture, name, here[name], f"{path} says {_shown(name, value)}{where}")
-    if capture.light.dark and "wavelength" in found.facts:
+    lit = {"wavelength", "irradiance", "lux"} & set(found.facts)
+    if capture.light.dark and lit:
         raise _contradiction(plan, capture, "light", "dark", f"{path} was recorded in light")
+    levels = {"irradiance", "lux"} & lit
+    if capture.light.level is not None and levels and capture.light.kind_of_level not in levels:
+        (name, *_) = levels
+        kind = capture.light.kind_of_level
+        raise _contradiction(plan, capture, kind, here[kind], f"{path} gives {name}: {_shown(name, found.facts[name])}")
 
 
 def clock(found: Found, path: Path, said: Said, plan: Measurement, capture: Capture) -> Conditions:

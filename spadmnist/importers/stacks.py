@@ -44,7 +44,7 @@ def cut(letters: str, start: int, stop: int) -> tuple[slice, ...]:
 
 def axes_note(found: Found, said: Said) -> tuple[str, ...]:
     """A note where the frames of a stack are more likely its last axis than its first, and nobody said which."""
-    known = "rows" in found.facts or None not in (said.rows, said.columns)
+    known = "rows" in found.facts or None not in (said.rows, said.columns) or found.arranged
     if found.frames is None or found.packed or said.axes is not None or known:
         return ()
     frames, rows, columns = found.frames.shape

@@ -57,6 +57,9 @@ class Array(Section):
     positions: File | None = None
 
 
+MOST_FRAMES = 10**12  # binary frames of a capture, of which counts are sums: 11 days of 1 us
+
+
 class _Light(Section):
     relative_uncertainty: Uncertainty | None = None
     own_uncertainty: Uncertainty | None = None
@@ -92,7 +95,7 @@ class Stamps(_Capture):
 
 
 class _Framed(_Capture):
-    frames: int = Field(ge=1, le=10**9)
+    frames: int = Field(ge=1, le=MOST_FRAMES)
     frame_time: Time
     frame_period: Time | None = None
     exposure: Time | None = None

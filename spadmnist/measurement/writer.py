@@ -84,18 +84,32 @@ def fill(plan: Measurement, recordings: Iterable[Recording]) -> None:
     root, described = plan.folder, plan.file
     assert root is not None and described is not None
     ids, names = [capture.id for capture in plan.captures], _files_of_plan(plan)
+    made: list[Path] = []
     with _alone(root):
         disk.sweep(disk.temporary(root))
-        for one in recordings:
-            index = ids.index(one.capture.id)
-            _check_counts(one.capture)
-            disk.inside(root, names[index])
-            _commit_recording(root, names[index], one)
-            if plan.file_name(one.capture.id) is None:
-                text = described.read_bytes().decode()
-                new = document.insert(text, ("captures", index), "id", "file", names[index], str(described))
-                disk.commit_file(described, new.encode(), disk.temporary(root))
-        _clear(root)
+        before = described.read_bytes()
+        try:
+            for one in recordings:
+                index = ids.index(one.capture.id)
+                _check_counts(one.capture)
+                disk.inside(root, names[index])
+                final = root / names[index]
+                known = final.exists()
+                _commit_recording(root, names[index], one, one.capture.id)
+                made += [] if known else [final]
+                if plan.file_name(one.capture.id) is None:
+                    text = described.read_bytes().decode()
+                    new = document.insert(text, ("captures", index), "id", "file", names[index], str(described))
+                    disk.commit_file(described, new.encode(), disk.temporary(root))
+        except InputError:
+            # what is refused leaves the plan as it was
+            if described.read_bytes() != before:
+                disk.commit_file(described, before, disk.temporary(root))
+            for final in made:
+                final.unlink(missing_ok=True)
+            raise
+        finally:
+            _clear(root)
 
 
 def _files_of_plan(plan: Measurement) -> list[str]:
@@ -186,8 +200,8 @@ def _commit(root: Path, name: str, data: bytes) -> None:
     disk.commit_file(final, data, disk.temporary(root))
 
 
-def _commit_recording(root: Path, name: str, one: Recording) -> None:
-    """Like `_commit`, written piece by piece."""
+def _commit_recording(root: Path, name: str, one: Recording, planned: str | None = None) -> None:
+    """Like `_commit`, written piece by piece. planned: the capture of a plan that it is."""
     final = root / name
     with disk.writing(final, capture_files.size(one)), disk.workspace(disk.temporary(root)) as work:
         new = work / final.name
@@ -198,6 +212,11 @@ def _commit_recording(root: Path, name: str, one: Recording) -> None:
         if not final.exists():
             disk.install(new, final, work / "aside")
         elif not final.is_file() or not filecmp.cmp(new, final, shallow=False):
+            if planned is not None:
+                raise InputError(
+                    f"{final}: the capture {planned} has other data already; remove this file to import them anew, or "
+                    "say with --capture which capture the new file is"
+                )
             raise _another(final)
 
 
