@@ -223,8 +223,8 @@ def _check_asked(
 def _is_asked(name: str, shard: Shard, experiment: Experiment, labelled: bool) -> bool:
     """Is it a file of an array that a config asks a shard to hold? Nothing else has such a place and such a name."""
     place = store.location(shard.path, experiment.format)
-    if name == place:
-        return True
+    if experiment.format == "hdf5":
+        return name == place
     group, _, rest = name.removeprefix(f"{place}/").partition("/")
     if name == group or not name.startswith(f"{place}/") or not _ARRAY_FILE.search(name):
         return False
