@@ -121,6 +121,23 @@ def read(
     return experiment
 
 
+def problems(raw: Any, name: str) -> list[str]:
+    """The mistakes in a config that is written out with nothing left open, a sentence each; name: of its place.
+
+    Types and ranges alone: no file is read, and effects and methods need not be known here.
+    """
+    if not isinstance(raw, Mapping):
+        return [f"{name}: {brief(raw)} is not a config"]
+    reader = _Reader(Document(name, raw), Path(), [])
+    reader.sections(raw, {**_SECTIONS, "sensor": _Sensor}, _DEFAULTS)
+    written = {"recording": ("frames", "frame_time", "readouts"), "sensor": ("name", "rules"), "output": ("format",)}
+    for part, keys in written.items():
+        for key in keys if not reader.problems else ():
+            if raw.get(part, {}).get(key) is None:
+                reader.say((part,), reader.missing(key))
+    return reader.problems
+
+
 def read_sensor(path: str | Path) -> Sensor:
     """The sensor of a sensor file or of a config, with every map read and every distribution drawn.
 

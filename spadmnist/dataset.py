@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -23,6 +24,7 @@ from typing import Any, Generic, Protocol, TypeVar, overload
 import numpy as np
 
 from . import config, disk, kernels, plugins, reconstruct, store, units
+from . import manifest as manifests
 from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
@@ -504,7 +506,23 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
         raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
     if manifest["format"] != FORMAT:
         raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
+    if intact and (wrong := manifests.problems(manifest, str(path))):
+        more = f" (and {len(wrong) - 4} more)" if len(wrong) > 4 else ""
+        raise InputError(f"{'; '.join(wrong[:4])}{more}; spadmnist verify {root} --repair makes {MANIFEST} again")
     return manifest, intact
+
+
+def around(root: Path) -> Path | None:
+    """The dataset, finished or not, that a folder lies in; None where it lies in none."""
+    for folder in Path(os.path.realpath(root)).parents:
+        if (folder / STATE / "plan.json").exists():
+            return folder
+        try:
+            if b'"format": "spadmnist-dataset/' in disk.read_file(folder / MANIFEST, _LARGEST_MANIFEST):
+                return folder
+        except OSError:
+            continue
+    return None
 
 
 def intact_manifest(root: Path) -> dict[str, Any]:

@@ -432,6 +432,8 @@ def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
     """Is the dataset there and finished? Refuse a folder that holds something else, before anything is written."""
+    if (outer := dataset.around(root)) is not None:
+        raise SpadError(f"{root}: lies inside the dataset {outer}, which holds its own files alone; choose another -o")
     with _writable(root):
         if not root.exists():
             return False
@@ -749,7 +751,9 @@ def finish(
         "shards": [asdict(shard) for shard in shards],
         "normalisation": normalisation,
         **({"causes": list(experiment.sensor.causes)} if experiment.causes else {}),
-        "statistics": _statistics(experiment, root, shards, wanted, files),
+        "statistics": statistics_of(
+            root, experiment.format, [x.text for x in experiment.levels], experiment.methods, like, shards, files
+        ),
         "files": files,
     }
     sealed = dataset.seal(manifest)
@@ -792,40 +796,48 @@ def _level_attributes(
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 
-def _statistics(
-    experiment: Experiment, root: Path, shards: Sequence[Shard], wanted: dict[str, Any], files: Files
+def statistics_of(
+    root: Path,
+    format: str,
+    levels: Sequence[str],
+    methods: Sequence[str],
+    like: Likeness,
+    shards: Sequence[Shard],
+    files: Files,
 ) -> dict[str, Any]:
-    """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data."""
-    pixels = int(np.prod(wanted["images"]["shape"]))
-    like = _likeness(experiment, wanted)
-    out: dict[str, Any] = {level.text: {} for level in experiment.levels}
+    """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data.
+
+    They are added up from what each shard says of itself. Raises InputError where one of them cannot be read.
+    """
+    pixels = int(np.prod(like.shape))
+    by_shard = dataset.files_by_shard(files, format)
+    out: dict[str, Any] = {level: {} for level in levels}
     for shard in shards:
         if shard.level is None:
             continue
         total = out[shard.level].setdefault(
             shard.split,
-            {"images": 0, "pixels": 0, "saturated_pixels": dict.fromkeys(experiment.methods, 0), "bytes": {}},
+            {"images": 0, "pixels": 0, "saturated_pixels": dict.fromkeys(methods, 0), "bytes": {}},
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels
-        reader = shard.reader(root, experiment.format, like)
+        reader = shard.reader(root, format, like)
+        place = store.location(shard.path, format)
         try:
             for readout, numbers in json.loads(reader.attributes["statistics"]).items():
                 sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
                 for key, value in numbers.items():
                     sums[key] += value
-            for method in experiment.methods:
+            for method in methods:
                 found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
                 total["saturated_pixels"][method] += int(found)
         except (KeyError, TypeError, ValueError, AttributeError):
             raise InputError(
-                f"{root / store.location(shard.path, experiment.format)}: what it says of its own detections is "
+                f"{root / place}: what it says of its own detections is "
                 "damaged; remove it and type the same command again"
             ) from None
-        place = store.location(shard.path, experiment.format)
-        for name, facts in files.items():
-            if name.startswith(place):
-                kind = name[len(place) :].strip("/").split("/")[0] if experiment.format == "zarr" else "all"
-                kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
-                total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
+        for name, facts in by_shard.get(place, {}).items():
+            kind = name[len(place) :].strip("/").split("/")[0] if format == "zarr" else "all"
+            kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
+            total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
+import re
 import shutil
 import stat
 import time
@@ -64,7 +65,21 @@ def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
                 changed.append(name)
     progress.stop()
     missing = sorted(set(listed) - found)
+    if not changed and not missing and not _adds_up(root, manifest):
+        changed.append(MANIFEST)
     return Damage(tuple(changed), tuple(missing), tuple(sorted(found - set(listed) - {MANIFEST})), len(present) + 1)
+
+
+def _adds_up(root: Path, manifest: Mapping[str, Any]) -> bool:
+    """Are the manifest's statistics those that its shards, which are as they were made, say of themselves?"""
+    config, levels = manifest["config"], [level["text"] for level in manifest["levels"]]
+    like, shards, files = dataset.Likeness.of(manifest), dataset.shards_in(manifest), manifest["files"]
+    format, methods = config["output"]["format"], config["reconstruct"]
+    try:
+        told = factory.statistics_of(root, format, levels, methods, like, shards, files)
+    except InputError:
+        return False
+    return told == manifest["statistics"]
 
 
 def _manifest(root: Path) -> dict[str, Any] | None:
@@ -147,6 +162,9 @@ def repair(
             )
     shards = dataset.shards_of(experiment, splits)
     bad = {*damage.changed, *damage.missing} - {POSITIONS}
+    if manifest is not None:
+        labelled = all(images.labels is not None for images in splits.values())
+        _check_asked(root, manifest, experiment, shards, labelled, bad, damage.extra)
     with factory.locked(root):
         if manifest is None:
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
@@ -174,6 +192,49 @@ def repair(
     if manifest is None:  # only now is it known what belongs here
         did += _set_aside(root, verify(root, progress).extra)
     return did
+
+
+def _check_asked(
+    root: Path,
+    manifest: Mapping[str, Any],
+    experiment: Experiment,
+    shards: Sequence[Shard],
+    labelled: bool,
+    bad: set[str],
+    extra: Sequence[str],
+) -> None:
+    """Raise SpadError where the manifest does not list what its config asks for: then nothing is moved away."""
+    small = {*factory.small_files(experiment, shards, manifest["normalisation"])[0], MANIFEST, POSITIONS}
+    wrong = "" if dataset.shards_in(manifest) == shards else "its shards are not those that its config makes"
+    for name in extra:
+        if name in small or any(_is_asked(name, s, experiment, labelled) for s in shards):
+            wrong = wrong or f"it does not list {name}, which its config asks for"
+    for name in sorted(bad - small):
+        if not any(_belongs(name, s, experiment.format) for s in shards):
+            wrong = wrong or f"it lists {name}, which its config does not ask for"
+    if MANIFEST in bad:
+        wrong = wrong or "its statistics are not those of its shards"
+    if wrong:
+        raise SpadError(
+            f"{root / MANIFEST}: {wrong}; remove {MANIFEST} and type the same command again, which makes it anew"
+        )
+
+
+def _is_asked(name: str, shard: Shard, experiment: Experiment, labelled: bool) -> bool:
+    """Is it a file of an array that a config asks a shard to hold? Nothing else has such a place and such a name."""
+    place = store.location(shard.path, experiment.format)
+    if experiment.format == "hdf5":
+        return name == place
+    group, _, rest = name.removeprefix(f"{place}/").partition("/")
+    if name == group or not name.startswith(f"{place}/") or not _ARRAY_FILE.search(name):
+        return False
+    if shard.level is None:
+        return group in ("zarr.json", "pixels", *(["labels"] if labelled else ()))
+    groups = {{"str": "frames", "qis": "frames"}.get(readout, readout) for readout in experiment.readouts}
+    return group in {"zarr.json", *groups} or (group == "reconstruction" and rest.split("/")[0] in experiment.methods)
+
+
+_ARRAY_FILE = re.compile(r"/(zarr\.json|c(\.0)+)$")
 
 
 def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did: list[str]) -> Experiment:

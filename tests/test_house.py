@@ -30,6 +30,7 @@ LAYERS = [
     {"reconstruct", "sensor", "statistics", "capture_files"},
     {"experiment", "signatures"},
     {"config"},
+    {"manifest"},
     {"dataset"},
     {"measurement"},
     {"factory", "look", "reference", "template", "twin"},
@@ -135,7 +136,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),
         ("pooch", {"images.py", "image_files.py"}),
-        ("pydantic", {"validated.py", "config.py", "images.py", "section.py", "measurement/entries.py"}),
+        ("pydantic", {"validated.py", "config.py", "images.py", "manifest.py", "section.py", "measurement/entries.py"}),
     ],
 )
 def test_a_library_has_its_place(package: str, owners: set[str]) -> None:

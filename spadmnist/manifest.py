@@ -1,0 +1,163 @@
+"""What a manifest may say: every field with its type and range. A right seal alone does not make it right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from . import config as configs
+from .document import Document
+from .section import Section
+from .validated import Reader
+
+Whole = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Text = Annotated[str, Field(min_length=1)]
+
+
+def _inside(name: str) -> str:
+    if {"", ".", ".."} & set(name.split("/")) or "\0" in name:
+        raise ValueError(f"{name!r} leads out of the dataset; it must be the name of a file inside")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_inside)]
+
+
+class _File(Section):
+    bytes: Whole
+    sha256: Digest
+
+
+class _Split(Section):
+    images: Annotated[int, Field(ge=1)]
+    sha256: Digest
+
+
+class _Images(Section):
+    shape: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=3)]
+    dtype: Literal["uint8", "uint16", "float32"]
+    white: Positive
+    splits: Annotated[dict[Text, _Split], Field(min_length=1)]
+
+
+class _Level(Section):
+    text: Text
+    kind: Literal["lux", "irradiance"]
+    value: Positive
+
+
+class _Settings(Section):
+    pdp: Annotated[float, Field(ge=0)]
+    exposure: Positive
+    dead_time: Annotated[float, Field(ge=0)]
+    tick: Annotated[float, Field(ge=0)]
+    frames: Annotated[int, Field(ge=1)]
+    frame_time: Positive
+
+
+class _Shard(Section):
+    level: Text | None
+    folder: Text
+    split: Text
+    number: Whole
+    start: Whole
+    stop: Annotated[int, Field(ge=1)]
+
+
+class _Sums(Section):
+    detections: Whole
+    empty_pixels: Whole
+
+
+class _Statistics(Section):
+    images: Whole
+    pixels: Whole
+    saturated_pixels: dict[Text, Whole]
+    bytes: dict[Text, Whole]
+    tr: _Sums | None = None
+    frames: _Sums | None = None
+    counts: _Sums | None = None
+    causes: dict[Text, Whole] | None = None
+
+
+_KINDS: dict[str, Any] = {
+    "format": str,
+    "config": dict[str, Any],
+    "images": _Images,
+    "maps": dict[FileName, Digest | dict[str, str]],
+    "plugins": list[dict[str, str]],
+    "versions": dict[str, str],
+    "seed": Whole,
+    "levels": Annotated[list[_Level], Field(min_length=1)],
+    "settings": _Settings,
+    "shards": Annotated[list[_Shard], Field(min_length=1)],
+    "normalisation": dict[str, dict[str, Positive | None]],
+    "causes": list[Text],
+    "statistics": dict[str, dict[str, _Statistics]],
+    "files": dict[FileName, _File],
+    "sha256": Digest,
+}
+
+
+def problems(manifest: Mapping[str, Any], name: str) -> list[str]:
+    """Every mistake in a manifest, a sentence each; name: of its file.
+
+    First types and ranges. Where these are right, what the parts say of each other: levels and splits are those of the
+    config, shards cover the images of each once, and statistics add them up.
+    """
+    reader = Reader(Document(name, manifest), Path())
+    reader.sections(manifest, {key: kind for key, kind in _KINDS.items() if key != "causes" or key in manifest}, {})
+    if not reader.problems:
+        _compare(manifest, reader)
+    return reader.problems
+
+
+def _compare(manifest: Mapping[str, Any], reader: Reader) -> None:
+    config, say = manifest["config"], reader.say
+    reader.problems += configs.problems(config, f"{reader.source.name}: config")
+    if not reader.problems and config.get("reconstruct") is None:
+        say(("config", "reconstruct"), "it is missing")
+    if reader.problems:
+        return
+    levels, scene = manifest["levels"], config["scene"]
+    texts = [level["text"] for level in levels]
+    if texts != scene.get(levels[0]["kind"]) or len({level["kind"] for level in levels}) > 1:
+        say(("levels",), "they are not those of the config")
+    if manifest["seed"] != config.get("seed"):
+        say(("seed",), f"{manifest['seed']} is not the config's, {config.get('seed')}")
+    splits, pixels = manifest["images"]["splits"], math.prod(manifest["images"]["shape"])
+    ends: dict[tuple[str | None, str], list[int]] = {}
+    for i, shard in enumerate(manifest["shards"]):
+        which = shard["level"], shard["split"]
+        number, start = ends.setdefault(which, [0, 0])
+        if shard["split"] not in splits or (shard["level"] is not None and shard["level"] not in texts):
+            say(("shards", i), f"{shard['level'] or 'originals'}, {shard['split']} is no level and split here")
+        elif (shard["number"], shard["start"]) != (number, start) or shard["stop"] <= start:
+            say(("shards", i), f"it does not go on where the one before it ends, at number {number} and image {start}")
+        ends[which] = [number + 1, shard["stop"]]
+    for level in (None, *texts):
+        for split, facts in splits.items():
+            held = ends.get((level, split), [0, 0])[1]
+            if held != facts["images"]:
+                what = f"{level or 'originals'}, {split}"
+                say(("shards",), f"of {what} they hold {held} images, and there are {facts['images']}")
+            if level is None:
+                continue
+            told = manifest["statistics"].get(level, {}).get(split)
+            if told is None:
+                say(("statistics", level), f"{split} is missing")
+            elif (told["images"], told["pixels"]) != (facts["images"], facts["images"] * pixels):
+                wanted = f"{facts['images']} images and {facts['images'] * pixels} pixels"
+                say(("statistics", level, split), f"they are not of {wanted}")
+            else:
+                for method in config["reconstruct"]:
+                    if method not in told["saturated_pixels"]:
+                        say(("statistics", level, split, "saturated_pixels"), f"{method} is missing")
+        if level is not None and level not in manifest["normalisation"]:
+            say(("normalisation",), f"{level} is missing")
