@@ -22,7 +22,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -636,16 +636,14 @@ def add_reconstructions(
         by_path = {s.path: s for s in shards if _record(root, s) is None}
         job = job_of(after)
 
-        def files_of(shard: Shard) -> Files:
-            place = store.location(shard.path, after.format)
-            return {n: f for n, f in manifest["files"].items() if n == place or n.startswith(place + "/")}
+        own = files_of(shards, manifest["files"], after.format)
 
         def done(path: str, result: tuple[str, Files]) -> None:
-            note(root, by_path[path], files_of(by_path[path]) | result[1])
+            note(root, by_path[path], own[path] | result[1])
             progress.advance(1, path)
 
         for path in [p for p, s in by_path.items() if s.level is None]:
-            note(root, by_path[path], files_of(by_path[path]))
+            note(root, by_path[path], own[path])
             del by_path[path]
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
@@ -764,12 +762,26 @@ def _level_attributes(
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 
+def files_of(shards: Iterable[Shard], files: Mapping[str, Any], format: str) -> dict[str, Files]:
+    """The files of each shard, in their order, by the shard's path. One pass over all files, however many shards."""
+    owner = {store.location(shard.path, format): shard.path for shard in shards}
+    found: dict[str, Files] = {path: {} for path in owner.values()}
+    for name, facts in files.items():
+        parts = name.split("/")
+        above = ("/".join(parts[:i]) for i in range(1, len(parts) + 1))
+        path = next((owner[place] for place in above if place in owner), None)
+        if path is not None:
+            found[path][name] = facts
+    return found
+
+
 def _statistics(
     experiment: Experiment, root: Path, shards: Sequence[Shard], wanted: dict[str, Any], files: Files
 ) -> dict[str, Any]:
     """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data."""
     pixels = int(np.prod(wanted["images"]["shape"]))
     out: dict[str, Any] = {level.text: {} for level in experiment.levels}
+    own = files_of(shards, files, experiment.format)
     for shard in shards:
         if shard.level is None:
             continue
@@ -788,9 +800,8 @@ def _statistics(
             found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
             total["saturated_pixels"][method] += int(found)
         place = store.location(shard.path, experiment.format)
-        for name, facts in files.items():
-            if name.startswith(place):
-                kind = name[len(place) :].strip("/").split("/")[0] if experiment.format == "zarr" else "all"
-                kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
-                total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
+        for name, facts in own[shard.path].items():
+            kind = name[len(place) :].strip("/").split("/")[0] if experiment.format == "zarr" else "all"
+            kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
+            total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
     return out

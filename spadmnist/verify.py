@@ -153,7 +153,8 @@ def repair(
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
             again = shards
         else:
-            again = [s for s in shards if any(_belongs(name, s, experiment.format) for name in bad)]
+            hurt = factory.files_of(shards, dict.fromkeys(sorted(bad)), experiment.format)
+            again = [s for s in shards if hurt[s.path]]
         did += _set_aside(root, damage.extra)
         remade, lines = _remake(experiment, splits, root, again, manifest, jobs, progress)
         did += lines
