@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_factory import write_config
 
-from spadmnist import capture_files, config, factory, measurement, store
+from spadmnist import capture_files, config, factory, measurement, plan, store
 from spadmnist.dataset import Shard
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.events import Layout
@@ -144,7 +145,7 @@ def test_neighbours_are_looked_for_within_the_array(tmp_path: Path) -> None:
     )
     assert "sensor.effects" in said and "63,984,001 neighbours, more than the 16,777,216" in said
     places = np.stack([np.arange(6000.0), np.zeros(6000)], axis=1)
-    with pytest.raises(InputError, match="35,994,000|36,000,000"):
+    with pytest.raises(InputError, match=r"35,994,000|36,000,000"):
         Layout(1, 6000, 1.0, 1.0, places).neighbours(1e6)
 
 
@@ -195,3 +196,35 @@ def test_every_file_has_its_shard(format: str) -> None:
         place = store.location(shard.path, format)
         assert list(found[shard.path]) == [n for n in files if n == place or n.startswith(f"{place}/")]
         assert found[shard.path]
+
+
+def test_what_does_not_fit_into_memory_is_refused_alike_before_and_in_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write_config(tmp_path / "small.yaml", "zarr", ("5 mlux",), train=40, test=6)
+    experiment = config.read(file)
+    images = experiment.load_images(None)
+    each = plan.estimate(experiment, images, 2)["memory_per_worker"]
+    for there, jobs, do in ((each * 3 // 2, 2, "give --jobs 1"), (each // 2, 1, "lower the frames")):
+        monkeypatch.setattr(factory, "_memory_there", lambda there=there: there)
+        said = []
+        for act in (
+            lambda jobs=jobs: plan.estimate(experiment, images, jobs),
+            lambda jobs=jobs: factory.generate(experiment, images, tmp_path / "out", jobs),
+        ):
+            with pytest.raises(InputError, match=do) as error:
+                act()
+            said.append(str(error.value))
+        assert said[0] == said[1] and not (tmp_path / "out").exists()
+    monkeypatch.setattr(factory, "_memory_there", lambda: each)
+    assert plan.estimate(experiment, images, 1)["memory_per_worker"] == each
+
+
+def test_the_limit_of_a_process_is_what_is_there() -> None:
+    limit = 3 << 30
+    program = (
+        f"import resource\nfrom spadmnist import factory\nresource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit}))\n"
+        "print(factory._memory_there())\n"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert 0 < int(told) <= limit
