@@ -45,7 +45,8 @@ _PIECE = 1 << 20  # events that are read at a time
 _FRAMES_AT_ONCE = 1 << 25  # bytes as they are stored
 _KEPT = 1 << 26  # bytes: frames that are no more than this are read once and kept
 _GZIP, _FLETCHER, _LZF = 1, 3, 32000  # numbers of HDF5's filters
-_GAINS = {_GZIP: 1032, _LZF: 88}  # by at most this factor such a filter shrinks anything
+DEFLATE_GAIN = 1032  # by at most this factor deflate shrinks anything
+_GAINS = {_GZIP: DEFLATE_GAIN, _LZF: 88}
 _UNPACKED = 1 << 28  # bytes that a chunk may unpack to whatever it is: what cannot become more is not looked at
 FILTERS = {_GZIP: "gzip", 2: "shuffle", _FLETCHER: "fletcher32", _LZF: "lzf"}
 # what h5py raises on damaged files
@@ -161,8 +162,11 @@ def _check_chunks(found: Any, name: str, path: Path) -> None:
 
 def _unpacked(raw: bytes, code: int, most: int) -> int:
     """Bytes that a chunk unpacks to, counted up to somewhat more than `most`, in little memory."""
-    if code != _GZIP:
-        return int(_lzf_size(np.frombuffer(raw, np.uint8)))
+    return deflated_size(raw, most) if code == _GZIP else int(_lzf_size(np.frombuffer(raw, np.uint8)))
+
+
+def deflated_size(raw: bytes, most: int) -> int:
+    """Bytes that deflated data unpack to, counted up to somewhat more than `most`, in little memory."""
     unpacker, size = zlib.decompressobj(), 0
     piece = raw
     while piece and size <= most:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,8 @@ from spadmnist.dataset import Shard
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.events import Layout
 from spadmnist.experiment import Level
+from spadmnist.import_options import Said
+from spadmnist.importers.frames import Npz, Tif
 
 CAPTURES = """format: spadmnist-measurement/1
 name: lab
@@ -228,3 +232,38 @@ def test_the_limit_of_a_process_is_what_is_there() -> None:
     )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert 0 < int(told) <= limit
+
+
+# --- files of other programs --------------------------------------------------------------------------------------
+
+
+def test_an_archive_that_is_read_whole_is_small(tmp_path: Path) -> None:
+    file = tmp_path / "a.npz"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("frames.npy", "w") as member:
+        header = {"shape": (300, 1024, 1024), "fortran_order": False, "descr": "|u1"}
+        np.lib.format.write_array_header_1_0(member, header)
+        for _ in range(300):
+            member.write(bytes(1 << 20))
+    assert file.stat().st_size < 1 << 20
+    with pytest.raises(InputError, match=r"a\.npz: unpacks to 314,572,928 bytes, more than the 268,435,456"):
+        Npz.read(file, Said())
+
+
+def test_a_page_unpacks_to_no_more_than_it_has(tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed")
+    packer = zlib.compressobj(9)
+    zeros = bytes(1 << 20)
+    packed = b"".join(packer.compress(zeros) for _ in range(300)) + packer.flush()
+    for name, data in (("bomb.tif", packed), ("whole.tif", zlib.compress(bytes(64)))):
+        tags = [(256, 4, 8), (257, 4, 8), (258, 3, 8), (259, 3, 8), (262, 3, 1), (273, 4, 0), (277, 3, 1), (278, 4, 8)]
+        tags.append((279, 4, len(data)))
+        at = 8 + 2 + 12 * len(tags) + 4
+        with open(tmp_path / name, "wb") as file:
+            file.write(b"II*\0" + struct.pack("<IH", 8, len(tags)))
+            for tag, kind, value in tags:
+                file.write(struct.pack("<HHII", tag, kind, 1, at if tag == 273 else value))
+            file.write(struct.pack("<I", 0) + data)
+        assert tifffile.TiffFile(tmp_path / name).pages[0].shape == (8, 8)
+    with pytest.raises(InputError, match=r"bomb\.tif: a page unpacks to more than its 64 bytes"):
+        Tif.read(tmp_path / "bomb.tif", Said()).frames[0:1]  # type: ignore[index]
+    assert not Tif.read(tmp_path / "whole.tif", Said()).frames[0:1].any()  # type: ignore[index]
