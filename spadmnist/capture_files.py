@@ -19,6 +19,7 @@ import contextlib
 import math
 import mmap
 import stat
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -43,7 +44,11 @@ _LARGEST_FRAME = 1 << 28  # bytes
 _PIECE = 1 << 20  # events that are read at a time
 _FRAMES_AT_ONCE = 1 << 25  # bytes as they are stored
 _KEPT = 1 << 26  # bytes: frames that are no more than this are read once and kept
-FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
+_GZIP, _FLETCHER, _LZF = 1, 3, 32000  # numbers of HDF5's filters
+DEFLATE_GAIN = 1032  # by at most this factor deflate shrinks anything
+_GAINS = {_GZIP: DEFLATE_GAIN, _LZF: 88}
+_UNPACKED = 1 << 28  # bytes that a chunk may unpack to whatever it is: what cannot become more is not looked at
+FILTERS = {_GZIP: "gzip", 2: "shuffle", _FLETCHER: "fletcher32", _LZF: "lzf"}
 # what h5py raises on damaged files
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, OverflowError, TypeError, EOFError)
 
@@ -127,6 +132,69 @@ def check_stored(found: Any, name: str, path: Path) -> None:
         raise InputError(
             f"{path}: {name} declares {found.size:,} values, and not all of them were written; write it again"
         )
+    if found.chunks is not None:
+        _check_chunks(found, name, path)
+
+
+def _check_chunks(found: Any, name: str, path: Path) -> None:
+    """Raise InputError where a chunk unpacks to more than its shape says: HDF5 would give it all the memory it asks."""
+    made = found.id.get_create_plist()
+    codes = [made.get_filter(i)[0] for i in range(made.get_nfilters())]
+    packers = [i for i, code in enumerate(codes) if code in _GAINS]
+    if len(packers) > 1:
+        raise InputError(f"{path}: {name} is packed {len(packers)} times over; store it packed once, with gzip")
+    sums = 4 * codes.count(_FLETCHER)
+    most = math.prod(found.chunks) * found.dtype.itemsize + sums
+    stored: list[tuple[tuple[int, ...], int, int]] = []
+    found.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size, chunk.filter_mask)))
+    for offset, size, skipped in stored:
+        large = size > most + most // 100 + 4096  # what does not shrink may grow a little
+        if not large and packers and not skipped >> packers[0] & 1 and size * _GAINS[codes[packers[0]]] > _UNPACKED:
+            behind = 4 * codes[packers[0] :].count(_FLETCHER)  # stands behind what is packed
+            raw = found.id.read_direct_chunk(offset)[1]
+            large = _unpacked(raw[: len(raw) - behind], codes[packers[0]], most) > most
+        if large:
+            raise InputError(
+                f"{path}: {name} has a chunk that unpacks to more than the {most:,} bytes of its shape; the file is "
+                "damaged or hostile: write it again"
+            )
+
+
+def _unpacked(raw: bytes, code: int, most: int) -> int:
+    """Bytes that a chunk unpacks to, counted up to somewhat more than `most`, in little memory."""
+    return deflated_size(raw, most) if code == _GZIP else int(_lzf_size(np.frombuffer(raw, np.uint8)))
+
+
+def deflated_size(raw: bytes, most: int) -> int:
+    """Bytes that deflated data unpack to, counted up to somewhat more than `most`, in little memory."""
+    unpacker, size = zlib.decompressobj(), 0
+    piece = raw
+    while piece and size <= most:
+        size += len(unpacker.decompress(piece, _PIECE))
+        piece = unpacker.unconsumed_tail
+    return size
+
+
+@jit
+def _lzf_size(raw):  # type: ignore[no-untyped-def]
+    """LZF: a byte below 32 begins a run of so many bytes and one; another one refers to bytes that came before."""
+    size = at = 0
+    while at < raw.size:
+        control = np.int64(raw[at])
+        if control < 32:
+            size += control + 1
+            at += control + 2
+            continue
+        length = control >> 5
+        at += 1
+        if length == 7:
+            if at >= raw.size:
+                break
+            length += np.int64(raw[at])
+            at += 1
+        size += length + 2
+        at += 1
+    return size
 
 
 def attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
@@ -188,7 +256,7 @@ def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _
             "correct one of them"
         )
     if capture.modality == "tr":
-        return _found_events(file, capture, path)
+        return _found_events(file, capture, math.prod(shape), path)
     frames = _data_set(file, "frames", path)
     if frames.ndim != 3:
         raise InputError(f"{path}: frames has {frames.ndim} axes, {frames.shape}; it needs (frames, rows, columns)")
@@ -223,7 +291,7 @@ def _by(shape: tuple[int, ...]) -> str:
     return " x ".join(str(n) for n in shape)
 
 
-def _found_events(file: Any, capture: Capture, path: Path) -> _Found:
+def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Found:
     time, pixel = _data_set(file, "time", path), _data_set(file, "pixel", path)
     for name, found in (("time", time), ("pixel", pixel)):
         if found.ndim != 1 or found.dtype.kind != "u":
@@ -239,7 +307,15 @@ def _found_events(file: Any, capture: Capture, path: Path) -> _Found:
         )
     check_stored(time, "time", path)
     check_stored(pixel, "pixel", path)
-    return _Found(capture, _tick((file, time), capture.conditions.exposure, path))
+    tick = _tick((file, time), capture.conditions.exposure, path)
+    # a pixel has a stamp in each tick at most, and in the one that the exposure's end cuts
+    most = pixels * (no_detection(capture.conditions.exposure, tick) + 1)
+    if len(time) > most:
+        raise InputError(
+            f"{path}: declares {len(time):,} detections; in {units.show(capture.conditions.exposure, 's')} of ticks of "
+            f"{units.show(tick, 's')} {pixels:,} pixels can have {most:,}: correct the tick, the exposure or the file"
+        )
+    return _Found(capture, tick)
 
 
 def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:

@@ -25,7 +25,7 @@ from . import disk, document, plugins, reconstruct, units
 from .document import Document, Path_
 from .effects import Conditions, Effect, in_order
 from .errors import ConfigError, InputError, SpadError, did_you_mean
-from .events import Layout
+from .events import MOST_PIXELS, Layout
 from .experiment import Experiment, Level
 from .images import ImageSource
 from .readout import READOUTS, no_detection, unsigned_for
@@ -275,12 +275,13 @@ class _Reader(Reader):
             return ()
         kind = "lux" if scene.lux is not None else "irradiance"
         levels: list[Level] = []
+        seen: dict[float | str, int] = {}  # by value and by folder
         for i, value in enumerate(scene.lux or scene.irradiance or []):
             level = Level(value.text, kind, float(value))
-            known = next((x for x in levels if x.value == level.value or x.folder == level.folder), None)
-            if known is not None:
-                self.say(("scene", kind, i), f"{level.text} is the level {known.text} again; list it once")
             levels.append(level)
+            known = levels[min(seen.setdefault(level.value, i), seen.setdefault(level.folder, i))]
+            if known is not level:
+                self.say(("scene", kind, i), f"{level.text} is the level {known.text} again; list it once")
         return tuple(levels)
 
     def conditions(self, recording: _Recording, scene: _Scene | None) -> Conditions | None:
@@ -418,6 +419,10 @@ class _Reader(Reader):
         area, share = float(model.pixel_area), float(model.fill_factor)
         if model.positions is None:
             assert model.rows is not None and model.columns is not None
+            if model.rows * model.columns > MOST_PIXELS:
+                size = f"{model.rows} x {model.columns} pixels"
+                self.say(path, f"{size} are more than the {MOST_PIXELS:,} that can be simulated; give fewer")
+                return None
             return Layout(model.rows, model.columns, area, share)
         try:
             positions = read_positions(self.base / model.positions)
@@ -479,10 +484,23 @@ class _Reader(Reader):
         if len(self.problems) > before:
             return None
         try:
-            return sensor.settled()
+            made = sensor.settled()
+            self.check_cascade(made, path)
         except SpadError as error:  # of an effect that looks at what it was given, as its chip is made
             self.say((*path, "effects"), str(error))
-            return None
+        return made if len(self.problems) == before else None
+
+    def check_cascade(self, sensor: Sensor, path: Path_) -> None:
+        """By a device's rules what an event causes has causes of its own: on average it must be less than one."""
+        caused = sensor.caused()
+        total = sum(caused.values())
+        if sensor.rules == "device" and total >= 1:
+            most = max(caused, key=lambda name: caused[name])
+            self.say(
+                (*path, "effects", most),
+                f"{total:.3g} further events come of each one ({', '.join(caused)}), so that a cascade never ends; by "
+                "the rules device they must be less than 1: lower the probability",
+            )
 
 
 @dataclass
@@ -530,7 +548,7 @@ class _Described:
 # --- positions ----------------------------------------------------------------------------------------------------
 
 _HEADERS = (["x", "y"], ["x(um)", "y(um)"])
-_MOST_PIXELS = 100_000
+_MOST_POSITIONS = 100_000
 _LARGEST_POSITIONS = 1 << 24  # bytes
 _FARTHEST = 1.0  # m
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
@@ -564,8 +582,10 @@ def read_positions(path: Path) -> np.ndarray:
             if line != rows.line_num:
                 raise InputError(f"{place}: the pixel of line {line} lies at the same place; keep one of the two")
             found.append((x, y))
-            if len(found) > _MOST_PIXELS:
-                raise InputError(f"{place}: there are more than {_MOST_PIXELS} pixels; give fewer, or rows and columns")
+            if len(found) > _MOST_POSITIONS:
+                raise InputError(
+                    f"{place}: there are more than {_MOST_POSITIONS} pixels; give fewer, or rows and columns"
+                )
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: is not well-formed CSV ({error}); write lines such as 23.0,-11.5"
@@ -582,7 +602,7 @@ def _text_of(path: Path) -> str:
         raise InputError(f"{path}: no such file; the positions of the pixels are read from there") from None
     except OSError as error:
         if error.errno == errno.EFBIG:
-            most = f"{_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_PIXELS} pixels"
+            most = f"{_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_POSITIONS} pixels"
             raise InputError(f"{path}: is larger than {most}") from None
         if error.errno in (errno.EINVAL, errno.EISDIR):
             raise InputError(f"{path}: is no file; positions is the name of a CSV file") from None

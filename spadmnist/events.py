@@ -8,7 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from . import kernels
-from .errors import SpadError
+from .errors import InputError, SpadError
+
+MOST_PIXELS = 1 << 24  # of an array: each map takes 8 bytes of each, 128 MiB
+_MOST_PAIRS = 1 << 24  # of pixels, in a list of who lies near whom: 24 bytes each, 400 MB
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,10 @@ class Layout:
         """Every pixel's neighbours up to a distance of `reach` pitches (a little rounding allowed)."""
         reach = reach * (1 + 1e-3)
         if self.positions is None:
-            far = int(reach)
-            dy, dx = (a.ravel() for a in np.mgrid[-far : far + 1, -far : far + 1])
+            # none lies farther than the array is large
+            y, x = (int(min(reach, size - 1)) for size in self.shape)
+            _check_pairs((2 * y + 1) * (2 * x + 1), reach)
+            dy, dx = (a.ravel() for a in np.mgrid[-y : y + 1, -x : x + 1])
             distance = np.hypot(dx, dy)
             near = (distance <= reach) & (distance > 0)
             near &= (np.abs(dy) < self.rows) & (np.abs(dx) < self.columns)
@@ -72,12 +77,22 @@ class Layout:
             return Neighbours(self, distance[near][order], np.stack([dx[near], dy[near]], axis=1)[order], None)
         from scipy.spatial import cKDTree
 
-        pairs = cKDTree(self.places).query_pairs(reach, output_type="ndarray")
+        tree = cKDTree(self.places)
+        _check_pairs(int(tree.count_neighbors(tree, reach)), reach)
+        pairs = tree.query_pairs(reach, output_type="ndarray")
         both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64).reshape(-1, 2)
         distance = np.hypot(*(self.places[both[:, 0]] - self.places[both[:, 1]]).T)
         order = np.lexsort((both[:, 1], np.round(distance, 9), both[:, 0]))
         first = np.searchsorted(both[order, 0], np.arange(self.pixels + 1))
         return Neighbours(self, distance[order], both[order, 1], first)
+
+
+def _check_pairs(count: int, reach: float) -> None:
+    if count > _MOST_PAIRS:
+        raise InputError(
+            f"a reach of {reach:.4g} pitches has {count:,} neighbours, more than the {_MOST_PAIRS:,} that can be held; "
+            "shorten it"
+        )
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,12 @@ class Experiment:
 
     def level(self, text: str) -> Level:
         """The level written as `text`, or of the same value. Raises KeyError with a sentence."""
-        return level_of(self.levels, text)
+        found = self._by_text.get(text)
+        return level_of(self.levels, text) if found is None else found
+
+    @cached_property
+    def _by_text(self) -> dict[str, Level]:
+        return {level.text: level for level in self.levels}
 
     # --- images --------------------------------------------------------------------------------------------------
 

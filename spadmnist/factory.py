@@ -17,6 +17,7 @@ import importlib.metadata
 import io
 import json
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -41,6 +42,7 @@ from .reconstruct import median_of_nonzero
 POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
+_LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
 
@@ -405,6 +407,8 @@ def generate(
     """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done."""
     started = time.monotonic()
     check_volume(experiment, splits)
+    shards = dataset.shards_of(experiment, splits)
+    check_memory(experiment, splits, shards, jobs)
     wanted = identity(experiment, splits)
     if _check_place(root, wanted):
         tidy(root)
@@ -414,7 +418,6 @@ def generate(
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted)
         _check_space(root, experiment, splits)
-        shards = dataset.shards_of(experiment, splits)
         like = _likeness(experiment, wanted)
         missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
         _make(experiment, splits, root, shards, missing, jobs, progress)
@@ -428,6 +431,43 @@ def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
     shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else 1000]
     channels = images.pixels[0].size // experiment.sensor.layout.pixels
     experiment.check_volume(float(shown.mean(dtype=np.float64)) / images.white, channels)
+
+
+def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard], jobs: int) -> int:
+    """Bytes that a worker takes. Raises InputError where so many workers at a time do not fit into this machine."""
+    needed, there = memory_per_worker(experiment, splits, shards), _memory_there()
+    if min(jobs, len(shards)) * needed > there:
+        fit = there // needed
+        do = f"give --jobs {fit}" if fit else "lower the frames, the exposure, the light or the number of pixels"
+        raise InputError(
+            f"{experiment.name}: each of {min(jobs, len(shards))} workers takes about {needed / 1e9:.2g} GB of memory, "
+            f"and there are {there / 1e9:.2g} GB: {do}"
+        )
+    return needed
+
+
+def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
+    """Bytes: interpreter and libraries, and the streams, scratch and encoded bytes of the largest shard."""
+    most: dict[tuple[str, str], int] = {}
+    for shard in shards:
+        if shard.level is not None:
+            key = shard.level, shard.split
+            most[key] = max(most.get(key, 0), shard.stop - shard.start)
+    # packed bits are held once; stamps and images two to three times, before and after they are put in order
+    framed = bool({"str", "qis"} & set(experiment.readouts))
+    streams = bits = 0.0
+    for (level, split), n in most.items():
+        size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])[1]
+        packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
+        streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
+    return int(_LIBRARIES + 3 * streams + 1.2 * bits)
+
+
+def _memory_there() -> int:
+    """Bytes that this machine, or the limit that was set for this process, has for all of it."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return whole if limit == resource.RLIM_INFINITY else min(whole, limit)
 
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:

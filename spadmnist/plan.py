@@ -15,7 +15,6 @@ from .foreign import visible
 from .images import Images
 
 _PROBE = 64  # images a level
-_LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _BESIDES_ENCODING = 1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
 
 
@@ -26,6 +25,8 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
     that are simulated and encoded here.
     """
     factory.check_volume(experiment, splits)
+    shards = dataset.shards_of(experiment, splits)
+    memory = factory.check_memory(experiment, splits, shards, jobs)
     # compile first, so that the probe times the work alone
     _probe(experiment, experiment.levels[0], next(iter(splits.values())), 1)
     levels = []
@@ -45,24 +46,7 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
         row["seconds"] = seconds * _BESIDES_ENCODING / jobs
         levels.append(row)
     total = {key: sum(row[key] for row in levels) for key in ("images", "photons", "detections", "bytes", "seconds")}
-    # packed bits are held once; stamps and images two to three times, before and after they are put in order
-    framed = bool({"str", "qis"} & set(experiment.readouts))
-    streams = bits = 0.0
-    for shard in dataset.shards_of(experiment, splits):
-        if shard.level is not None:
-            images = splits[shard.split]
-            size = dataset.expected_per_image(experiment, experiment.level(shard.level), images)[1]
-            packed = images.pixels[0].size * -(-experiment.conditions.frames // 8) * framed
-            n = shard.stop - shard.start
-            streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
-    return {
-        "levels": levels,
-        "total": total,
-        "jobs": jobs,
-        "shards": len(dataset.shards_of(experiment, splits)),
-        # streams, scratch and encoded bytes of a shard; interpreter, libraries and compiled kernels
-        "memory_per_worker": int(_LIBRARIES + 3 * streams + 1.2 * bits),
-    }
+    return {"levels": levels, "total": total, "jobs": jobs, "shards": len(shards), "memory_per_worker": memory}
 
 
 def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tuple[float, float]:

@@ -176,6 +176,7 @@ class Distribution:
         return drawn[np.minimum(which, len(self.parts) - 1), np.arange(pixels)]
 
 
+_LARGEST_MAP = 1 << 24  # entries of a map: 128 MiB
 _DISTRIBUTIONS = {"normal": ("mean", "sigma"), "lognormal": ("median", "sigma")}
 
 Problem = Callable[[tuple[Any, ...], str], None]  # (path below the value, sentence)
@@ -331,8 +332,8 @@ def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...],
 
 def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     try:
-        with disk.opened(path) as file:
-            values = np.load(file, allow_pickle=False)
+        with disk.opened(path):  # a regular file, and no wait for it
+            values = np.load(path, mmap_mode="r", allow_pickle=False)  # no memory before its shape is known to be right
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
     except OSError as error:
@@ -343,7 +344,9 @@ def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ..
         what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "an archive"
         wanted = " or ".join(str(shape).replace("-1", "n") for shape in shapes)
         raise InputError(f"{path}: is {what}, but {declared.name} needs one number for each {declared.per}: {wanted}")
-    values = values.astype(np.float64)
+    if values.size > _LARGEST_MAP:
+        raise InputError(f"{path}: has {values.size:,} entries; a map may have {_LARGEST_MAP:,}: take fewer")
+    values = np.array(values, np.float64)
     flat = values.ravel()
     for index in np.flatnonzero(~np.isfinite(flat))[:1]:
         raise InputError(

@@ -239,6 +239,12 @@ class Sensor:
                 rate = effect.expected_rate(rate, conditions)
         return candidates * conditions.exposure, rate * conditions.exposure
 
+    def caused(self) -> dict[str, float]:
+        """Events that come directly of one event, averaged over the array, by the effect that makes them."""
+        one = np.ones((1, self.layout.pixels))
+        clock = Conditions(1.0, 1, 1.0, 1.0, None)
+        return {e.name: float(np.mean(self._call(e, "expected_rate", one, clock))) - 1 for e in self.at("correlated")}
+
     def drawn(self, photons: np.ndarray, conditions: Conditions, readouts: Collection[str]) -> float:
         """Expected candidates that `expose` has at once for such images, those around a part of a chip among them."""
         if self.chip is None or self.window is None:

@@ -170,7 +170,8 @@ def repair(
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
             again = shards
         else:
-            again = [s for s in shards if any(_belongs(name, s, experiment.format) for name in bad)]
+            hurt = dataset.files_by_shard({name: {} for name in bad}, experiment.format)
+            again = [s for s in shards if store.location(s.path, experiment.format) in hurt]
         did += _set_aside(root, damage.extra)
         remade, lines = _remake(experiment, splits, root, again, manifest, jobs, progress)
         did += lines

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import image_files
+from ..capture_files import DEFLATE_GAIN, deflated_size
 from ..errors import InputError
 from ..foreign import visible
 from ..import_options import BITS, STACKS
@@ -97,6 +98,12 @@ class Npz(Format):
             with zipfile.ZipFile(path) as archive:
                 held = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
                 size, parts = path.stat().st_size, {}
+                declared = sum(held[name].file_size for name in ("time", "pixel", "frames") if name in held)
+                if declared > LARGEST_PIECE:
+                    raise InputError(
+                        f"{path}: unpacks to {declared:,} bytes, more than the {LARGEST_PIECE:,} that are read whole; "
+                        "store HDF5 or .npy, which are read piece by piece"
+                    )
                 for name in (*FACTS, "time", "pixel", "frames"):
                     if name in held:
                         parts[name] = image_files.read_member(archive, held[name], size, f"{path}: {name}")
@@ -172,7 +179,10 @@ class Tif(Format):
                         page = file.pages[number]
                         if page.shape != shape or page.dtype != dtype:
                             raise ValueError(f"page {number} is {page.dtype} {page.shape}, unlike the first")
+                        _check_page(file, page, path)
                         out[i] = page.asarray()[*part]
+            except InputError:
+                raise
             except Exception as error:
                 if "imagecodecs" in str(error):
                     raise InputError(
@@ -185,6 +195,20 @@ class Tif(Format):
         notes = ("its pages show 0 as white; the numbers are taken as they stand, 0 as no detection",) * white_is_0
         stack = arranged((count, *shape), dtype, letters, get)
         return Found(frames=stack, bits=dtype.kind == "b", packed=said.packed, notes=notes)
+
+
+def _check_page(file: Any, page: Any, path: Path) -> None:
+    """Raise InputError where a part of a page that deflate packs unpacks to more than the page has."""
+    if "DEFLATE" not in page.compression.name:
+        return
+    for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+        if size * DEFLATE_GAIN > LARGEST_PIECE:
+            file.filehandle.seek(start)
+            if deflated_size(file.filehandle.read(size), page.nbytes) > page.nbytes:
+                raise InputError(
+                    f"{path}: a page unpacks to more than its {page.nbytes:,} bytes; the file is damaged or hostile: "
+                    "write it again"
+                )
 
 
 class Raw(Format):

@@ -15,14 +15,13 @@ from .. import capture_files, config, dataset, document, units
 from ..document import Path_
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
-from ..events import Layout
+from ..events import MOST_PIXELS, Layout
 from ..recording import Capture, Light, Recording
 from ..validated import Reader
 from .entries import EXAMPLES, FILE, SECTIONS, Array, Counts, Dark, Entry, Flat, Frames, Stamps
 from .of_dataset import of_dataset
 from .type import Measurement, without_file
 
-_MOST_PIXELS = 1 << 24
 _DEFAULT_WAVELENGTH = "555 nm"  # where a level is given in lux, which mean light of this colour
 
 
@@ -129,9 +128,9 @@ class _Reader(Reader):
             return Layout(*listed, np.nan, np.nan, positions)
         if array.rows is None or array.columns is None:
             return None
-        if array.rows * array.columns > _MOST_PIXELS:
+        if array.rows * array.columns > MOST_PIXELS:
             size = _by((array.rows, array.columns))
-            self.say(path, f"{size} pixels are more than the {_MOST_PIXELS:,} that can be held; give fewer")
+            self.say(path, f"{size} pixels are more than the {MOST_PIXELS:,} that can be held; give fewer")
         return Layout(array.rows, array.columns, np.nan, np.nan)
 
     def captures(self, raw: list[Any]) -> list[tuple[Capture, Path | None]]:
