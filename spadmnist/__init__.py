@@ -12,10 +12,36 @@ TR           every detection's time stamp; STR: the first one of each frame; QIS
 effect       one physical cause, in one file, at one stage of the line from photons to readouts
 """
 
-from __future__ import annotations
+import sys
 
-from importlib import import_module
-from typing import Any
+
+def _leave_the_current_folder() -> None:
+    """Take the current folder off the path of the program, whose libraries a file there could stand in for.
+
+    `python -m spadmnist` puts it there, and so does an empty entry of PYTHONPATH. What PYTHONPATH names is asked for.
+    A program that imports the package keeps its path.
+    """
+    import os  # what `python -m` is made of has imported it
+
+    first = sys.argv[0] if sys.argv else ""
+    word = sys.orig_argv[-len(sys.argv)] if first == "-m" else ""  # so it is while `python -m` looks for the module
+    module = word.partition("m")[2] if word.startswith("-") else word
+    started = module.partition(".")[0] == __name__
+    if not started and os.path.basename(first) != __name__:
+        return
+    named = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    meant = (started and not sys.flags.safe_path) or (len(named) > 1 and "" in named)
+    here = os.getcwd()
+    if meant and here in sys.path and here not in [os.path.abspath(entry) for entry in named if entry]:
+        sys.path.remove(here)
+        if here == os.path.dirname(os.path.dirname(os.path.abspath(__file__))):
+            sys.path.append(here)  # the package itself is there, and its workers look for it
+
+
+_leave_the_current_folder()  # before anything is imported: no `from __future__` above
+
+from importlib import import_module  # noqa: E402
+from typing import Any  # noqa: E402
 
 __version__ = "0.1.0"
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from .foreign import quoted, visible, visible_lines
+from .workers import safe_path
 
 if TYPE_CHECKING:
     from .factory import Progress
@@ -1029,7 +1030,8 @@ def main(arguments: list[str] | None = None) -> None:
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    sys.exit(_run(arguments))
+    with safe_path():
+        sys.exit(_run(arguments))
 
 
 def _run(arguments: list[str] | None) -> int:

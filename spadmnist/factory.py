@@ -21,7 +21,6 @@ import resource
 import shutil
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -31,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
+from .compiled import compiling
 from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
@@ -38,6 +38,7 @@ from .experiment import Experiment
 from .heap import keep_freed_memory
 from .images import Images
 from .reconstruct import median_of_nonzero
+from .workers import workers
 
 POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
@@ -158,19 +159,17 @@ def run_tasks(
         for key, task in zip(keys, tasks(keys), strict=True):
             done(key, function(task))
         return
-    from joblib import Parallel, delayed
+    from joblib import delayed
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    # the tracker that cleans up behind workers need not tell people that it did
-    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     missing, fatal, attempt = list(keys), [], 1
     while missing:
         remaining = dict.fromkeys(missing)
         alone = attempt > _ROUNDS
         try:
-            with Parallel(
-                n_jobs=2 if alone else min(jobs, max(2, len(missing))),
+            with workers(
+                2 if alone else min(jobs, max(2, len(missing))),
                 backend="loky",
                 return_as="generator_unordered",
                 pre_dispatch=1 if alone else "n_jobs",
@@ -627,15 +626,11 @@ def _warm(experiment: Experiment, progress: Progress) -> None:
     """Compile the kernels once, here, so that the workers find them in the cache."""
     if experiment.sensor.block > 1:
         return  # a user's effect is run for the images that are wanted, and for no others
-    hint = threading.Timer(1.5, progress.notice, ["Compiling the simulation for this machine, once: about 20 s."])
-    hint.start()
-    try:
+    with compiling(lambda: progress.notice("Compiling the simulation for this machine, once: about 20 s.")):
         pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
         made = experiment.simulate_block(experiment.levels[0], "warm", pixels, 255, 0)
         dataset.stream_columns(made, experiment.sensor.layout.shape)
         dataset.reconstruction_columns(experiment, made, experiment.sensor.layout.shape)
-    finally:
-        hint.cancel()
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------

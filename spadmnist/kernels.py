@@ -19,12 +19,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
+from .compiled import kernel
+
 # `error_model="numpy"` drops the check for division by zero, which would keep LLVM from vectorising.
-_jit = njit(cache=True, error_model="numpy", nogil=True)
-_inline = njit(cache=True, error_model="numpy", nogil=True, inline="always")
+_jit = kernel(error_model="numpy", nogil=True)
+_inline = kernel(error_model="numpy", nogil=True, inline="always")
 
 
 @intrinsic

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import plugins
+from ..compiled import digest_of_sources
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
@@ -31,9 +32,7 @@ _FACTS = ("law", "middle", "recordings", "factor", "tail", "scaled")
 
 def name_of(sensor: Sensor, capture: Capture, *more: Any) -> str:
     """The name of the entry for a capture of a settled sensor; more: numbers and words that it depends on."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(path.read_bytes())
+    digest = hashlib.sha256(digest_of_sources().encode())
     for _, text in sorted(plugins.loaded_files().items()):
         digest.update(text.encode())
     # of a part of a chip the whole of it, whose other pixels may matter, and which part
