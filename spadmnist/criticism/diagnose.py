@@ -13,9 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from joblib import Parallel
-
 from ..effects import Mimic
+from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import advice, blocks, chance, checks, limits, recordings, setups
@@ -63,7 +62,7 @@ def diagnose(
     Raises InputError where sensor and measurement do not belong together.
     """
     say = progress or (lambda what: None)
-    with Parallel(n_jobs=jobs) as parallel:
+    with pool(jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, _QUICK if quick else recordings.REPLICATES, say)
         short = setups.stopped_early(bench)
         if short:

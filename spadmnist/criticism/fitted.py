@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from joblib import Parallel
 from scipy import stats
 
 from ..effects import Effect
 from ..errors import InputError, did_you_mean
+from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import blocks, fit, likelihood, mapping, recordings, settling
@@ -48,7 +48,7 @@ def fitted(
     ]
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
-    with Parallel(n_jobs=jobs) as parallel:
+    with pool(jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = begun(bench)
         start, wrong = course.state, bool(course.failed)
