@@ -203,7 +203,7 @@ def run_tasks(
 
 @contextlib.contextmanager
 def pool(jobs: int, return_as: str = "list") -> Iterator[Any]:
-    """A `joblib.Parallel` of so many workers, for calls that are not done again.
+    """What `joblib.Parallel` is with so many workers, which are started when they are called for.
 
     Raises SpadError where a worker dies; whatever is raised, no worker is left at work.
     """
@@ -217,8 +217,12 @@ def pool(jobs: int, return_as: str = "list") -> Iterator[Any]:
     workers = {"backend": "loky", "initializer": _start_worker, "initargs": (os.getpid(),)}
     try:
         with Parallel(n_jobs=jobs, return_as=return_as, **workers) as parallel:
-            _start_workers()
-            yield parallel
+
+            def called(calls: Any) -> Any:
+                _start_workers()
+                return parallel(calls)
+
+            yield called
     except TerminatedWorkerError as error:
         _end_workers(error)
         raise SpadError(
