@@ -109,6 +109,7 @@ def test_what_does_not_end_is_left_all_the_same() -> None:
     assert (done.returncode, done.stderr.strip()) == (130, SENTENCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["generate", "diagnose"])
 def test_ctrl_c_while_workers_start(command: str, tmp_path: Path) -> None:
     """They import for a second, in which Ctrl-C is not theirs to answer."""
@@ -132,6 +133,7 @@ def begun(command: str, tmp_path: Path) -> psutil.Popen:
     return started(command, place / "sensor.yaml", place / "lab", "--jobs", 2, *more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["compare", "diagnose"])
 def test_a_worker_killed_while_it_starts(command: str, tmp_path: Path) -> None:
     process = begun(command, tmp_path)
@@ -182,6 +184,7 @@ def test_too_few_addresses() -> None:
     assert done.returncode == 2 and done.stderr.startswith("Error: only 410 MB of addresses"), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_workers_do_not_mind_closed_streams(closed: str, tmp_path: Path) -> None:
     file = write_config(tmp_path / "c.yaml")
