@@ -8,10 +8,10 @@ nor numba.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from . import interrupts
 from .foreign import quoted, visible, visible_lines
 from .workers import safe_path
 
@@ -48,6 +49,7 @@ def cli() -> None:
     A config (YAML) names images, light levels, a sensor and its effects; `generate` makes the dataset: time stamps
     (TR), first time stamps of frames (STR), 1-bit frames (QIS), and flux images made from them.
     """
+    _check_limits()
 
 
 def _plugin(command: F) -> F:
@@ -992,6 +994,8 @@ class _terminal:
 
         from .factory import Progress
 
+        tqdm.monitor_interval = 0  # no thread that watches the bar
+
         bar: list[Any] = []
 
         def start(what: str, total: float, done: float) -> None:
@@ -1026,68 +1030,126 @@ class _terminal:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: one clear sentence and no traceback for whatever a user can cause."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by the caller
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    with safe_path():
-        sys.exit(_run(arguments))
+    _open_streams()
+    interrupts.install()
+    try:
+        with safe_path():
+            status = _run(arguments)
+    except KeyboardInterrupt:  # between the verb and its end
+        status = interrupts.status()
+    sys.exit(status)
+
+
+def _open_streams() -> None:
+    """A stream that the caller has closed leads nowhere, for workers too: a file opened later would take its place."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # the lowest number that is free is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
 
 
 def _run(arguments: list[str] | None) -> int:
-    from .errors import ConfigError, SpadError
-
     try:
+        interrupts.under_way(True)
         result = cli.main(arguments, prog_name="spadmnist", standalone_mode=False)
         sys.stdout.flush()
         return result if isinstance(result, int) else 0
-    except click.exceptions.Exit as stop:
-        return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
-        return _interrupted()
-    except click.ClickException as error:
+        return interrupts.status()
+    except Exception as error:
+        return interrupts.status() if interrupts.came() else _failed(error)
+    finally:
+        interrupts.under_way(False)
+
+
+def _failed(error: Exception) -> int:
+    """The exit status after an error, which is said."""
+    from .errors import ConfigError, SpadError
+
+    if isinstance(error, click.exceptions.Exit):
+        return error.exit_code
+    if isinstance(error, BrokenPipeError):
+        # the reader has gone; there is nobody left to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    if isinstance(error, click.ClickException):
         shown, words = io.StringIO(), error.format_message()
         error.show(shown)
         for line in shown.getvalue().replace(words, visible(words)).rstrip("\n").split("\n"):
             _say(line)
-        return 2
-    except ConfigError as error:
+    elif isinstance(error, ConfigError):
         for problem in error.problems:
             _say(f"Error: {problem}")
-        return 2
-    except SpadError as error:
+    elif isinstance(error, SpadError):
         _say(f"Error: {error}")
-        return 2
-    except BrokenPipeError:
-        # the reader has gone; there is nobody left to tell
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except MemoryError:
+    elif isinstance(error, MemoryError):
         _say("Error: there is not enough memory; give fewer --jobs or smaller images")
-        return 2
-    except OSError as error:
+    elif _is_alone(error):
+        _say(f"Error: {_ALONE}")
+    elif isinstance(error, OSError):
         _say(f"Error: {error.filename or 'the system'}: {error.strerror or error}")
-        return 2
-    except Exception as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # in the middle of compiled code
-            return _interrupted()
-        if isinstance(error.__cause__, SystemExit):
-            return 143
-        if os.environ.get("SPADMNIST_DEBUG"):
-            raise
-        _say(f"Error: this should not have happened, and is a fault of the program: {_kind_of(error)}")
+    elif os.environ.get("SPADMNIST_DEBUG"):
+        raise error
+    else:
+        _say(
+            "Error: this should not have happened, and is a fault of the program: "
+            f"{type(error).__name__}: {' '.join(str(error).split())}"
+        )
         _say("SPADMNIST_DEBUG=1 shows where; please report it.")
-        return 2
+    return 2
 
 
-def _kind_of(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+# --- threads and processes ----------------------------------------------------------------------------------------
+
+_ALONE = (
+    "the system lets this program have no further thread or process (it counts all of this user's); end other "
+    "programs, raise the limits (ulimit -u, ulimit -v), or give fewer --jobs"
+)
+_LEAST_SPACE = 600  # MB of addresses that numpy, scipy and numba take before anything is simulated
+_OWN_THREADS = 3  # to speak to workers, to write, to tell that time passes
+_MOST_THREADS = 64  # of numpy's linear algebra, and again of scipy's, as they are built
 
 
-def _interrupted() -> int:
-    _say("")
-    _say("Interrupted. What is complete is kept: the same command goes on from there.")
-    return 130
+def _is_alone(error: BaseException | None) -> bool:
+    """Did the system refuse a thread (which Python tells by words alone) or a process? Then what follows fails, too."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.ENOMEM) and error.filename is None:
+            return True
+        if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+            return True
+        error = error.__context__
+    return False
+
+
+def _check_limits() -> None:
+    """Refuse limits under which numpy cannot be imported: it waits for ever, or ends the program as Ctrl-C would."""
+    import resource
+    import threading
+
+    from .errors import SpadError
+
+    space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if space != resource.RLIM_INFINITY and space < _LEAST_SPACE * 1_000_000:
+        raise SpadError(
+            f"only {space / 1e6:.0f} MB of addresses are allowed (ulimit -v), and the program needs {_LEAST_SPACE} MB "
+            "to begin with; raise that limit"
+        )
+    told = [os.environ.get(name, "") for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")]
+    each = min(_processors(), _MOST_THREADS, *(int(text) for text in told if text.isdecimal() and int(text) > 0))
+    end = threading.Event()
+    started = []
+    try:
+        for _ in range(2 * (each - 1) + _OWN_THREADS):
+            thread = threading.Thread(target=end.wait, daemon=True)
+            thread.start()
+            started.append(thread)
+    finally:
+        end.set()
+        for thread in started:
+            thread.join()
 
 
 if __name__ == "__main__":

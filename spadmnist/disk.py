@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
+import glob
 import hashlib
 import os
 import re
@@ -20,6 +22,7 @@ from typing import IO, Any
 
 from .errors import InputError, SpadError
 
+_PART = ".spadmnist-part"  # how a file's name ends that is not complete yet
 _LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
@@ -125,6 +128,26 @@ def writing(place: Path, size: int) -> Iterator[None]:
             advice = f"see to that (or choose another place with -o) and {again}"
         reason = error.strerror or str(error)
         raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
+
+
+@contextlib.contextmanager
+def part(path: Path) -> Iterator[tuple[IO[bytes], Path]]:
+    """(a new file beside `path`, open and empty; its path), which is gone afterwards where it is still there.
+
+    It is locked while its writer lives. Such files of the same `path` whose writer was killed are removed.
+    """
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"):
+        with contextlib.suppress(OSError), open(left, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused where a writer holds it
+            left.unlink()
+    own = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_PART}")
+    with open(own, "x+b") as file:
+        try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield file, own
+        finally:
+            own.unlink(missing_ok=True)
 
 
 def _amount(size: int) -> str:

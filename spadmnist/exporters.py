@@ -107,17 +107,13 @@ def export(
 @contextlib.contextmanager
 def _whole(path: Path, size: int) -> Iterator[IO[bytes]]:
     """A new file that is there as a whole or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     with disk.writing(path, size):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(part, "x+b") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
+        with disk.part(path) as (file, part):
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
             os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
 
 
 def _events(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:

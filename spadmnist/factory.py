@@ -16,6 +16,8 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import multiprocessing
+import multiprocessing.resource_tracker
 import os
 import resource
 import shutil
@@ -160,7 +162,6 @@ def run_tasks(
             done(key, function(task))
         return
     from joblib import delayed
-    from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     missing, fatal, attempt = list(keys), [], 1
@@ -178,6 +179,7 @@ def run_tasks(
                 initializer=_start_worker,
                 initargs=(os.getpid(),),
             ) as parallel:
+                _start_workers()
                 calls = (
                     delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
                 )
@@ -189,8 +191,7 @@ def run_tasks(
                 fatal.append(next(iter(remaining)))
                 del remaining[fatal[-1]]
         except BaseException as error:
-            # an error of a task leaves the workers idle; an interruption finds them at work
-            get_reusable_executor().shutdown(wait=True, kill_workers=not isinstance(error, Exception))
+            _end_workers(error)
             raise
         missing, attempt = list(remaining), attempt + 1
     if fatal:
@@ -198,6 +199,70 @@ def run_tasks(
             f"a worker died each time it made {', '.join(map(str, fatal))} (out of memory?); all else is complete: "
             "free some memory or give fewer --jobs, and type the same command again"
         )
+
+
+@contextlib.contextmanager
+def pool(jobs: int, return_as: str = "list") -> Iterator[Any]:
+    """What `joblib.Parallel` is with so many workers, which are started when they are called for.
+
+    Raises SpadError where a worker dies; whatever is raised, no worker is left at work.
+    """
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    if jobs == 1:
+        with workers(1, return_as=return_as) as parallel:
+            yield parallel
+        return
+    start = {"backend": "loky", "initializer": _start_worker, "initargs": (os.getpid(),)}
+    try:
+        with workers(jobs, return_as=return_as, **start) as parallel:
+
+            def called(calls: Any) -> Any:
+                _start_workers()
+                return parallel(calls)
+
+            yield called
+    except TerminatedWorkerError as error:
+        _end_workers(error)
+        raise SpadError(
+            "a worker died (out of memory, or killed from outside?); free some memory or give fewer --jobs, and type "
+            "the same command again"
+        ) from None
+    except BaseException as error:
+        _end_workers(error)
+        raise
+
+
+def _start_workers() -> None:
+    """Start the workers of the open pool, which never see Ctrl-C: not while they import what they need, either."""
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.backend import resource_tracker
+
+    for tracker in (resource_tracker, multiprocessing.resource_tracker):  # which may unblock the signal as they start
+        tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        get_reusable_executor(reuse=True).submit(_nothing)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _nothing() -> None:
+    """A first call, for which all workers are started."""
+
+
+def _end_workers(error: BaseException) -> None:
+    """End the workers: an error of a task leaves them idle; an interruption finds them at work."""
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.backend.process import LokyProcess
+
+    with contextlib.suppress(OSError, RuntimeError):  # where no process or thread could be started
+        get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=not isinstance(error, Exception))
+    for process in multiprocessing.active_children():
+        if isinstance(process, LokyProcess) and process.pid is not None:  # started before the one that could not be
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
+            process.join()
 
 
 def _keyed(function: Callable[[Any], Any], key: Any, task: Any) -> tuple[Any, Any]:

@@ -20,7 +20,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 
 # a module imports from layers below its own, and within its own only along an arrow
 LAYERS = [
-    {"errors", "foreign", "heap", "units", "streams", "light", "compiled"},
+    {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "compiled"},
     {"import_options"},
     {"disk", "kernels", "workers"},
     {"document", "section", "plugins", "events", "image_files", "digits", "store"},
@@ -39,6 +39,7 @@ LAYERS = [
     {"importers"},
     {"exporters", "fluxes", "torch"},
     {"cli"},
+    {"start"},
     {"__main__"},
 ]
 LEVEL = {name: level for level, layer in enumerate(LAYERS) for name in layer}

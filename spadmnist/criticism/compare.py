@@ -22,11 +22,11 @@ from scipy import stats
 
 from .. import units
 from ..errors import InputError
+from ..factory import pool
 from ..measurement import Measurement
 from ..recording import Capture
 from ..sensor import Sensor
 from ..statistics import Summary
-from ..workers import workers
 from .nulls import Judgement, Null
 from .recordings import REPLICATES, CaptureNull, model_of, reduced, statistics_for
 
@@ -163,7 +163,7 @@ def compare(
     judged: list[tuple[float, Null]] = []  # misfit, null of independent cells
     levels: list[tuple[Capture, float, float, float]] = []  # capture, log of the light factor, its error, elasticity
     captures = list(measurement.captures)
-    with workers(jobs, return_as="generator") as parallel:
+    with pool(jobs, "generator") as parallel:
         for k, capture in enumerate(captures):
             say(capture.id, k / len(captures))
             recording = measurement.recording(capture.id, sensor) if capture.mean is None else None

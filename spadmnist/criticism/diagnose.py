@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..effects import Mimic
+from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
-from ..workers import workers
 from . import advice, blocks, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
@@ -62,7 +62,7 @@ def diagnose(
     Raises InputError where sensor and measurement do not belong together.
     """
     say = progress or (lambda what: None)
-    with workers(jobs) as parallel:
+    with pool(jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, _QUICK if quick else recordings.REPLICATES, say)
         short = setups.stopped_early(bench)
         if short:

@@ -10,9 +10,9 @@ from scipy import stats
 
 from ..effects import Effect
 from ..errors import InputError, did_you_mean
+from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
-from ..workers import workers
 from . import blocks, fit, likelihood, mapping, recordings, settling
 from .answer import Diagnosis, Step, Value, title
 from .candidates import Change, Key, changes
@@ -48,7 +48,7 @@ def fitted(
     ]
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
-    with workers(jobs) as parallel:
+    with pool(jobs) as parallel:
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = begun(bench)
         start, wrong = course.state, bool(course.failed)

@@ -1,15 +1,16 @@
 """Nulls that were learnt before, on disk: another measurement of the same model then costs one reduction.
 
 An entry is named by everything that it is a function of: sensor, capture, light, seed, the program's own source and the
-user's plug-ins. What cannot be read is learnt again; the oldest entries go when there are too many.
+user's plug-ins. An entry ends with the digest of all before it: what cannot be read, or is not what was written, is
+learnt again. The oldest entries go when there are too many.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import plugins
+from .. import disk, plugins
 from ..compiled import digest_of_sources
 from ..images import cache_folder
 from ..recording import Capture
@@ -51,7 +52,7 @@ def recall(name: str) -> tuple[dict[str, np.ndarray], dict[str, Null], dict[str,
     """(further arrays, nulls by statistic, the same of cells `apart`), or None where no such entry can be read."""
     path = _folder() / f"{name}.npz"
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(_intact(path.read_bytes()), allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         facts = json.loads(arrays.pop("facts").tobytes().decode())
         nulls, apart = (
@@ -80,16 +81,25 @@ def keep(name: str, further: Mapping[str, np.ndarray], nulls: Mapping[str, Null]
     folder = _folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, allow_pickle=False, facts=header, **further, **arrays)
-            os.replace(temporary, folder / f"{name}.npz")
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+        whole = io.BytesIO()
+        np.savez(whole, allow_pickle=False, facts=header, **further, **arrays)
+        entry = folder / f"{name}.npz"
+        with disk.part(entry) as (file, part):
+            file.write(whole.getbuffer())
+            file.write(hashlib.sha256(whole.getbuffer()).digest())
+            file.flush()
+            os.replace(part, entry)
         _make_room(folder)
     except OSError:
         return
+
+
+def _intact(data: bytes) -> io.BytesIO:
+    """The archive of an entry. Raises ValueError where it is not what was written."""
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(data[:-size]).digest() != data[-size:]:
+        raise ValueError("damaged")
+    return io.BytesIO(data[:-size])
 
 
 def _make_room(folder: Path) -> None:
