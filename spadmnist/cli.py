@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from .criticism.answer import Diagnosis
     from .factory import Progress
     from .sensor import Sensor
 
@@ -796,13 +797,14 @@ def diagnose(
     _check_answer(json_file)
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
-        with _writing(output):
-            next_file, notes = output / "sensor.yaml", answer.notes(found)
-            found.file = str(next_sensor.write(sensor, next_file, found.values, notes, model.window))
-        page = pages.diagnosis(found, output)
-        _say(f"Report: {page}")
-    _write_answer(json_file, answer.canonical(found))
-    click.echo(answer.table(found))
+        _write_next(found, sensor, output / "sensor.yaml", model)
+    with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
+        if output is not None:
+            last.callback(lambda: _say(f"Report: {pages.diagnosis(found, output)}"))
+        last.callback(lambda: click.echo(answer.table(found)))
+        last.callback(lambda: _write_answer(json_file, answer.canonical(found)))
+    if found.unwritten:
+        sys.exit(2)
 
 
 @cli.command(short_help="Settle parameters of a model.")
@@ -839,10 +841,25 @@ def fit(
     next_sensor.check_place(sensor, output)
     _check_answer(json_file)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
-    with _writing(output):
-        found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found), model.window))
+    _write_next(found, sensor, output, model)
     _write_answer(json_file, answer.canonical(found))
     click.echo(answer.table(found))
+    if found.unwritten:
+        sys.exit(2)
+
+
+def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:
+    """Write the next sensor file. Where that fails the answer says why, and stays."""
+    from .criticism import answer, next_sensor
+
+    try:
+        with _writing(out):
+            found.file = str(next_sensor.write(source, out, found.values, answer.notes(found), model.window))
+    except Exception as error:  # whatever it is, hours of work are not lost for it
+        if os.environ.get("SPADMNIST_DEBUG"):
+            raise
+        found.unwritten = " ".join(str(error).split()) or type(error).__name__
+        _say(f"Error: the next sensor file was not written: {found.unwritten}")
 
 
 def _model(sensor: Path, crop: str | None) -> Sensor:
