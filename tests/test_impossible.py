@@ -121,7 +121,7 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
     )
     found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
     told = [e for e in found.untried if e["effect"] == "afterpulsing"]
-    if stage not in ("taking out", "likelihood", "limits"):  # which may need no recording of it
+    if stage not in ("taking out", "likelihood", "intervals", "limits"):  # which may need no recording of it
         assert broken.raised
     assert bool(told) == bool(broken.raised)
     if stays:
@@ -162,3 +162,19 @@ def test_an_interrupt_ends_a_diagnosis(lab, monkeypatch) -> None:
     Broken(monkeypatch, "crosstalk", KeyboardInterrupt(), armed=True)
     with pytest.raises(KeyboardInterrupt):
         bench.moved(state, [state.sensors.changed({("crosstalk", "probability"): 0.01})])
+
+
+def test_steps_are_as_they_were_where_a_later_stage_fails(lab) -> None:
+    """Values and intervals, too, that were written before it failed."""
+    bench = bench_of(lab(), 8)
+    course = course_of.begun(bench)
+    change = next(c for c in candidates.changes(bench.start) if c.name == "add crosstalk")
+    step = answer.Step(change, {"probability": answer.Value(0.01, 0.0, 0.02)}, 1.0, 9.0, "")
+    course.steps, before = [step], dict(step.values)
+    with diagnose._or_as_before(course, "the intervals"):
+        step.values["probability"] = answer.Value(0.5, 0.4, 0.6)
+        course.steps = []
+        raise OverflowError("too large")
+    assert course.steps == [step] and step.values == before
+    (told,) = course.search.untried
+    assert told["effect"] == "crosstalk" and told["where"] == "the intervals" and "too large" in told["why"]
