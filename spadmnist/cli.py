@@ -24,6 +24,7 @@ from .foreign import quoted, visible, visible_lines
 from .workers import safe_path
 
 if TYPE_CHECKING:
+    from .criticism.answer import Diagnosis
     from .factory import Progress
     from .sensor import Sensor
 
@@ -808,13 +809,14 @@ def diagnose(
     _check_answer(json_file)
     found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
     if output is not None:
-        with _writing(output):
-            next_file, notes = output / "sensor.yaml", answer.notes(found)
-            found.file = str(next_sensor.write(sensor, next_file, found.values, notes, model.window))
-        page = pages.diagnosis(found, output)
-        _say(f"Report: {page}")
-    _write_answer(json_file, answer.canonical(found))
-    _print_lines(answer.table(found))
+        _write_next(found, sensor, output / "sensor.yaml", model)
+    with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
+        if output is not None:
+            last.callback(lambda: _say(f"Report: {pages.diagnosis(found, output)}"))
+        last.callback(lambda: _print_lines(answer.table(found)))
+        last.callback(lambda: _write_answer(json_file, answer.canonical(found)))
+    if found.unwritten:
+        sys.exit(2)
 
 
 @cli.command(short_help="Settle parameters of a model.")
@@ -851,10 +853,25 @@ def fit(
     next_sensor.check_place(sensor, output)
     _check_answer(json_file)
     found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
-    with _writing(output):
-        found.file = str(next_sensor.write(sensor, output, found.values, answer.notes(found), model.window))
+    _write_next(found, sensor, output, model)
     _write_answer(json_file, answer.canonical(found))
     _print_lines(answer.table(found))
+    if found.unwritten:
+        sys.exit(2)
+
+
+def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:
+    """Write the next sensor file. Where that fails the answer says why, and stays."""
+    from .criticism import answer, next_sensor
+
+    try:
+        with _writing(out):
+            found.file = str(next_sensor.write(source, out, found.values, answer.notes(found), model.window))
+    except Exception as error:  # whatever it is, hours of work are not lost for it
+        if os.environ.get("SPADMNIST_DEBUG"):
+            raise
+        found.unwritten = " ".join(str(error).split()) or type(error).__name__
+        _say(f"Error: the next sensor file was not written: {found.unwritten}")
 
 
 def _model(sensor: Path, crop: str | None) -> Sensor:

@@ -26,6 +26,18 @@ class EffectError(SpadError):
     """An effect's own code failed, or returned what no effect may return."""
 
 
+# What says of a model that it cannot be simulated: of a candidate, then, that it is none.
+UNABLE = (SpadError, ArithmeticError, ValueError, MemoryError)
+
+
+def why(error: BaseException) -> str:
+    """What an error says, in one line; its kind, where that is not of this program."""
+    said = " ".join(str(error).split())
+    if isinstance(error, SpadError):
+        return said
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`" Did you mean dead_time?"`, or an empty string where nothing is near."""
     near = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.6)

@@ -125,6 +125,8 @@ class Diagnosis:
     simulations: int = 0
     dark: list[str] = field(default_factory=list)  # captures without light
     crop: str | None = None  # the part of the sensor that was measured: rows, columns
+    untried: list[dict[str, Any]] = field(default_factory=list)  # candidates that cannot be simulated
+    unwritten: str = ""  # why there is no next sensor file where one was asked for
 
     def as_data(self) -> dict[str, Any]:
         """As `formats`: spadmnist-diagnosis/1."""
@@ -143,7 +145,9 @@ class Diagnosis:
             "excluded": self.excluded,
             "not_identifiable": self.invisible,
             "no_limit": self.unlimited,
+            "not_tried": self.untried,
             "sensor": self.file,
+            **({"not_written": self.unwritten} if self.unwritten else {}),
         }
 
 
@@ -231,7 +235,20 @@ def table(found: Diagnosis) -> str:
     if found.unlimited:
         about = [e["effect"] for e in found.unlimited]
         lines += textwrap.wrap(f"Tried and not found, without a limit: {', '.join(about)}.", 100)
+    if found.untried:
+        lines += ["", "Could not be simulated, and so was not tried there:"]
+        for e in found.untried:
+            text = f"{named(e)}, {e['where']}: {e['why']}"
+            lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
+    if found.unwritten:
+        lines += ["", *textwrap.wrap(f"The next sensor file was not written: {found.unwritten}", 100)]
     return "\n".join(lines)
+
+
+def named(entry: Mapping[str, Any]) -> str:
+    """What people call a candidate of the answer, as `title` does a change."""
+    name = str(entry["effect"]) + (f".{entry['parameter']}" if entry["parameter"] else "")
+    return name + (" per pixel" if entry["change"] == "per_pixel" else "")
 
 
 def shown(v: Value) -> str:

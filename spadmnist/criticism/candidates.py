@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..effects import Conditions, Effect
+from ..errors import UNABLE, SpadError, why
 from ..plugins import ByWavelength, Parameter
 from ..sensor import Sensor
 
@@ -129,7 +130,16 @@ class Change:
 
 
 def with_values(sensor: Sensor, values: Values) -> Sensor:
-    """The sensor with some parameters set, effects that it lacks among them."""
+    """The sensor with some parameters set, effects that it lacks among them. Raises SpadError where there is none."""
+    try:
+        return _with_values(sensor, values)
+    except SpadError:
+        raise
+    except UNABLE as error:
+        raise SpadError(why(error)) from error
+
+
+def _with_values(sensor: Sensor, values: Values) -> Sensor:
     given: dict[str, dict[str, Any]] = {}
     for (name, parameter), value in values.items():
         given.setdefault(name, {})[parameter] = value

@@ -8,18 +8,21 @@ left. What the set-up explains is no matter of the sensor (`setups`).
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..effects import Mimic
+from ..errors import UNABLE, why
 from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import advice, blocks, chance, checks, limits, recordings, setups
 from . import compare as comparing
 from .answer import Diagnosis, Step, Value, plain, title
+from .candidates import Change
 from .course import (
     LEAST_GAIN,
     Course,
@@ -97,14 +100,20 @@ def _diagnosed(
     while len(course.steps) < max_steps and not in_vain(course, not beside.explained) and _another(course, beside):
         pass
     if course.steps:
-        drop_needless(course)
-        drop_mimics(course, start, not beside.explained)
+        with _or_as_before(course, "taking out what is needless"):
+            drop_needless(course)
+        with _or_as_before(course, "taking out what only looks alike"):
+            drop_mimics(course, start, not beside.explained)
     if course.steps and not short:
-        settle_exactly(course, measurement)
-    widen(course)
-    open_ends(course)
+        with _or_as_before(course, "settling by likelihood"):
+            settle_exactly(course, measurement)
+    with _or_as_before(course, "the intervals"):
+        widen(course)
+    with _or_as_before(course, "the intervals"):
+        open_ends(course)
     if course.steps:
-        course.last_rung()
+        with _or_as_before(course, "the last comparison"):
+            course.last_rung()
     left = course.failed
     if left and beside.explained and all(b.cell[0] == "" for b in left):
         left = []
@@ -113,7 +122,7 @@ def _diagnosed(
         course.state, course.settled, course.values = start, None, {}
         course.ladder = course.ladder[:1] if verdict != "unexplained" else course.ladder
     rungs = [course.ladder[0], *([beside.placebo] if beside.placebo else []), *course.ladder[1:]]
-    usual = blocks.measure(bench, rungs)
+    usual = _measured(course, rungs)
     after = (course.ladder[-1] if course.steps else course.ladder[0]).misfit
     if verdict == "explained":
         verdict = _or_confused(course, beside)
@@ -130,7 +139,8 @@ def _diagnosed(
         bench.say("what would have been seen")
         if beside.looked is not course.state:  # the last step was the last one allowed, or its numbers have moved
             beside.tried = course.search.scan(course.state, everywhere=True, known=beside.tried)
-        excluded, invisible, unlimited = limits.upper_limits(course.search, course.state, beside.tried)
+        with _or_as_before(course, "the upper limits"):
+            excluded, invisible, unlimited = limits.upper_limits(course.search, course.state, beside.tried)
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not course.steps)
     return Diagnosis(
         bench.start.name,
@@ -154,7 +164,34 @@ def _diagnosed(
         bench.simulations,
         bench.dark,
         str(bench.start.window) if bench.start.window else None,
+        untried=course.search.untried,
     )
+
+
+@contextlib.contextmanager
+def _or_as_before(course: Course, where: str) -> Iterator[None]:
+    """What is done to the steps, or the steps as they were, where that needs a model that cannot be simulated."""
+    before, told = course.kept(), [(step, dict(step.values)) for step in course.steps]
+    try:
+        yield
+    except UNABLE as error:
+        course.back_to(before)
+        for step, values in told:
+            step.values = values
+        for change in [step.change for step in course.steps[-1:]]:
+            course.search.not_tried(change.kind, change.effect, change.parameter, where, why(error))
+
+
+def _measured(course: Course, rungs: Sequence[Rung]) -> float:
+    """As `blocks.measure`; where halves of a capture cannot be simulated, all rungs are judged by the whole."""
+    before = [(rung, rung.left, rung.misfit) for rung in rungs]
+    with _or_as_before(course, "the last comparison"):
+        return blocks.measure(course.bench, rungs)
+    for rung, left, misfit in before:
+        rung.left, rung.misfit = left, misfit
+        for step in rung.steps:
+            step.misfit = misfit
+    return checks.usual_misfit(rungs[0].state.own)
 
 
 # --- a step ------------------------------------------------------------------------------------------------------
@@ -191,13 +228,39 @@ def _another(course: Course, beside: _Beside) -> bool:
     return _added(course, beside, failed)
 
 
+class _NoCandidate(Exception):
+    """The best candidate cannot be simulated: it is none."""
+
+
 def _added(
     course: Course, beside: _Beside, failed: Sequence[checks.Block], least: float = comparing.FALSE_ALARM
 ) -> bool:
     """Is the best of the candidates a step after which another one may come? Adds it, if it is one.
 
-    least: the p-value that it must have.
+    least: the p-value that it must have. One that turns out to be none makes room for the next best.
     """
+    while True:
+        before = course.kept()
+        try:
+            return _best_added(course, beside, failed, least)
+        except _NoCandidate as none:
+            course.back_to(before)
+            names = none.args[0]
+            beside.tried = [t for t in beside.tried if t.change.name not in names]
+
+
+@contextlib.contextmanager
+def _needed(course: Course, changes: Sequence[Change], where: str) -> Iterator[None]:
+    """Without this the candidate is none: then it is excluded, and raises _NoCandidate."""
+    try:
+        yield
+    except UNABLE as error:
+        for change in changes:
+            course.search.exclude(change, where, why(error))
+        raise _NoCandidate({change.name for change in changes}) from error
+
+
+def _best_added(course: Course, beside: _Beside, failed: Sequence[checks.Block], least: float) -> bool:
     bench, search, faint = course.bench, course.search, not failed
     number = len(course.steps) + 1
     # what a step has set is settled anew with every other one: no finding of its own
@@ -208,7 +271,12 @@ def _added(
         return False
     worth = search.worth(second)
     bench.say(f"step {number}: settling " + ", ".join(title(t.change) for t in worth))
-    refined = [refine(bench, course.state, one) for one in worth]
+    refined = []
+    for one in worth:
+        with search.if_possible(one.change, "settling its numbers"):
+            refined.append(refine(bench, course.state, one))
+    if not refined:
+        raise _NoCandidate({one.change.name for one in worth})
     if not faint:
         search.weigh(course.state, refined)
     judged = {id(one): chance.of_best(bench, course.state, beside.tried, one, not faint) for one in refined}
@@ -220,7 +288,8 @@ def _added(
             return False
         best, significance, p = search.least_likely(course.state, refined, lambda t: judged[id(t)])
     else:
-        best = search.preferred(refined, lambda t: t.gain)
+        with _needed(course, [one.change for one in refined if one.scatters], "comparing the best"):
+            best = search.preferred(refined, lambda t: t.gain)
         significance, p = judged[id(best)]
     # small differences of many pixels, or codes, are no matter of squares: their chance is known by itself
     if p > least or (best.gain < LEAST_GAIN and not faint):
@@ -229,15 +298,18 @@ def _added(
         course.state = _closer(course)  # something is wrong: too few recordings may be all that hides what it is
         return True
     before, earlier, fell = course.state, course.kept(), course.misfit
-    new = accept(course, best, significance)
+    with _needed(course, best.changes, "settling all numbers together"):
+        new = accept(course, best, significance)
     if best.maps is None and not best.phases:
-        unseen = search.scattered(before, course.values, best, faint)
-        refined, second = refined + unseen, second + unseen
+        with _or_as_before(course, "looking for what looks alike"):
+            unseen = search.scattered(before, course.values, best, faint)
+            refined, second = refined + unseen, second + unseen
     new[0].alternatives = _alternatives(bench, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
     beside.placebo = beside.placebo or placebo_of(bench, before, beside.tried, best, named)
     if not failed and course.failed and _few(course):
-        course.state = _closer(course)  # as close as the model without it was looked at
+        with _needed(course, best.changes, "a closer look"):
+            course.state = _closer(course)  # as close as the model without it was looked at
     if not failed and course.failed:
         course.back_to(earlier)  # nothing was wrong before, now something is
         return False

@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 from scipy import ndimage, stats
 
 from .. import twin
-from ..errors import EffectError, SpadError
+from ..errors import UNABLE, EffectError, SpadError, why
 from ..heap import keep_freed_memory
 from ..measurement import Measurement
 from ..recording import Capture, Recording
@@ -57,6 +57,10 @@ def halves_of(id: str) -> tuple[str, str]:
 
 class Fault(str):
     """Why a model cannot be simulated: an effect's own code has failed."""
+
+
+def _unable(error: BaseException) -> str:
+    return (Fault if isinstance(error, EffectError) else str)(why(error))
 
 
 @dataclass(frozen=True)
@@ -318,10 +322,8 @@ def _task(
                 sensor = recordings.InTheDark.of(sensor)
             for recording in recordings.simulated(sensor, capture, photons[some], numbers[some], seed):
                 take(recording)
-    except EffectError as error:
-        return Fault(error)
-    except (SpadError, ValueError) as error:
-        return str(error)
+    except UNABLE as error:
+        return _unable(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
     return Made(
         numbers,
@@ -398,24 +400,28 @@ class Bench:
         pieces: int = 1,
         hasty: bool = False,
     ) -> list[Made | str]:
-        """Recordings for each of (sensors, capture, photons, numbers), in their order."""
-        tasks = []
-        for sensors, id, photons, numbers in wanted:
+        """Recordings for each of (sensors, capture, photons, numbers), in their order; or why there are none."""
+        tasks: list[list[tuple[Any, ...]]] = []
+        out: list[Made | str] = [""] * len(wanted)
+        for k, (sensors, id, photons, numbers) in enumerate(wanted):
+            tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
-            for part in parts:
-                if sensors.alike:
-                    models = [recordings.Packed.of(sensors.of(id, 0))]
-                else:
-                    models = [recordings.Packed.of(sensors.of(id, int(numbers[i]))) for i in part]
-                capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
-                tasks.append((models, capture, photons[part], numbers[part], self.seed, self.dead, hasty, second))
-        self.simulations += sum(len(n) for _, _, _, n in wanted)
-        results = iter(list(self.parallel(delayed(_task)(*task) for task in tasks)))
-        out: list[Made | str] = []
-        for _, _, _, numbers in wanted:
-            made = [next(results) for _ in range(max(1, min(pieces, len(numbers))))]
+            capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
+            try:
+                for part in parts:
+                    each = [0] if sensors.alike else [int(numbers[i]) for i in part]
+                    models = [recordings.Packed.of(sensors.of(id, number)) for number in each]
+                    rest = self.seed, self.dead, hasty, second
+                    tasks[k].append((models, capture, photons[part], numbers[part], *rest))
+            except UNABLE as error:
+                tasks[k], out[k] = [], _unable(error)
+        self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
+        results = iter(list(self.parallel(delayed(_task)(*task) for some in tasks for task in some)))
+        for k, some in enumerate(tasks):
+            made = [next(results) for _ in some]
             wrong = [p for p in made if isinstance(p, str)]
-            out.append(wrong[0] if wrong else _joined([p for p in made if isinstance(p, Made)]))
+            if some:
+                out[k] = wrong[0] if wrong else _joined([p for p in made if isinstance(p, Made)])
         return out
 
     def closed_form(self, sensor: Sensor, id: str) -> Callable[[float], float]:
@@ -454,8 +460,13 @@ class Bench:
         return -math.log(self.closed_form(sensor, id)(usual.level) / here) / max(slope, 0.05)
 
     def told(self, state: State, sensors: Sensors) -> Moved:
-        """What another model changes of the totals, as the closed forms have it; nothing else."""
-        return Moved({}, {}, {id: self.needed(state, sensors.usual(id), id) for id in state.rates})
+        """What another model changes of the totals, as the closed forms have it; nothing else. Raises SpadError."""
+        try:
+            return Moved({}, {}, {id: self.needed(state, sensors.usual(id), id) for id in state.rates})
+        except SpadError:
+            raise
+        except UNABLE as error:
+            raise SpadError(why(error)) from error
 
     def _centre(self, sensor: Sensor, seen: Seen) -> tuple[float, float | None, Callable[[float], float], float]:
         capture = seen.capture
@@ -476,8 +487,17 @@ class Bench:
     ) -> State:
         """Learn what the model makes of every capture, and judge the data by it.
 
-        known: the same model, simulated less often: its recordings are the first of these.
+        known: the same model, simulated less often: its recordings are the first of these. Raises SpadError where it
+        cannot be simulated.
         """
+        try:
+            return self._state(values, sensors, replicates, known)
+        except SpadError:
+            raise
+        except UNABLE as error:
+            raise SpadError(why(error)) from error
+
+    def _state(self, values: Values, sensors: Sensors | None, replicates: int | None, known: State | None) -> State:
         sensors = sensors or Sensors.same(with_values(self.start, values))
         n = replicates or self.replicates
         there = len(known.own[RATES]) if known else 0
@@ -628,7 +648,7 @@ class Bench:
         kept: Kept = "likely",
         only_of: Sequence[Collection[str]] | None = None,
     ) -> list[Moved | str]:
-        """What each of these models would change.
+        """What each of these models would change; or, in a word, why it cannot be simulated.
 
         few: recordings of each capture; only: of these captures, where there are any; hasty: without statistics that
         cost much; kept: of what the recordings show, what is hardly ever chance (a trace), what is hardly all chance
@@ -636,20 +656,31 @@ class Bench:
         """
         numbers = np.arange(few, dtype=np.uint64)
         ids_of = [[id for id in state.made if not some or id in some] for some in only_of or [only] * len(models)]
-        wanted = []
-        for sensors, ids in zip(models, ids_of, strict=True):
-            for id in ids:
-                level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
-                wanted.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
+        wanted, unable = [], dict[int, str]()
+        for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
+            own = []
+            try:
+                for id in ids:
+                    level = state.rates[id].level * self.matched(state, sensors.usual(id), id)
+                    own.append((sensors, id, level * state.factors[id][numbers.astype(int)], numbers))
+            except UNABLE as error:
+                unable[k], own = _unable(error), []
+            wanted += own
         simulated = self.simulate(wanted, hasty=hasty)
         if kept == "sure":  # a slope is a difference of the same few recordings
             simulated = self._more_of_doubtful(state, wanted, simulated, hasty)
         results = iter(simulated)
         out: list[Moved | str] = []
-        for sensors, ids in zip(models, ids_of, strict=True):
+        for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
+            if k in unable:
+                out.append(unable[k])
+                continue
             made = {id: next(results) for id in ids}
             wrong = [m for m in made.values() if isinstance(m, str)]
-            out.append(wrong[0] if wrong else self._moved(state, sensors, made, kept))  # type: ignore[arg-type]
+            try:
+                out.append(wrong[0] if wrong else self._moved(state, sensors, made, kept))  # type: ignore[arg-type]
+            except UNABLE as error:
+                out.append(_unable(error))
         return out
 
     def _more_of_doubtful(

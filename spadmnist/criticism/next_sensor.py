@@ -14,6 +14,7 @@ import numpy as np
 from .. import config, disk, document, units
 from ..effects import Effect
 from ..errors import InputError, SpadError
+from ..plugins import ByWavelength, Parameter
 from ..window import Window
 from .candidates import Key
 
@@ -51,8 +52,9 @@ def _is_ours(file: Path) -> bool:
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, window: Window | None = None) -> Path:
     """Write `out` beside its maps; source: the sensor file that was diagnosed. Returns `out`.
 
-    values: (effect, parameter) -> number, switch or map; notes: what stands behind a line, as a comment. window: the
-    part of the sensor that maps are of; elsewhere they are as `source` has them, or at their median where it does not.
+    values: (effect, parameter) -> number, switch, table over the wavelength or map; notes: what stands behind a line,
+    as a comment. window: the part of the sensor that maps are of; elsewhere they are as `source` has them, or at their
+    median where it does not. Raises SpadError where the file cannot be read again; then none is left there.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     text = source.read_text(encoding="utf-8-sig")
@@ -60,21 +62,24 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     shape = chip.layout.shape
     written: dict[Key, str] = {}
     for (effect, parameter), value in values.items():
+        declared = Effect.registry.find(effect).parameters[parameter]
         if isinstance(value, np.ndarray):
             if window is not None:
-                declared = Effect.registry.find(effect).parameters[parameter]
                 value = window.filled(declared, value, getattr(chip.effect(effect), parameter, None))
             # with the file's own name, lest it takes the place of a map that another sensor beside it has
             name = f"{out.stem}.{effect}.{parameter}.npy"
             map_ = io.BytesIO()
-            np.save(map_, value.reshape(shape) if value.size == shape[0] * shape[1] else value)
+            np.save(map_, value.reshape(shape) if declared.per_pixel else value)
             disk.commit_file(out.parent / name, map_.getvalue(), out.parent)
             written[effect, parameter] = f"{{file: {name}}}"
         elif isinstance(value, bool):
             written[effect, parameter] = "true" if value else "false"
+        elif isinstance(value, ByWavelength):
+            entries = zip(value.wavelengths, value.values, strict=True)
+            told = ", ".join(f"{units.show(at, 'm', 9)}: {_number(declared, x)}" for at, x in entries)
+            written[effect, parameter] = f"{{{told}}}"
         else:
-            unit = Effect.registry.find(effect).parameters[parameter].unit
-            written[effect, parameter] = units.show(float(value), unit, 6) if unit else f"{float(value):.6g}"
+            written[effect, parameter] = _number(declared, value)
     text = _moved_files(text, source.parent, out.parent)
     try:
         new = _headed(_edited(text, written, notes))
@@ -83,8 +88,16 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     except (SpadError, ValueError):
         # a file written in another way: its contents, without its comments
         disk.commit_file(out, _headed(_dumped(text, written)).encode(), out.parent)
-        config.read_sensor(out)
+        try:
+            config.read_sensor(out)
+        except SpadError:
+            out.unlink()
+            raise
     return out
+
+
+def _number(declared: Parameter, value: float) -> str:
+    return units.show(float(value), declared.unit, 6) if declared.unit else f"{float(value):.6g}"
 
 
 def _headed(text: str) -> str:

@@ -35,7 +35,10 @@ _BETTER, EXCLUDED = 2.0, 6.0  # in chi square: what a better whole number gains,
 
 
 def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
-    """Settle the numbers of a candidate. Its gain is that on captures that they are not settled with."""
+    """Settle the numbers of a candidate. Its gain is that on captures that they are not settled with.
+
+    Raises SpadError where it cannot be simulated there.
+    """
     if one.maps is not None or not one.change.dials:
         one.residuals = bench.residuals(state, one.moved, noisy=True)
         return one
@@ -61,7 +64,7 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
 
     found = settled(given)
     if isinstance(found, str):
-        return one
+        raise SpadError(found)
     for dial in one.change.dials:
         if dial.whole and dial.key in given:
             found, intervals = _counted(found, dial, lambda v: settled(v, 2))
@@ -72,9 +75,10 @@ def refine(bench: Bench, state: State, one: Tried, rounds: int = 3) -> Tried:
     one.sensors = state.sensors.changed(found.values, one.phases, one.chips)
     if not one.faint:  # there it may do what it did not do where it was tried first
         (there,) = bench.moved(state, [one.sensors])
-        if not isinstance(there, str):
-            one.there, residuals = there, bench.residuals(state, there)
-            found = replace(found, residuals=residuals, square=square(residuals))
+        if isinstance(there, str):
+            raise SpadError(there)
+        one.there, residuals = there, bench.residuals(state, there)
+        found = replace(found, residuals=residuals, square=square(residuals))
     one.settled, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.gain = square(state.residuals) - found.square
     if one.scatters:  # pixels, or recordings, may then differ as they do: no matter of their mean
@@ -193,7 +197,7 @@ def _swung(bench: Bench, state: State, one: Tried) -> Tried:
     strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in dials}}
     swing = turned(bench, state, one.change.phases, strong, _SWINGING)
     if isinstance(swing, str):
-        return one
+        raise SpadError(swing)
     gain, times, found = swing.suited(bench, state, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in dials}}
     mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}

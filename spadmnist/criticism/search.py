@@ -17,7 +17,7 @@ from scipy import stats
 
 from .. import plugins
 from ..effects import Effect
-from ..errors import EffectError, SpadError
+from ..errors import UNABLE, SpadError, why
 from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
@@ -29,6 +29,7 @@ from .refining import STRONG, optimism, state_of
 from .swings import NEAR, TIMES, turned
 from .tried import EACH, Tried, further, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
 
+_LOOKING, _AGAIN, _MAPPING = "the first look", "the second look", "making a map"  # where a candidate may fail
 _SCAN = 2  # recordings of each capture for a first look
 _SECOND = 6  # candidates that are looked at again
 _NEARLY = 0.8  # of the largest gain
@@ -62,27 +63,45 @@ class Search:
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[State, list[Line]] | None = None
 
-        self._untried: set[str] = set()
+        self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
+        self._out: set[str] = set()  # those of them that are none any more
         for name in Effect.registry:
             plugged = plugins.is_from_file(Effect.registry.find(name)) and bench.start.effect(name) is None
             if plugged and all(change.effect != name for change in changes(bench.start)):
-                self._not_tried(name, "none of its parameters says where to look for it; give one off= and search=")
+                nowhere = "none of its parameters says where to look for it; give one off= and search="
+                self.not_tried("add", name, None, "choosing candidates", nowhere)
 
-    def _not_tried(self, effect: str, why: str) -> None:
-        """Say of an effect, once, that it cannot be tried."""
-        if effect not in self._untried:
-            self._untried.add(effect)
+    def not_tried(self, kind: str, effect: str, parameter: str | None, where: str, why: str) -> None:
+        """Keep of a candidate that it cannot be simulated, where, and why; said once of an effect."""
+        entry = {"change": kind, "effect": effect, "parameter": parameter, "where": where, "why": why}
+        if all(entry["effect"] != other["effect"] for other in self.untried):
             self.say(f"not tried: {effect} ({why})")
+        which = ("change", "effect", "parameter", "where")
+        if all(any(entry[k] != other[k] for k in which) for other in self.untried):
+            self.untried.append(entry)
+
+    def exclude(self, change: Change, where: str, why: str) -> None:
+        """A candidate is none any more: beside this model, or at the values that suit it, it cannot be simulated."""
+        self._out.add(change.name)
+        self.not_tried(change.kind, change.effect, change.parameter, where, why)
+
+    def possible(self) -> list[Change]:
+        """Every candidate beside the sensor as it is stated, but those that are excluded."""
+        return self._beside(self.bench.start)
+
+    def _beside(self, sensor: Sensor) -> list[Change]:
+        return [change for change in changes(sensor) if change.name not in self._out]
 
     @contextlib.contextmanager
-    def _if_possible(self, change: Change) -> Iterator[None]:
-        """Candidates that the sensor or the measurement does not allow are none; a fault of an effect is said."""
+    def if_possible(self, change: Change, where: str, wholly: bool = True) -> Iterator[None]:
+        """A candidate that cannot be simulated is none, and that is kept. wholly: whatever its values."""
         try:
             yield
-        except EffectError as error:
-            self._not_tried(change.effect, str(error))
-        except SpadError:
-            pass
+        except UNABLE as error:
+            if wholly:
+                self.exclude(change, where, why(error))
+            else:
+                self.not_tried(change.kind, change.effect, change.parameter, where, why(error))
 
     # --- looking -------------------------------------------------------------------------------------------------
 
@@ -141,7 +160,7 @@ class Search:
         for change, tried in tries:
             if change.phases:
                 continue
-            with self._if_possible(change):
+            with self.if_possible(change, _LOOKING, wholly=False):
                 chips = change.kind == "add" and chancy(with_values(state.sensors.one, tried))
                 sensors = state.sensors.changed(tried, chips=chips)
                 still.append(Tried(change, tried, Moved({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
@@ -152,8 +171,12 @@ class Search:
         for change, tried in tries:
             if not change.phases:
                 continue
-            swing = turned(self.bench, state, change.phases, tried, fit.FEW)
-            if isinstance(swing, str):
+            swing: Any = None
+            with self.if_possible(change, _LOOKING, wholly=False):
+                swing = turned(self.bench, state, change.phases, tried, fit.FEW)
+            if swing is None or isinstance(swing, str):
+                if swing is not None:
+                    self.not_tried(change.kind, change.effect, change.parameter, _LOOKING, swing)
                 continue
             gain, times, found = swing.suited(self.bench, state)
             phases = {(id, key): p for id, p in found.items() for key in change.phases}
@@ -173,7 +196,11 @@ class Search:
 
         What may be of either sign is simulated with both: some of it grows in proportion, some with the square.
         """
-        down = {i: opposite for i, one in enumerate(tried) if (opposite := _opposite(state, one))}
+        down: dict[int, Sensors] = {}
+        for i, one in enumerate(tried):
+            with self.if_possible(one.change, _LOOKING, wholly=False):
+                if opposite := _opposite(state, one):
+                    down[i] = opposite
         models = [one.sensors for one in tried if one.sensors is not None]
         made = self.bench.moved(state, [*models, *down.values()], few, only, kept="sure")
         downs = dict(zip(down, made[len(tried) :], strict=True))
@@ -181,9 +208,8 @@ class Search:
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):
             other = downs.get(i)
             if isinstance(up, str) or isinstance(other, str):
-                for why in (up, other):
-                    if isinstance(why, fit.Fault):
-                        self._not_tried(one.change.effect, why)
+                said = up if isinstance(up, str) else str(other)
+                self.not_tried(one.change.kind, one.change.effect, one.change.parameter, _LOOKING, said)
                 continue
             one.moved = up if other is None else self.bench.both(state, up, other, few)
             out.append(one)
@@ -196,7 +222,7 @@ class Search:
         resemble it; captures that it was not looked at in are added.
         """
         tries: list[tuple[Change, dict[Key, Any]]] = []
-        for change in changes(state.sensors.one):
+        for change in self._beside(state.sensors.one):
             if change.phases and not self.lines(state):
                 continue  # nothing swings; and with a phase for each capture it would explain any totals
             if change.strengths or change.fixed:
@@ -216,7 +242,7 @@ class Search:
         """Candidates by what the closed forms say of the totals: nothing else is wrong, nothing need be simulated."""
         out = []
         for change, tried in tries:
-            with self._if_possible(change):
+            with self.if_possible(change, _LOOKING, wholly=False):
                 one = Tried(change, tried, self.bench.told(state, state.sensors.changed(tried)), 0.0, 1.0)
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 out.append(self._by_exact_totals(state, one) if one.gain > _PROMISING else one)
@@ -355,9 +381,10 @@ class Search:
             # how far an edge has to go nothing in proportion tells: where it was seen it is nearer than where it is not
             as_it_was = [replace(one, times=1.0)] if edge and abs(math.log(abs(one.times))) > _FAR_OFF else []
             for start in [one, *as_it_was]:
-                given = start.scaled()
-                sensors = state.sensors.changed(given, one.phases, one.chips)
-                out.append(replace(start, values=given, gain=size, sensors=sensors))
+                with self.if_possible(one.change, _AGAIN):
+                    given = start.scaled()
+                    sensors = state.sensors.changed(given, one.phases, one.chips)
+                    out.append(replace(start, values=given, gain=size, sensors=sensors))
         # pixels that chance has made odd are a map, too, even where the map alone would be no news
         least = _CHANCE_BESIDE if any(one.chips for one in best) else _LEAST_CHANCE
         for one in self._simulated(state, [*out, *self.maps(state, values, least)], fit.FEW):
@@ -368,7 +395,12 @@ class Search:
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
                 one.gain, one.times = self.line_search(state, one.moved, one.signed)
                 if one.chips and one.gain > _PROMISING:
-                    one.fell, one.gain = one.gain, self.beside(state, one)
+                    beside: float | None = None
+                    with self.if_possible(one.change, _AGAIN):
+                        beside = self.beside(state, one)
+                    if beside is None:
+                        continue
+                    one.fell, one.gain = one.gain, beside
             else:
                 one.gain = square(state.residuals) - square(self.bench.residuals(state, one.moved))
                 # small differences of many pixels are lost among what chance leaves, but for edges, which stand out
@@ -401,16 +433,18 @@ class Search:
         groups = [[c] for c in wanted]
         pixels = [c for c in wanted if c.per == "pixel" and mapping.by_counts(c)]
         if len(pixels) > 1 and all(c.per == "pixel" for c in held):
-            with contextlib.suppress(SpadError, np.linalg.LinAlgError):
+            with contextlib.suppress(*UNABLE):  # each is tried by itself, too
                 together = mapping.needed(self.bench, values, held, pixels, levels)
                 if len(together) > 1:
                     groups.insert(0, together)
         out = []
         for group in groups:
-            try:
-                sensors, found, mapped = mapping.sensors_with(self.bench, values, [*held, *group], levels)
-            except (SpadError, np.linalg.LinAlgError):
+            made: tuple[Any, ...] = ()
+            with self.if_possible(group[0], _MAPPING):
+                made = mapping.sensors_with(self.bench, values, [*held, *group], levels)
+            if not made:
                 continue
+            sensors, found, mapped = made
             map_ = found[group[0].carrier]  # type: ignore[index]
             spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
             if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
@@ -428,7 +462,7 @@ class Search:
     def mappable(self, state: State) -> list[Change]:
         """Every map that may be tried: not of a number that an earlier step settles, alike in all pixels."""
         settled = {dial.key for change in self.accepted for dial in change.dials}
-        return [c for c in changes(state.sensors.one) if c.carrier and c.carrier not in settled]
+        return [c for c in self._beside(state.sensors.one) if c.carrier and c.carrier not in settled]
 
     def structured(self, state: State, tried: list[Tried]) -> list[Tried]:
         """Patterns before maps, but only those that stand out of the map's own scatter.
@@ -476,10 +510,14 @@ class Search:
         """
         levels = mapping.levels_of(self.bench, state)
         out = []
-        for change in changes(state.sensors.one):
+        for change in self._beside(state.sensors.one):
             if change.per != "pixel" or change.carrier is None or change.effect == like.change.effect:
                 continue
-            told = sum(mapping.information(self.bench, values, change, levels).values())
+            told: Any = None
+            with self.if_possible(change, _MAPPING):
+                told = sum(mapping.information(self.bench, values, change, levels).values())
+            if told is None:
+                continue
             # what intervals tell of each pixel, jitter may have scattered as well
             if float(np.median(told)) > _TOLD and not change.blinds:
                 continue

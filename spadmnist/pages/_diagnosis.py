@@ -114,6 +114,7 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "limits": [(e, *_limit(e)) for e in found.excluded[:_MOST]],
         "hidden": [(e["effect"], _about(e["effect"])) for e in found.invisible[:_MOST]],
         "name": _name,
+        "named": answer.named,
         "about": _about,
     }
 
@@ -338,6 +339,7 @@ shows what is faint in each statistic, or what only a few of them tell.{% endif 
 beside {{ found.measurement }}\
 {% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
 beside this page: <b>{{ next }}</b>{% endif %}\
+{% if found.unwritten %} &middot; the next sensor file was not written: {{ found.unwritten }}{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
 </section>
 
@@ -492,6 +494,18 @@ squared residual {{ card.before | number }} before, <b>{{ card.after | number }}
 <tr><td><b>{{ entry.effect }}</b><br><span class="small">{{ about(entry.effect) }}</span></td>\
 <td>{{ entry.parameter }}{% if meaning %}<br><span class="small">{{ meaning }}</span>{% endif %}</td>\
 <td class="figure"><b>{{ limit }}</b></td></tr>
+{% endfor %}
+</tbody></table></div>
+{% endif %}
+
+{% if found.untried %}
+<h2>What could not be simulated</h2>
+<p class="small">These were not tried there.</p>
+<div class="wide"><table class="list">
+<thead><tr><th>candidate</th><th>where</th><th>why</th></tr></thead>
+<tbody>
+{% for entry in found.untried %}
+<tr><td><b>{{ named(entry) }}</b></td><td>{{ entry.where }}</td><td>{{ entry.why }}</td></tr>
 {% endfor %}
 </tbody></table></div>
 {% endif %}
