@@ -19,6 +19,7 @@ from measured import (
     recordings,
     refused,
 )
+from scipy import stats
 
 from spadmnist import config, measurement, twin
 from spadmnist.criticism import compare
@@ -112,6 +113,16 @@ def test_bits_drawn_by_themselves_follow_the_sensors_law(monkeypatch: pytest.Mon
     if flux > 1e4:
         with pytest.raises(AssertionError):
             laws.same_share(ones(whole), trials, ones(wrong), trials)
+
+
+def test_bits_drawn_by_themselves_give_every_pixel_binomial_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As bright as the paper's bright capture, 9,740 of 10,000 frames have a detection; false alarm 1e-6."""
+    large(monkeypatch)
+    n, hit = 10_000, 0.974
+    flux = (-np.log1p(-hit) / 10e-6 - 1000) / 0.4
+    bits = np.unpackbits(ones_of(device(rows=100), one("qis", frames=n), flux, 7), axis=2, count=10)
+    counts = bits.sum(axis=0, dtype=np.int64).ravel()
+    laws.histogram_is(counts, lambda k: stats.binom.pmf(k, n, hit))
 
 
 @pytest.mark.parametrize("modality", ["qis", "str", "counts", "counter"])
