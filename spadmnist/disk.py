@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import os
 import secrets
@@ -15,7 +16,7 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from .errors import SpadError
 
@@ -42,6 +43,48 @@ def commit_file(path: str | os.PathLike[str], data: bytes, tmp: str | os.PathLik
         os.rename(work / "file", path)
         _sync(path.parent)
     return record
+
+
+@contextlib.contextmanager
+def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
+    """A file among the user's own, to be written piece by piece: there as a whole or not at all; an older one goes.
+
+    size: bytes, about. It grows beside its place under a hidden name that is the same each time, so that a run that
+    was killed leaves nothing that the next one does not write over. Raises SpadError where it cannot be written, or is
+    being written by another run.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    with writing(path, size):
+        _make_folder(path.parent)
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        with open(os.open(part, flags, 0o666), "r+b") as file:
+            if not _own(file, part):
+                raise SpadError(f"{path}: another run is writing it; wait for it, or choose another name with -o")
+            try:
+                file.truncate(0)
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(part, path)
+            finally:
+                part.unlink(missing_ok=True)
+        _sync(path.parent)
+
+
+def put_file(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file among the user's own; see `whole`."""
+    with whole(path, len(data)) as file:
+        file.write(data)
+
+
+def _own(file: IO[bytes], path: Path) -> bool:
+    """Hold an open file alone. False where another process does, or has renamed it meanwhile."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(file.fileno()), os.lstat(path))
+    except (BlockingIOError, FileNotFoundError):
+        return False
 
 
 def read_file(path: str | os.PathLike[str], most: int) -> bytes:
