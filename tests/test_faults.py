@@ -42,9 +42,8 @@ def opened(path, *more, **named):
 
 measurement.open = opened
 """
-# a writer that a full disk stops without a word
+# a program that refuses without a word
 SILENT = """
-import sys
 from spadmnist import cli
 cli._say = lambda text: None
 """
@@ -77,10 +76,10 @@ def test_where_nothing_is_wrong_nothing_is_lost(tmp_path: Path) -> None:
     ("planted", "what", "says"),
     [
         (IN_PLACE, "killed export npy", "not whole: out.npy"),
-        (IN_PLACE, "full export npy", "not whole: out.npy"),
-        (BLIND, "damaged dataset hdf5", "verify: status 0"),
+        pytest.param(IN_PLACE, "full export npy", "not whole: out.npy", marks=pytest.mark.slow),
+        pytest.param(BLIND, "damaged dataset hdf5", "verify: status 0", marks=pytest.mark.slow),
         pytest.param(RAISES, "hostile measurement", "fault of the program: KeyError", marks=pytest.mark.slow),
-        (SILENT, "full export npy", "its refusal is no sentence"),
+        pytest.param(SILENT, "full export npy", "its refusal is no sentence", marks=pytest.mark.slow),
     ],
 )
 def test_a_planted_fault_is_told(planted: str, what: str, says: str) -> None:
