@@ -173,6 +173,8 @@ def digests(path: Path) -> dict[str, str]:
 def _pieces(value: Any) -> list[bytes]:
     if isinstance(value, np.ndarray):
         return [str((value.dtype, value.shape)).encode(), np.ascontiguousarray(value).tobytes()]
+    if isinstance(value, Events):
+        return [piece for one in (value.times, value.offsets, value.ticks, value.tick) for piece in _pieces(one)]
     if dataclasses.is_dataclass(value):
         return [piece for one in dataclasses.fields(value) for piece in _pieces(getattr(value, one.name))]
     if isinstance(value, float | int | str | bool | None):
