@@ -5,7 +5,7 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify bench challenge lint clean
+.PHONY: help demo test verify faults bench challenge lint clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,6 +31,12 @@ test: $(VENV)/installed lint  ## set up, and run the tests (a few minutes)
 
 verify: $(VENV)/installed  ## the slow statistical and fault tests
 	$(RUN)/python -m pytest -m slow -q -n 2 --dist loadfile
+
+# Tries of each class at most, drawn by lot; more classes have fewer: python scripts/faults.py list
+TRIES ?= 400
+
+faults: $(VENV)/installed  ## kills, full disks, damage and hostile files by the thousand (up to an hour)
+	$(RUN)/python scripts/faults.py run --sample $(TRIES) -o docs/faults.md
 
 lint: $(VENV)/installed
 	$(RUN)/ruff check spadmnist scripts tests

@@ -904,7 +904,7 @@ def _write_answer(file: Path | None, text: str) -> None:
 
     if file is not None:
         with _writing(file):
-            disk.commit_file(file, (text + "\n").encode(), file.parent)
+            disk.put_file(file, (text + "\n").encode())
 
 
 @cli.command("methods", short_help="List flux reconstructions, or describe one.")

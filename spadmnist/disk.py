@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import glob
 import hashlib
 import os
 import re
@@ -22,7 +21,6 @@ from typing import IO, Any
 
 from .errors import InputError, SpadError
 
-_PART = ".spadmnist-part"  # how a file's name ends that is not complete yet
 _LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
@@ -74,6 +72,48 @@ def opened(path: str | os.PathLike[str]) -> IO[bytes]:
 
 
 _HANDED_OVER = re.compile(r"/dev/stdin|/dev/fd/[0-9]+|/proc/self/fd/[0-9]+")
+
+
+@contextlib.contextmanager
+def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
+    """A file among the user's own, to be written piece by piece: there as a whole or not at all; an older one goes.
+
+    size: bytes, about. It grows beside its place under a hidden name that is the same each time, so that a run that
+    was killed leaves nothing that the next one does not write over. Raises SpadError where it cannot be written, or is
+    being written by another run.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    with writing(path, size):
+        _make_folder(path.parent)
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        with open(os.open(part, flags, 0o666), "r+b") as file:
+            if not _own(file, part):
+                raise SpadError(f"{path}: another run is writing it; wait for it, or choose another name with -o")
+            try:
+                file.truncate(0)
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(part, path)
+            finally:
+                part.unlink(missing_ok=True)
+        _sync(path.parent)
+
+
+def put_file(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file among the user's own; see `whole`."""
+    with whole(path, len(data)) as file:
+        file.write(data)
+
+
+def _own(file: IO[bytes], path: Path) -> bool:
+    """Hold an open file alone. False where another process does, or has renamed it meanwhile."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(file.fileno()), os.lstat(path))
+    except (BlockingIOError, FileNotFoundError):
+        return False
 
 
 def read_file(path: str | os.PathLike[str], most: int) -> bytes:
@@ -128,26 +168,6 @@ def writing(place: Path, size: int) -> Iterator[None]:
             advice = f"see to that (or choose another place with -o) and {again}"
         reason = error.strerror or str(error)
         raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
-
-
-@contextlib.contextmanager
-def part(path: Path) -> Iterator[tuple[IO[bytes], Path]]:
-    """(a new file beside `path`, open and empty; its path), which is gone afterwards where it is still there.
-
-    It is locked while its writer lives. Such files of the same `path` whose writer was killed are removed.
-    """
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"):
-        with contextlib.suppress(OSError), open(left, "rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused where a writer holds it
-            left.unlink()
-    own = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_PART}")
-    with open(own, "x+b") as file:
-        try:
-            with contextlib.suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield file, own
-        finally:
-            own.unlink(missing_ok=True)
 
 
 def _amount(size: int) -> str:

@@ -6,11 +6,9 @@ not written; an import takes them from --positions.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import os
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
@@ -97,23 +95,11 @@ def export(
         def told(share: float, id: str = capture.id) -> None:
             progress.advance(share, id)
 
-        with _whole(path, capture_files.size(one)) as file:
+        with disk.whole(path, capture_files.size(one)) as file:
             target.put(one.watched(told), file)
         if one.frames is None:
             told(1.0)
     return paths
-
-
-@contextlib.contextmanager
-def _whole(path: Path, size: int) -> Iterator[IO[bytes]]:
-    """A new file that is there as a whole or not at all."""
-    with disk.writing(path, size):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with disk.part(path) as (file, part):
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-            os.replace(part, path)
 
 
 def _events(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:

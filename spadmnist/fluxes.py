@@ -263,7 +263,7 @@ def write(found: Fluxes, folder: Path) -> Path:
     files[SHEET] = sheet(found)
     missing = [name for name, data in files.items() if not _is_there(folder / name, data)]
     for name in missing:
-        disk.commit_file(folder / name, files[name], folder)
+        disk.put_file(folder / name, files[name])
     return folder
 
 

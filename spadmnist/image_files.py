@@ -153,6 +153,7 @@ def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what is damaged: the picture is read, or refused in a sentence
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with disk.opened(path) as file:

@@ -338,7 +338,7 @@ def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ..
         raise InputError(f"{path}: no such file; {declared.name} takes its map from there") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or 'it is damaged'})") from None
-    except (ValueError, EOFError):
+    except Exception:  # the header is a Python literal, and its reader raises nearly anything
         raise InputError(f"{path}: is not a .npy file of plain numbers; write the map with numpy.save") from None
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or not _fits(values.shape, shapes):
         what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "an archive"

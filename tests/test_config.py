@@ -412,6 +412,7 @@ def maps(tmp_path: Path) -> Path:
     (tmp_path / "empty.npy").write_bytes(b"")
     whole = (tmp_path / "flat.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(whole[:-100])
+    (tmp_path / "torn.npy").write_bytes(whole.replace(b"}", b" "))  # of the header, which is a Python literal
     (tmp_path / "folder.npy").mkdir()
     return tmp_path
 
@@ -439,7 +440,7 @@ def test_a_map_is_read(name: str, maps: Path) -> None:
         ("text", "<U"),
         ("bool", "bool"), ("one", "(28, 28)"), ("pickle", "numpy.save"), ("zip", "archive"),
         ("words", "numpy.save"),
-        ("empty", "numpy.save"), ("cut", "numpy.save"), ("folder", "older"),
+        ("empty", "numpy.save"), ("cut", "numpy.save"), ("torn", "numpy.save"), ("folder", "older"),
     ],
 )  # fmt: skip
 def test_a_map_that_cannot_be_used_is_refused(name: str, says: str, maps: Path) -> None:

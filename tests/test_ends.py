@@ -25,6 +25,7 @@ import spadmnist.cli as command_line
 from spadmnist import disk
 from spadmnist.cli import _run
 from spadmnist.criticism import memory, nulls
+from spadmnist.errors import SpadError
 
 START = [sys.executable, "-c", "from spadmnist.start import main; main()"]
 SENTENCE = "Interrupted. What is complete is kept: the same command goes on from there."
@@ -204,24 +205,32 @@ def test_workers_do_not_mind_closed_streams(closed: str, tmp_path: Path) -> None
 
 def test_half_an_export_is_cleared_by_the_next_one_and_a_living_writer_keeps_its_own(tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; from pathlib import Path; from spadmnist import disk\n"
-        "with disk.part(Path(sys.argv[1])) as (file, part):\n    file.write(b'half'); file.flush()\n"
-        "    print(part, flush=True)\n    sys.stdin.read()\n"
+        "import sys; from pathlib import Path; from spadmnist import disk\n"
+        "with disk.whole(Path(sys.argv[1]), 4) as file:\n    file.write(b'half'); file.flush()\n"
+        "    print(flush=True)\n    sys.stdin.read()\n"
     )
     path = tmp_path / "a[1].npz"
-    writers = [
-        subprocess.Popen([sys.executable, "-c", code, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    halves = [Path(writer.stdout.readline().strip()) for writer in writers if writer.stdout]
-    assert all(half.read_bytes() == b"half" for half in halves)
-    writers[0].kill()
-    writers[0].wait()
-    (tmp_path / ".other.npz.1").touch()
-    with disk.part(path) as (_, own):
-        assert {file.name for file in tmp_path.iterdir()} == {own.name, halves[1].name, ".other.npz.1"}
-    writers[1].communicate("")
-    assert [file.name for file in tmp_path.iterdir()] == [".other.npz.1"]
+
+    def writer() -> subprocess.Popen[str]:
+        begun = subprocess.Popen(
+            [sys.executable, "-c", code, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert begun.stdout is not None and begun.stdout.readline() == "\n"
+        return begun
+
+    killed = writer()
+    killed.kill()
+    killed.communicate()
+    (half,) = tmp_path.iterdir()
+    assert half.read_bytes() == b"half"
+    (tmp_path / ".other.npz.part").touch()
+    living = writer()
+    with pytest.raises(SpadError, match="another run is writing it"):
+        disk.put_file(path, b"all")
+    living.communicate("")
+    assert {file.name for file in tmp_path.iterdir()} == {"a[1].npz", ".other.npz.part"}
+    disk.put_file(path, b"all")
+    assert {file.name for file in tmp_path.iterdir()} == {"a[1].npz", ".other.npz.part"} and path.read_bytes() == b"all"
 
 
 @pytest.mark.parametrize("at", [3, 0.3, 0.6, 0.9, 0.999])

@@ -12,7 +12,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +24,7 @@ import pytest
 from commands import COMMAND, run, run_anew
 
 import spadmnist
-from spadmnist import config, dataset, factory, plugins, verify
+from spadmnist import config, dataset, factory, plugins
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 
@@ -364,105 +363,7 @@ def test_other_versions_do_not_go_on(made: tuple[Path, Path], tmp_path: Path, mo
         make(made[0], tmp_path / "out")
 
 
-# --- killed at every step on the disk -----------------------------------------------------------------------------
-#
-# Not a matter of luck: a child process is killed just before its n-th step that changes the disk, for many n.
-# All of it in processes forked from one that has imported everything, so that a kill costs little.
-
-_STEPS = ("mkdir", "rename", "replace", "unlink", "rmdir", "fsync")
-
-
-def _forked(action: Callable[[], Any], die_at: int | None = None) -> int:
-    """Call `action` in a forked process that is killed before step `die_at`; the number of steps, -1 if killed."""
-    read, write = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        status = 1
-        try:
-            count = 0
-
-            def counted(real: Any) -> Any:
-                def step(*arguments: Any, **options: Any) -> Any:
-                    nonlocal count
-                    count += 1
-                    if count == die_at:
-                        os.kill(os.getpid(), signal.SIGKILL)
-                    return real(*arguments, **options)
-
-                return step
-
-            for name in _STEPS:
-                setattr(os, name, counted(getattr(os, name)))
-            action()
-            os.write(write, str(count).encode())
-            status = 0
-        except BaseException as error:
-            print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        finally:
-            os._exit(status)
-    os.close(write)
-    with open(read) as pipe:
-        said = pipe.read()
-    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    if status == -signal.SIGKILL:
-        return -1
-    if status != 0:
-        raise AssertionError(f"the child ended with {status}")
-    return int(said)
-
-
-def hammer(verb: str, format: str, folder: str, kills: int, seed: int) -> None:
-    """Kill `verb` before `kills` of its steps and the last ones, do it again, and compare."""
-    home = Path(folder)
-    file = write_config(home / "c.yaml", format, ("5 mlux", "2560 mlux"), train=12, test=4)
-    few = write_config(home / "few.yaml", format, ("5 mlux", "2560 mlux"), METHODS[:2], train=12, test=4)
-    make(file, home / "expected")
-    expected = tree(home / "expected")
-    make(few, home / "few")
-    root = home / "out"
-
-    def prepare() -> None:
-        shutil.rmtree(root, ignore_errors=True)
-        if verb == "reconstruct":
-            shutil.copytree(home / "few", root)
-        elif verb != "generate":
-            shutil.copytree(home / "expected", root)
-            for victim in random.Random(seed).sample(sorted(expected.keys() - {"manifest.json"}), 5):
-                (root / victim).write_bytes(b"damaged")
-            (root / "config.yaml").unlink()
-        if verb == "repair manifest":
-            shutil.copy(home / "expected" / "config.yaml", root)
-            (root / "manifest.json").unlink()
-
-    def act() -> None:
-        if verb == "generate":
-            make(file, root)
-        elif verb == "reconstruct":
-            factory.add_reconstructions(root, METHODS, 1)
-        else:
-            verify.repair(root, verify.verify(root), 1)
-
-    for _ in range(2):  # the first time kernels are compiled and kept, on the disk, too: steps that never come again
-        prepare()
-        steps = _forked(act)
-        assert_same(root, expected)
-    rng = random.Random(seed)
-    early = range(1, steps - 30)
-    points = sorted(rng.sample(early, min(kills, len(early))))
-    late = range(max(1, steps - 30), steps + 1)
-    points += sorted(rng.sample(late, 12))
-    wrong = []
-    for at in points:
-        prepare()
-        assert _forked(act, at) == -1
-        try:
-            if verb == "generate":
-                assert_whole_shards(root, expected, format)
-            _forked(act)
-            assert_same(root, expected)
-        except AssertionError as error:
-            wrong.append(f"killed before step {at} of {steps}: {error}")
-    assert not wrong, "\n".join([f"{len(wrong)} of {len(points)}", *wrong[:5], *wrong[-5:]])
+# --- killed from outside ------------------------------------------------------------------------------------------
 
 
 def assert_whole_shards(root: Path, expected: dict[str, bytes | str], format: str) -> None:
@@ -478,27 +379,6 @@ def assert_whole_shards(root: Path, expected: dict[str, bytes | str], format: st
         if "empty folder" in mine.values() and len(mine) == 1:
             continue  # a folder above shards
         assert mine == theirs, f"{shard} is not complete"
-
-
-def _hammered(verb: str, format: str, folder: Path, kills: int) -> None:
-    code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_factory; "
-        f"test_factory.hammer({verb!r}, {format!r}, {str(folder)!r}, {kills}, seed=1)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert result.returncode == 0, result.stderr[-3000:]
-
-
-VERBS = ["generate", "reconstruct", "repair", "repair manifest"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
-def test_killed_at_many_steps_on_the_disk(verb: str, format: str, tmp_path: Path) -> None:
-    _hammered(verb, format, tmp_path, 30)
-
-
-# --- killed from outside ------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

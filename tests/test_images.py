@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 import gzip
 import hashlib
 import http.server
@@ -709,6 +710,18 @@ def test_bad_image_file(tmp_path: Path, data: bytes, parts: list[str]) -> None:
     (tmp_path / "f").mkdir()
     (tmp_path / "f" / "bad.png").write_bytes(data)
     refused(lambda: load_folder(tmp_path / "f"), tmp_path / "f" / "bad.png", *parts)
+
+
+def test_of_a_damaged_picture_nothing_but_the_sentence_is_said(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    whole = as_tiff(GREY)
+    (tmp_path / "f").mkdir()
+    for size in range(8, len(whole), 7):  # Pillow warns of tags that lie beyond the end
+        (tmp_path / "f" / "bad.tif").write_bytes(whole[:size])
+        with contextlib.suppress(InputError):
+            load_folder(tmp_path / "f")
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize(

@@ -560,6 +560,22 @@ def test_a_file_is_committed_whole(tmp_path: Path) -> None:
     assert disk.sweep(tmp_path / "nowhere") == 0
 
 
+def test_a_file_among_the_users_own_leaves_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "answer.json"
+    (tmp_path / ".answer.json.part").write_bytes(b"what a run that was killed left, longer than the new one")
+    disk.put_file(path, b"new")
+    assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["answer.json"]
+    with pytest.raises(RuntimeError), disk.whole(path, 10) as file:
+        file.write(b"half")
+        raise RuntimeError
+    assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["answer.json"]
+    with disk.whole(path, 10) as file:
+        with pytest.raises(SpadError, match="another run is writing it"):
+            disk.put_file(path, b"other")
+        file.write(b"mine")
+    assert path.read_bytes() == b"mine" and os.listdir(tmp_path) == ["answer.json"]
+
+
 @pytest.mark.parametrize("format", ["zarr", pytest.param("hdf5", marks=pytest.mark.slow)])
 def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
     program = textwrap.dedent(

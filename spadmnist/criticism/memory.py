@@ -20,6 +20,7 @@ import numpy as np
 
 from .. import disk, plugins
 from ..compiled import digest_of_sources
+from ..errors import SpadError
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
@@ -84,13 +85,10 @@ def keep(name: str, further: Mapping[str, np.ndarray], nulls: Mapping[str, Null]
         whole = io.BytesIO()
         np.savez(whole, allow_pickle=False, facts=header, **further, **arrays)
         entry = folder / f"{name}.npz"
-        with disk.part(entry) as (file, part):
-            file.write(whole.getbuffer())
-            file.write(hashlib.sha256(whole.getbuffer()).digest())
-            file.flush()
-            os.replace(part, entry)
+        data = whole.getvalue()
+        disk.put_file(entry, data + hashlib.sha256(data).digest())
         _make_room(folder)
-    except OSError:
+    except (OSError, SpadError):  # what is not remembered is learnt again
         return
 
 

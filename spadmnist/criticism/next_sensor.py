@@ -70,7 +70,7 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
             name = f"{out.stem}.{effect}.{parameter}.npy"
             map_ = io.BytesIO()
             np.save(map_, value.reshape(shape) if declared.per_pixel else value)
-            disk.commit_file(out.parent / name, map_.getvalue(), out.parent)
+            disk.put_file(out.parent / name, map_.getvalue())
             written[effect, parameter] = f"{{file: {name}}}"
         elif isinstance(value, bool):
             written[effect, parameter] = "true" if value else "false"
@@ -83,11 +83,11 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     text = _moved_files(text, source.parent, out.parent)
     try:
         new = _headed(_edited(text, written, notes))
-        disk.commit_file(out, new.encode(), out.parent)
+        disk.put_file(out, new.encode())
         config.read_sensor(out)
     except (SpadError, ValueError):
         # a file written in another way: its contents, without its comments
-        disk.commit_file(out, _headed(_dumped(text, written)).encode(), out.parent)
+        disk.put_file(out, _headed(_dumped(text, written)).encode())
         try:
             config.read_sensor(out)
         except SpadError:

@@ -52,7 +52,7 @@ def write(folder: Path, kind: str, template: str, words: dict[str, Any]) -> Path
     version = importlib.metadata.version("spadmnist")
     text = environment.get_template("page").render(mark=_mark(kind), version=version, **words)
     page = Path(folder) / FILES[kind]
-    disk.commit_file(page, text.encode("utf-8", "replace"), page.parent)
+    disk.put_file(page, text.encode("utf-8", "replace"))
     return page
 
 
