@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -598,16 +599,19 @@ def test_names_with_blanks_and_of_any_alphabet(made: tuple[Path, Path], tmp_path
     assert_same(home / "a b", expected)
 
 
-@pytest.mark.parametrize(("cause", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_end_in_the_middle_of_compiled_code_is_no_fault(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cause: BaseException, code: int
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], number: int, code: int
 ) -> None:
     """Compiled code turns what a signal raises into a SystemError."""
     from spadmnist import cli as command_line
+    from spadmnist import interrupts
 
     def stopped(*given: object, **more: object) -> None:
-        raise SystemError("returned a result with an exception set") from cause
+        monkeypatch.setattr(interrupts, "_came", [(number, 0.0)])
+        raise SystemError("returned a result with an exception set")
 
     monkeypatch.setattr(command_line.cli, "main", stopped)
     assert command_line._run([]) == code
-    assert "fault" not in capsys.readouterr().err
+    said = capfd.readouterr().err
+    assert "fault" not in said and ("Interrupted" in said) == (number == signal.SIGINT)
