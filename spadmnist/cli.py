@@ -190,7 +190,7 @@ def generate(
         _say(f"Note: {note}")
     images = experiment.load_images(images_dir)
     root = output if output is not None else Path(config.stem)
-    workers = jobs or _processors()
+    workers = jobs or factory.most_workers(experiment, images, _processors())
     if dry_run:
         from . import plan
 
@@ -241,6 +241,7 @@ def generate(
     metavar="SENSOR",
     help="Of a measurement: whose PDP and dead time the methods are told.  [default: 1, and 0 s]",
 )
+@_crop
 @_jobs
 @_plugin
 @_json
@@ -249,6 +250,7 @@ def reconstruct_(
     methods: tuple[str, ...],
     output: Path | None,
     sensor: Path | None,
+    crop: str | None,
     jobs: int | None,
     plugin_files: tuple[Path, ...],
     as_json: bool,
@@ -278,9 +280,12 @@ def reconstruct_(
             raise SpadError(
                 f"--jobs: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
             )
-        _reconstruct_measurement(dataset, methods, output, sensor, as_json)
+        if crop is not None and sensor is None:
+            raise SpadError("--crop: is the part of a sensor; give --sensor as well, or leave it out")
+        model = None if sensor is None else _model(sensor, crop)
+        _reconstruct_measurement(dataset, methods, output, model, as_json)
         return
-    for option, given in (("--output", output), ("--sensor", sensor)):
+    for option, given in (("--output", output), ("--sensor", sensor), ("--crop", crop)):
         if given is not None:
             raise SpadError(
                 f"{option}: belongs to a measurement, and {dataset} is none; a dataset keeps its images and knows its "
@@ -300,14 +305,13 @@ def reconstruct_(
 
 
 def _reconstruct_measurement(
-    path: Path, methods: tuple[str, ...], output: Path | None, sensor: Path | None, as_json: bool
+    path: Path, methods: tuple[str, ...], output: Path | None, model: Sensor | None, as_json: bool
 ) -> None:
-    from . import config, fluxes, measurement, report
+    from . import fluxes, measurement, report
 
     opened = measurement.open(path)
     folder = output if output is not None else fluxes.place_of(opened)
     fluxes.check_place(folder)
-    model = None if sensor is None else config.read_sensor(sensor)
     with _terminal() as progress:
         found = fluxes.of_measurement(opened, methods, model, progress)
     fluxes.write(found, folder)
@@ -369,12 +373,15 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
 def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
     from . import measurement, report
 
-    opened = measurement.open(path)
+    opened = measurement.open(path, planned=True)
     looks = report.looks(opened, plot is not None)
     if as_json:
-        _print_json({"measurement": opened.name, "captures": [one.numbers for one in looks]})
+        missing = {"missing": list(opened.missing)} if opened.missing else {}
+        _print_json({"measurement": opened.name, "captures": [one.numbers for one in looks], **missing})
     else:
         _print_lines(report.capture_table(opened, looks))
+    if opened.missing:
+        _say(f"Not recorded yet: {', '.join(opened.missing)}. Next:  spadmnist import FILE -o {quoted(path)}")
     if plot is not None:
         with _writing(plot):
             report.capture_sheet(opened, looks, plot)
@@ -620,8 +627,11 @@ def export(
 
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
+    opened = library.open(measurement, readout)
     with _terminal() as progress:
-        paths = exporters.export(library.open(measurement, readout), output, format_, ids, progress)
+        paths = exporters.export(opened, output, format_, ids, progress)
+    if opened.layout.positions is not None:
+        _say("Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv.")
     if as_json:
         _print_json({"files": [str(path) for path in paths]})
         return

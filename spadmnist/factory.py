@@ -510,6 +510,12 @@ def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: S
     return needed
 
 
+def most_workers(experiment: Experiment, splits: Mapping[str, Images], processors: int) -> int:
+    """How many workers there may be: one for each processor, as far as memory goes, and one at least."""
+    needed = memory_per_worker(experiment, splits, dataset.shards_of(experiment, splits))
+    return max(1, min(processors, _memory_there() // needed))
+
+
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
     """Bytes: interpreter and libraries, and the streams, scratch and encoded bytes of the largest shard."""
     most: dict[tuple[str, str], int] = {}

@@ -655,7 +655,8 @@ def looks(measurement: Measurement, drawn: bool) -> list[Look]:
     """Read the captures, one after the other. drawn: for a picture, too."""
     found = []
     for i, capture in enumerate(measurement.captures):
-        recorded = None if capture.mean is not None else measurement.recording(capture.id)
+        unknown = capture.mean is not None or capture.id in measurement.missing
+        recorded = None if unknown else measurement.recording(capture.id)
         numbers = look.look(measurement, capture, recorded)
         if recorded is None or not drawn or i >= _MOST_CAPTURES:
             found.append(Look(capture, numbers))

@@ -471,3 +471,32 @@ def test_frames_that_came_from_elsewhere(tmp_path: Path) -> None:
     assert commands.run("reconstruct", "lab", "--method", "qis_counts", cwd=tmp_path).returncode == 0
     found, right = np.load(tmp_path / "b-flux" / "b.qis_counts.npy"), np.load(folder / "qis_counts.npy")
     assert found.dtype == np.float32 and np.array_equal(found, right) and found.sum() == 176
+
+
+def test_a_part_of_the_sensor_gives_its_own_numbers(tmp_path: Path) -> None:
+    """A measured window of a chip whose PDP differs from pixel to pixel: the nominal values of the window."""
+    sensor = tmp_path / "chip.yaml"
+    sensor.write_text(
+        "sensor:\n  rules: device\n  layout: {rows: 8, columns: 16, pixel_area: 25 um^2, fill_factor: 1}\n"
+        "  effects: {detection: {pdp: 0.5}, dead_time: {duration: 50 ns}, tdc: {resolution: 1 ns}}\n"
+    )
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    (lab / "measurement.yaml").write_text(
+        "format: spadmnist-measurement/1\nlayout: {rows: 4, columns: 8}\ncaptures:\n"
+        "  - {id: a, modality: tr, exposure: 1 ms, light: {kind: flat, wavelength: 500 nm, irradiance: 1 nW/cm^2}}\n"
+    )
+    run = commands.run
+    window = ("--crop", "2:6,4:12")
+    assert run("simulate", sensor, lab, "-o", tmp_path / "twin", *window).returncode == 0
+    refused = run("reconstruct", tmp_path / "twin", "--sensor", sensor, "-o", tmp_path / "f")
+    assert refused.returncode == 2 and "--crop" in refused.stderr
+    made = run(
+        "reconstruct", tmp_path / "twin", "--sensor", sensor, *window, "-o", tmp_path / "f", "--method", "counts"
+    )
+    assert made.returncode == 0, made.stderr
+    plain = run("reconstruct", tmp_path / "twin", "-o", tmp_path / "g", "--method", "counts")
+    assert plain.returncode == 0
+    one, two = (np.load(tmp_path / name / "a.counts.npy") for name in "fg")
+    assert np.allclose(one, two / 0.5) and one.shape == (4, 8)
+    assert "--crop: is the part of a sensor" in run("reconstruct", tmp_path / "twin", *window).stderr

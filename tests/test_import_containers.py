@@ -446,7 +446,7 @@ def test_counts_in_numbers(tmp_path: Path, kind: Any, name: str) -> None:
     made = run(save(tmp_path / name, COUNTS.astype(kind)), said)
     assert np.array_equal(frames(made), COUNTS) and made.took[0].detections == COUNTS.sum()
     high = refusal_elsewhere(save(tmp_path / name, (COUNTS + 1).astype(kind)), said, tmp_path / "no")
-    assert "16 stands in the frames from 0 on, but 4 bits count up to 15" in high
+    assert "the frames from 0 on hold 16, but 4 bits count up to 15" in high
 
 
 def refusal_elsewhere(file: Path, said: Said, out: Path) -> str:
@@ -458,14 +458,14 @@ def refusal_elsewhere(file: Path, said: Said, out: Path) -> str:
 @pytest.mark.parametrize(
     ("value", "kind", "says"),
     [
-        (0.5, float, "0.5 stands in the frames from 0 on, which is no whole number"),
-        (np.nan, float, "nan stands in the frames"),
-        (np.inf, float, "inf stands in the frames"),
-        (-np.inf, np.float32, "-inf stands in the frames"),
+        (0.5, float, "the frames from 0 on hold 0.5, which is no whole number"),
+        (np.nan, float, "on hold nan"),
+        (np.inf, float, "on hold inf"),
+        (-np.inf, np.float32, "on hold -inf"),
         (2050, np.float16, "which float16 does not tell from the next whole number"),
-        (-1, np.int8, "-1 stands in the frames from 0 on, but 12 bits count up to 4095"),
-        (4096, np.uint16, "4096 stands in the frames"),
-        (2**62, np.int64, "4611686018427387904 stands in the frames"),
+        (-1, np.int8, "the frames from 0 on hold -1, but 12 bits count up to 4095"),
+        (4096, np.uint16, "on hold 4096"),
+        (2**62, np.int64, "on hold 4611686018427387904"),
     ],
 )
 @pytest.mark.parametrize("modality", ["counts", "str", "qis", None])

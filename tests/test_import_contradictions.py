@@ -259,3 +259,24 @@ def test_times_behind_an_empty_word(tmp_path: Path) -> None:
     said = Said(firmware="2212b", timestamps=8, cycle=4e-3)
     assert back(run(path, said)).totals.sum() == 12
     assert "give another --timestamps or --firmware" in refusal(again, replace(said, timestamps=32))
+
+
+@pytest.mark.parametrize("name", [" a ", "a\nb", "x" * 101, "‮a", ""])
+def test_a_name_that_cannot_be_read_again_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(SpadError, match=r"--name: .* is not a name: a line of 1 to 100 characters"):
+        run(table(tmp_path / "a.csv", "0,1"), SECOND, name=name)
+
+
+def test_decimals_are_rounded_once(tmp_path: Path) -> None:
+    """Beyond 4096 s a double of seconds does not tell the ps."""
+    times = ["9000.000000000001", "9000.0000000000024", "4503.599627370497", "0.0000000000005001", "8e3"]
+    path = tmp_path / "a.csv"
+    path.write_text("time (s);pixel\n\n" + "".join(f"{time.replace('.', ',')};0\n" for time in times))
+    events = back(run(path, Said(exposure=9001.0))).events
+    assert events is not None and events.ticks is not None
+    assert [int(t) for t in events.ticks] == [1, 4503599627370497, 8 * 10**15, 9 * 10**15 + 1, 9 * 10**15 + 2]
+    path.write_text("pixel\ttime (ns)\tfine (ps)\n0\t9000000000000\t1\n")
+    again = made_in(tmp_path, "b") / "a.csv"
+    again.write_text(path.read_text())
+    events = back(run(again, Said(exposure=9001.0))).events
+    assert events is not None and events.ticks is not None and int(events.ticks[0]) == 9 * 10**15 + 1

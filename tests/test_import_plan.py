@@ -187,7 +187,7 @@ def test_a_plan_survives_a_file_that_fails(tmp_path: Path) -> None:
     good, bad = save(tmp_path / "dark.npy", bits()), bits(seed=2).astype(np.uint8)
     bad[15] = 7
     files = [good, save(tmp_path / "flat_1.npy", bad)]
-    assert "7 stands in the frames" in refusal_of(fill, files, lab)
+    assert "on hold 7" in refusal_of(fill, files, lab)
     assert measurement.open(lab, planned=True).missing in (("flat 1",), ("dark", "flat 1"))
     save(files[1], bits(seed=2))
     left = [path for path in files if path.stem.replace("_", " ") in measurement.open(lab, planned=True).missing]
@@ -222,3 +222,17 @@ def test_the_verb(tmp_path: Path) -> None:
     said = commands.run("import", "a.npy", "-o", lab / "measurement.yaml", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
     assert measurement.open(lab).missing == ()
+
+
+def test_a_plan_is_inspected_as_far_as_it_is_recorded(tmp_path: Path) -> None:
+    lab = plan(tmp_path / "lab")
+    fill(save(tmp_path / "dark.npy", bits()), lab)
+    said = commands.run("inspect", lab, "--plot", tmp_path / "a.png")
+    assert (
+        said.returncode == 0
+        and "Not recorded yet: flat 1, counts, tags. Next:  spadmnist import FILE -o" in said.stderr
+    )
+    assert "dark" in said.stdout and (tmp_path / "a.png").stat().st_size > 5000
+    found = json.loads(commands.run("inspect", lab, "--json").stdout)
+    assert found["missing"] == ["flat 1", "counts", "tags"] and found["captures"][0]["detections"] == int(bits().sum())
+    assert found["captures"][1]["detections"] is None

@@ -465,8 +465,8 @@ def test_a_raw_file_of_a_spad512(tmp_path: Path) -> None:
     ("name", "change", "said", "says"),
     [
         ("a.npy", lambda p: np.save(p, np.array([{}], object)), CLOCK, "damaged"),
-        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), 0.5)), replace(CLOCK, bits=3), "0.5 stands in the frames"),
-        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), np.nan)), replace(CLOCK, bits=3), "nan stands in the frames"),
+        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), 0.5)), replace(CLOCK, bits=3), "on hold 0.5"),
+        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), np.nan)), replace(CLOCK, bits=3), "on hold nan"),
         ("a.npy", lambda p: np.save(p, np.zeros((2, 3, 4), complex)), CLOCK, "complex128"),
         ("a.npy", lambda p: np.save(p, np.zeros((2, 3))), CLOCK, "(frames, rows, columns)"),
         ("a.npy", lambda p: np.save(p, np.asfortranarray(bits())), replace(CLOCK, packed=True), "Fortran"),
@@ -476,8 +476,8 @@ def test_a_raw_file_of_a_spad512(tmp_path: Path) -> None:
         ("a.npy", lambda p: p.write_bytes(huge_npy()), CLOCK, "damaged or cut short"),
         ("a.npy", lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n"), CLOCK, "this is a PNG image"),
         ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), -1)), CLOCK, "numbers other than 0 and 1"),
-        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), -1)), replace(CLOCK, bits=3), "-1 stands in the frames"),
-        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), 9)), replace(CLOCK, bits=3), "9 stands in the frames"),
+        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), -1)), replace(CLOCK, bits=3), "on hold -1"),
+        ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), 9)), replace(CLOCK, bits=3), "on hold 9"),
         ("a.npy", lambda p: np.save(p, np.zeros((0, 3, 4), bool)), CLOCK, "holds no frame"),
         ("a.npy", lambda p: save(p, bits()), replace(CLOCK, rows=4), "not 4 x 11 pixels"),
         ("a.npy", lambda p: save(p, bits()), replace(CLOCK, frames=7), "holds 20 frames"),
@@ -897,15 +897,15 @@ def test_a_refusal_leaves_nothing_of_its_own(tmp_path: Path) -> None:
     bad[15] = 7
     files = [save(tmp_path / "a.npy", good), save(tmp_path / "b.npy", bad)]
     said = replace(CLOCK, modality="qis")
-    assert "7 stands in the frames" in refusal(files, said)
+    assert "on hold 7" in refusal(files, said)
     assert not (tmp_path / "made").exists()
     (tmp_path / "made").mkdir()
-    assert "7 stands in the frames" in refusal(files, said)
+    assert "on hold 7" in refusal(files, said)
     assert list((tmp_path / "made").iterdir()) == []
     save(files[1], good)
     kept = run(files, said).folder
     (kept / "measurement.yaml").unlink()  # as if it had been stopped before the end
     (kept / "b.h5").unlink()
     save(files[1], bad)
-    assert "7 stands in the frames" in refusal(files, said)
+    assert "on hold 7" in refusal(files, said)
     assert [path.name for path in kept.iterdir()] == ["a.h5"]

@@ -74,7 +74,7 @@ class Took:
         """For people: what it is, then a line of what was left out."""
         c, capture = self.capture.conditions, self.capture
         array = f"{self.shape[0]:,} x {self.shape[1]:,} pixels"
-        parts = [f"{self.detections:,} detections"]
+        parts = [f"{self.detections:,} detection{'s' * (self.detections != 1)}"]
         if self.of_pixels is not None and len(self.of_pixels) > 1:
             parts[0] += f" ({', '.join(f'{n:,}' for n in self.of_pixels)})"
         if self.frames is None:
@@ -133,6 +133,8 @@ def import_files(
     The files are read twice, so that one at a time is in memory: first to know the pixels and to ask for what is
     missing, then to be written. Raises InputError with a sentence.
     """
+    if name is not None:
+        measurement.check_name(name)
     if len(lights) not in (0, 1, len(files)):
         raise SpadError(f"--light: {len(lights)} for {len(files)} files; give it once, or once for each file in order")
     if said.relative_uncertainty is not None and lights and all(lit.level is None for lit in lights):

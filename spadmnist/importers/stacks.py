@@ -168,7 +168,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
     seen = Seen(kind)
 
     def wrong(value: Any, start: int) -> InputError:
-        return InputError(f"{path}: {value} stands in the frames from {start} on, but {why}; correct it")
+        return InputError(f"{path}: the frames from {start} on hold {value}, but {why}; correct it")
 
     def checked(piece: np.ndarray, start: int) -> np.ndarray:
         if found.packed:
@@ -179,7 +179,7 @@ def recording(path: Path, found: Found, said: Said, capture: Capture, layout: La
             return piece
         if piece.dtype.kind == "f" and not (fine := are_whole(piece)).all():
             raise InputError(
-                f"{path}: {piece[~fine][0]:g} stands in the frames from {start} on, {no_whole(piece[~fine][0])}; store "
+                f"{path}: the frames from {start} on hold {piece[~fine][0]:g}, {no_whole(piece[~fine][0])}; store "
                 "what was recorded"
             )
         low, high = int(piece.min(initial=0)), int(piece.max(initial=0))

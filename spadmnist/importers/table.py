@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ class Table(Format):
 
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
-        """Times are read as doubles: exact for whole numbers below 2^53."""
+        """Times are read as they are written, and rounded to ticks once: exact below 2^53 of them."""
         tick = said.tick or PICOSECOND
         channels, ticks = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint64)]
         try:
@@ -62,6 +63,8 @@ class Table(Format):
                 for line, lines, table in _pieces(file, path, head):
                     channel, where = _channels(head, table, shape)
                     time = sum((table[:, i] * _ratio(scale, tick) for i, scale, _ in head.times), np.zeros(len(table)))
+                    if time.max(initial=0) >= _ROUNDED:
+                        time = _exact(lines, head, tick)
                     whole = np.rint(time)
                     fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
                     fine &= (time >= 0) & (whole < _MOST_TICKS)
@@ -80,6 +83,19 @@ class Table(Format):
         facts = {"tick": tick} | ({} if shape is None else {"rows": shape[0], "columns": shape[1]})
         source = "--tick" if said.tick is not None else "a table's times are rounded to it"
         return Found(facts, np.concatenate(channels), np.concatenate(ticks), sources={"tick": source})
+
+
+_ROUNDED = 2.0**49  # ticks from which on a double may round a decimal to another tick
+
+
+def _exact(lines: Sequence[str], head: _Head, tick: float) -> np.ndarray:
+    """(lines that are not empty,) times in ticks, rounded once, from the decimals as they are written."""
+    found = []
+    for line in filter(str.strip, lines):
+        cells = line.replace(",", ".").split(";") if head.separator == ";" else line.split(head.separator)
+        time = sum(Decimal(cells[i].strip()) * Decimal(repr(scale)) for i, scale, _ in head.times)
+        found.append(float((Decimal(time) / Decimal(repr(tick))).to_integral_value()))
+    return np.array(found)
 
 
 def _head(text: str, path: Path) -> _Head:

@@ -7,11 +7,11 @@ uniform images opens as a measurement.
 
 from __future__ import annotations
 
-from .entries import FILE, FORMAT
+from .entries import FILE, FORMAT, check_name
 from .reader import is_measurement, open
 from .type import Measurement
 from .writer import fill, write
 
 open_measurement = open  # its name in the package
 
-__all__ = ["FILE", "FORMAT", "Measurement", "fill", "is_measurement", "open", "open_measurement", "write"]
+__all__ = ["FILE", "FORMAT", "Measurement", "check_name", "fill", "is_measurement", "open", "open_measurement", "write"]

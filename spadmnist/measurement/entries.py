@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo
 
+from ..errors import SpadError
 from ..section import Section
 from ..validated import Irradiance, Length, Lux, Mean, Time, Uncertainty, brief
 
@@ -29,6 +30,14 @@ def _name(raw: object) -> str:
         return raw
     hint = f'; write "{raw}"' if isinstance(raw, (int, float)) and not isinstance(raw, bool) else ""
     raise ValueError(f"{brief(raw)} is not a name: a line of 1 to {_LONGEST} characters{hint}")
+
+
+def check_name(name: str) -> None:
+    """Raise SpadError for a name that a measurement cannot have."""
+    try:
+        _name(name)
+    except ValueError as error:
+        raise SpadError(f"--name: {error}") from None
 
 
 def _inside(raw: object, info: ValidationInfo) -> str:
