@@ -74,7 +74,8 @@ class Said:
         metavar="SHARE",
     )
     rows: int | None = _option(
-        "Of pixels, which are then the channels of the same number.  [default: 1 x channels in use; raw frames: 512 x 512]",
+        "Of pixels, which are then the channels of the same number.  [default: 1 x channels in use, raw frames 512 x "
+        "512]",
         whole=(1, MOST_ROWS),
         names=("height",),
     )

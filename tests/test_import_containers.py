@@ -480,7 +480,7 @@ def test_numbers_that_are_no_counts(tmp_path: Path, value: Any, kind: Any, says:
     elif modality is None:
         assert "are no bits" in text
     else:
-        assert "stands in the frames" in text
+        assert "the frames from" in text
 
 
 @pytest.mark.parametrize(("none", "frame_time", "told"), [(100, 10e-6, False), (0, 10e-6, True), (100, 12e-6, True)])

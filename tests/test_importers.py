@@ -491,7 +491,7 @@ def test_a_raw_file_of_a_spad512(tmp_path: Path) -> None:
         ("a.npz", lambda p: npz_bomb(p), CLOCK, "declares"),
         ("a.tif", lambda p: p.write_bytes(b"II*\0" + bytes(50)), CLOCK, "damaged"),
         ("a.tif", lambda p: p.write_bytes(save(p, bits().astype(np.uint8)).read_bytes()[:300]), CLOCK, "damaged"),
-        ("a.tif", lambda p: save(p, np.full((2, 3, 4), 0.5, np.float32)), replace(CLOCK, bits=3), "0.5 stands in"),
+        ("a.tif", lambda p: save(p, np.full((2, 3, 4), 0.5, np.float32)), replace(CLOCK, bits=3), "on hold 0.5"),
         ("a.bin", lambda p: p.write_bytes(bytes(1000)), CLOCK, "no whole frames of 512 x 512 bits"),
         ("a.bin", lambda p: p.write_bytes(bytes(1000)), replace(CLOCK, columns=12), "multiple of 8"),
         ("a.xyz", lambda p: p.write_bytes(b"hello"), CLOCK, "what can be imported is"),
