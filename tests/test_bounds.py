@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_factory import write_config
 
-from spadmnist import capture_files, config, factory, measurement, plan, store
+from spadmnist import capture_files, config, dataset, factory, measurement, plan, store
 from spadmnist.dataset import Shard
+from spadmnist.disk import Files
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.events import Layout
 from spadmnist.experiment import Level
@@ -191,15 +192,16 @@ def test_levels_are_not_compared_with_each_other(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("format", ["zarr", "hdf5"])
 def test_every_file_has_its_shard(format: str) -> None:
     shards = [Shard("5 mlux", folder, split, k, 0, 1) for folder in ("a", "ab") for split in ("x", "y") for k in (0, 1)]
-    files = {"spadmnist.yaml": 0, "data.zarr/zarr.json": 0, "data.zarr/a/zarr.json": 0}
+    files: Files = {name: {} for name in ("spadmnist.yaml", "data.zarr/zarr.json", "data.zarr/a/zarr.json")}
     for shard in shards:
         place = store.location(shard.path, format)
-        files |= dict.fromkeys([place] if format == "hdf5" else [f"{place}/zarr.json", f"{place}/tr/c.0"], 1)
-    found = factory.files_of(shards, files, format)
+        names = [place] if format == "hdf5" else [f"{place}/zarr.json", f"{place}/tr/c.0"]
+        files |= {name: {} for name in names}
+    found = dataset.files_by_shard(files, format)
     for shard in shards:
         place = store.location(shard.path, format)
-        assert list(found[shard.path]) == [n for n in files if n == place or n.startswith(f"{place}/")]
-        assert found[shard.path]
+        assert list(found[place]) == [n for n in files if n == place or n.startswith(f"{place}/")]
+        assert found[place]
 
 
 def test_what_does_not_fit_into_memory_is_refused_alike_before_and_in_a_run(

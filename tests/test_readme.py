@@ -80,7 +80,7 @@ class Block:
     @property
     def lacking(self) -> str:
         """What it needs and this machine has not, or nothing."""
-        if "import torch" in self.text and importlib.util.find_spec("torch") is None:
+        if re.search(r"import torch|\bst\.", self.text) and importlib.util.find_spec("torch") is None:
             return "PyTorch is not installed"
         if "spad_mnist.yaml" in self.text and not MNIST.is_dir():
             return f"MNIST's four files are not in {MNIST}"
