@@ -280,3 +280,21 @@ def test_decimals_are_rounded_once(tmp_path: Path) -> None:
     again.write_text(path.read_text())
     events = back(run(again, Said(exposure=9001.0))).events
     assert events is not None and events.ticks is not None and int(events.ticks[0]) == 9 * 10**15 + 1
+
+
+def test_channels_of_a_file_that_says_how_many_there_are(tmp_path: Path) -> None:
+    """Those that are chosen are the pixels, as 1 x n or as the user says; the others are left out, and said."""
+    time, pixel = np.array([5, 3, 9, 2]), np.array([0, 1, 2, 2])
+    for name, more, shape in (("a", {}, (1, 2)), ("b", {"rows": 2, "columns": 1}, (2, 1))):
+        path = made_in(tmp_path, name) / "a.npz"
+        np.savez(path, time=time, pixel=pixel, tick=1e-9, rows=1, columns=3)
+        made = run(path, replace(SECOND, channels=("2", "0"), **more))
+        assert made.took[0].shape == shape and made.took[0].of_pixels == (2, 1)
+        assert made.took[0].left_out == ("1 detections of the channel 1 (--channels)",)
+
+
+def test_raw_frames_that_begin_as_gzip(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"\x1f\x8b\x08" + bytes(13))
+    made = run(path, replace(CLOCK, rows=2, columns=8))
+    assert any("begins as a file that gzip packed" in note for note in made.notes)

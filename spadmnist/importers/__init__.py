@@ -193,7 +193,7 @@ def recognise(path: Path) -> type[Format]:
     if not head:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")
     kinds = formats()
-    if head.startswith(_GZIP) and not any(path.suffix.lower() in kind.ends for kind in kinds if kind.binary):
+    if head.startswith(GZIP) and not any(path.suffix.lower() in kind.ends for kind in kinds if kind.binary):
         name = quoted(path.name)
         raise InputError(f"{path}: is packed by gzip; unpack it (gunzip -k {name}) and import what comes out")
     for kind in kinds:
@@ -205,7 +205,7 @@ def recognise(path: Path) -> type[Format]:
     raise InputError(f"{path}: this is {image_files.looks_like(head)}; what can be imported is {known}")
 
 
-_GZIP = b"\x1f\x8b\x08"
+GZIP = b"\x1f\x8b\x08"
 _OLD_MATLAB = b"MATLAB 5.0"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 

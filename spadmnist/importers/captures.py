@@ -343,7 +343,7 @@ def _described(
     known = {**found.facts, **told}
     if said.tick is not None and found.facts.get("tick", said.tick) != said.tick:
         raise InputError(f"{path}: has ticks of {units.show(found.facts['tick'], 's')}; leave out --tick")
-    for key in ("rows", "columns", "bits"):
+    for key in ("bits",) if said.channels is not None else ("rows", "columns", "bits"):
         if getattr(said, key) is not None and found.facts.get(key, getattr(said, key)) != getattr(said, key):
             raise InputError(f"{path}: says that its {key} are {found.facts[key]}; leave out {word(key)}")
     if said.counting == "frames" and found.facts.get("counter"):
@@ -437,7 +437,9 @@ def _alike(one: Light, other: Light) -> bool:
 
 def _shape(path: Path, found: Found, said: Said) -> tuple[int, int] | None:
     """Rows and columns as the user or the file says; None where the channels in use are to become pixels."""
-    rows, columns = (getattr(said, key) or found.facts.get(key) for key in ("rows", "columns"))
+    # of channels that the user chooses the file does not know how they lie
+    known = {} if found.frames is None and said.channels is not None else found.facts
+    rows, columns = (getattr(said, key) or known.get(key) for key in ("rows", "columns"))
     if found.frames is None:
         return (rows or 1, columns or 1) if rows or columns else None
     held = found.frames.shape[1:]

@@ -17,6 +17,7 @@ from ..import_options import BITS, STACKS
 from ..recording import MODALITIES
 from . import (
     FACTS,
+    GZIP,
     LARGEST_PIECE,
     Format,
     Found,
@@ -158,7 +159,10 @@ class Tif(Format):
         except Exception as error:  # damaged files make it raise nearly anything
             raise damaged(path, error) from None
         if colours > 1:
-            raise InputError(f"{path}: has {colours} channels (ImageJ), one after the other; store each by itself")
+            raise InputError(
+                f"{path}: has {colours} channels (ImageJ), one after the other; store each by itself, or, where they "
+                "are frames, store it with frames (axes TYX)"
+            )
         if len(shape) != 2 or dtype is None or dtype.kind not in "iubf" or declared > count:
             raise InputError(
                 f"{path}: its {count} pages are {dtype} of the shape {shape}; store a page of whole numbers, rows x "
@@ -246,6 +250,7 @@ class Raw(Format):
         if each > LARGEST_PIECE:
             raise InputError(f"{path}: a frame of {rows} x {columns} pixels is more than can be read; give others")
         with open(path, "rb") as file:
+            packed = file.read(3) == GZIP
             file.seek(max(0, size - 4))
             size -= 4 if size % each == 4 % each and file.read(4) == b"DONE" else 0
         if size == 0 or size % each:
@@ -257,6 +262,6 @@ class Raw(Format):
         stack = frames_in_file(path, 0, dtype, (size // each, *shape))
         sized = f"{rows} x {columns} " + ("as said" if said.rows and said.columns else "where nothing else is said")
         sources = dict.fromkeys(("rows", "columns"), sized)
-        return Found(
-            {"rows": rows, "columns": columns}, frames=stack, bits=not counts, packed=not counts, sources=sources
-        )
+        notes = ("begins as a file that gzip packed; if it is one, unpack it and import what comes out",) * packed
+        known = {"rows": rows, "columns": columns}
+        return Found(known, frames=stack, bits=not counts, packed=not counts, sources=sources, notes=notes)
