@@ -13,6 +13,7 @@ import io
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -1060,7 +1061,10 @@ def main(arguments: list[str] | None = None) -> None:
     _open_streams()
     interrupts.install()
     try:
-        with safe_path():
+        with safe_path(), warnings.catch_warnings():
+            # libraries warn programmers; what a user should know is said in a sentence. Tests raise what numpy warns of
+            if not os.environ.get("SPADMNIST_DEBUG") and not sys.warnoptions:
+                warnings.simplefilter("ignore")
             status = _run(arguments)
     except KeyboardInterrupt:  # between the verb and its end
         status = interrupts.status()

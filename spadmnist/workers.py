@@ -21,8 +21,10 @@ def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
 
     from . import compiled
 
-    # the tracker that cleans up behind workers need not tell people that it did
-    quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")}
+    # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers does so, too
+    debugging = os.environ.get("SPADMNIST_DEBUG")
+    silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
+    quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
     with safe_path(), _environment({**quiet, **compiled.for_workers()}):  # noqa: SIM117
         with Parallel(n_jobs=jobs, **options) as parallel:
             yield parallel

@@ -615,3 +615,29 @@ def test_an_end_in_the_middle_of_compiled_code_is_no_fault(
     assert command_line._run([]) == code
     said = capfd.readouterr().err
     assert "fault" not in said and ("Interrupted" in said) == (number == signal.SIGINT)
+
+
+def test_no_warning_of_a_library_reaches_a_user(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Not where it is raised in the verb; a programmer sees it with SPADMNIST_DEBUG, or with -W."""
+    import warnings
+
+    from spadmnist import cli as command_line
+
+    def warned(*given: object, **more: object) -> None:
+        warnings.warn("A worker stopped while some jobs were given to the executor.", UserWarning, stacklevel=1)
+        warnings.warn("divide by zero encountered in divide", RuntimeWarning, stacklevel=1)
+
+    monkeypatch.setattr(command_line.cli, "main", warned)
+    monkeypatch.setattr(command_line.interrupts, "install", lambda: None)
+    monkeypatch.setattr(sys, "warnoptions", [])
+    for debugging, says in (("", False), ("1", True)):
+        monkeypatch.setenv("SPADMNIST_DEBUG", debugging)
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.showwarning = lambda message, *_: print(message, file=sys.stderr)
+            with pytest.raises(SystemExit) as caught:
+                command_line.main([])
+        assert caught.value.code == 0
+        assert ("divide by zero" in capfd.readouterr().err) == says
