@@ -188,7 +188,7 @@ def _quick(said: str) -> bool:
 
 
 def import_words(said: Said) -> list[str]:
-    """What the command line is told, for what the library is told."""
+    """The options of the command line that say the same as arguments of the library."""
     words = []
     for name in said.given:
         option, value = options()[name], getattr(said, name)

@@ -95,7 +95,7 @@ def compiling(say: Callable[[], None]) -> Iterator[None]:
 
 
 class _Compiling(event.Listener):
-    """numba tells of what it compiles, and not of what it finds compiled."""
+    """Listens to numba, which reports what it compiles, and nothing where it loads what was compiled before."""
 
     def __init__(self, say: Callable[[], None]):
         self.depth, self.timer = 0, threading.Timer(_SILENCE, lambda: say() if self.depth else None)

@@ -60,7 +60,7 @@ def test_a_file_of_a_capture_that_is_there_is_no_other_capture(tmp_path: Path) -
     assert fill(lab, dark, flat).missing == ("bright",)  # again for what is missing
     with pytest.raises(SpadError, match="flat has other data already"):
         fill(lab, table(tmp_path / "new" / "flat.csv", "0,8"))
-    with pytest.raises(SpadError, match=r"x\.csv, y\.csv: not named as a capture is, and 1 captures are missing"):
+    with pytest.raises(SpadError, match=r"x\.csv, y\.csv: not named as a capture is, and 1 capture is missing"):
         fill(lab, table(tmp_path / "x.csv", "0,8"), table(tmp_path / "y.csv", "0,8"))
 
 

@@ -85,10 +85,6 @@ class Search:
         self._out.add(change.name)
         self.not_tried(change.kind, change.effect, change.parameter, where, why)
 
-    def possible(self) -> list[Change]:
-        """Every candidate beside the sensor as it is stated, but those that are excluded."""
-        return self._beside(self.bench.start)
-
     def _beside(self, sensor: Sensor) -> list[Change]:
         return [change for change in changes(sensor) if change.name not in self._out]
 

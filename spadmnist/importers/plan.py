@@ -53,7 +53,8 @@ def match(plan: Measurement, files: Sequence[Path], ids: Sequence[str]) -> list[
     rest = [id for id in missing if id not in named]
     unnamed = [path for path, id in zip(files, named, strict=True) if id is None]
     if unnamed and len(unnamed) != len(rest):
-        which = f"{len(rest)} captures are missing ({', '.join(rest)})" if rest else "no other capture is missing"
+        are = "capture is" if len(rest) == 1 else "captures are"
+        which = f"{len(rest)} {are} missing ({', '.join(rest)})" if rest else "no other capture is missing"
         names = ", ".join(path.name for path in unnamed[:8])
         raise SpadError(
             f"{plan.source}: {names}: not named as a capture is, and {which}; say which captures the files are with "
