@@ -1,9 +1,8 @@
 """What the hidden-effect challenge hides: the laboratory, effects, set-up faults, and the list of cases.
 
-Difficulty is an oracle's significance Z: that of somebody who knows which effect is there, its shape and its size, but
-not the level of the light. Each effect says below how Z follows from the expected numbers of detections; the strength
-of the effect is then solved for the Z of its tier. These are signal-to-noise arguments, good to about a third, not
-refits of every data set: tiers are wide.
+Difficulty is Z of `challenge_oracle`: what the best test reaches that knows an effect's family and strength, but not
+what chance made of it. Each effect says below how Z follows from the expected numbers of detections; the strength of
+the effect is then solved for the Z of its tier. Tiers are wide, for Z is good to about a third.
 """
 
 from __future__ import annotations
@@ -19,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri_exp
 
 sys.path.insert(0, str(Path(__file__).parent))
+import challenge_oracle as oracle
 from challenge_generator import Capture, Traps, World, photon_rate
+from challenge_oracle import LAGS, band, followers, gain, if_any
 
 NANOWATT = 1e-5  # W/m^2 in one nW/cm^2
 LIGHT_UNCERTAINTY = 0.015
@@ -215,84 +215,6 @@ def changed(change: str, effect: str, parameter: str) -> list[dict[str, Any]]:
 UNKNOWN: list[dict[str, Any]] = [{"change": "unknown", "effect": None, "parameter": None}]
 
 
-# ---- an oracle's significance -----------------------------------------------------------------------------
-
-
-def gain(background: Any, extra: Any) -> Any:
-    """Expected log likelihood ratio of a Poisson number with `extra` against one with the background alone."""
-    total = background + extra
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(total > 0, total * np.log(total / background), 0.0) - extra
-
-
-LAGS = np.geomspace(1e-11, 1e-2, 1500)  # s
-
-
-def followers(lab: Lab, extra: Any, base: Any = 0.0) -> float:
-    """Z of an excess hazard `extra` (1/s, at LAGS) that follows each detection, on the rate and `base`."""
-    total = 0.0
-    for capture in lab.stated:
-        rate = lab.rate(capture)
-        per_detection = np.trapezoid(gain(rate + base, extra) * np.exp(-rate * LAGS), LAGS)
-        total += 2 * lab.pixels * lab.detections(capture) * per_detection
-    return math.sqrt(total)
-
-
-def band(mean: float, shortest: float, longest: float) -> np.ndarray:
-    """Hazard (1/s, at LAGS) of releases from traps with lifetimes between two limits."""
-    lifetimes = np.geomspace(shortest, longest, 25)
-    return mean * np.mean([np.exp(-LAGS / tau) / tau for tau in lifetimes], axis=0)
-
-
-def later_frames(lab: Lab, mean: float, lifetimes: Iterable[float]) -> float:
-    """Z of releases in later frames: frame k after a detection fires more often than others."""
-    taus = np.array(list(lifetimes))
-    total = 0.0
-    for capture in lab.stated:
-        x = lab.rate(capture) * capture.frame_time
-        fires, k = -math.expm1(-x), np.arange(60)[:, None]
-        ratio = capture.frame_time / taus
-        share = ((1 - np.exp(-ratio)) ** 2 / ratio * np.exp(-k * ratio)).mean(axis=1)
-        total += 2 * lab.pixels * lab.detections(capture) * float(gain(fires, mean * share * (1 - fires)).sum())
-    return math.sqrt(total)
-
-
-def of_map(noncentrality: float, freedom: int) -> float:
-    """Z of a pattern whose shape is not known: chi-squared of many pixels, never better than a known pattern's."""
-    return min(math.sqrt(noncentrality), noncentrality / math.sqrt(2 * freedom))
-
-
-def light_map(lab: Lab, relative: np.ndarray) -> float:
-    """Sum over captures and pixels of (relative change / its error)^2, the common level left free."""
-    deviation = relative / relative.mean() - 1
-    return sum(lab.weight(c) * lab.share(c) ** 2 for c in lab.lit) * float((deviation**2).sum())
-
-
-def all_lit(lab: Lab, power: float) -> float:
-    """Sum over lit captures of detections * share^2 * power: a known swing of the light with this mean square."""
-    return sum(lab.pixels * lab.weight(c) * lab.share(c) ** 2 for c in lab.lit) * power
-
-
-def random_level(length: float, relative: float, hold: float, weight: float) -> float:
-    """Square of the Z of a level that jumps at random, its correlation falling as exp(-t / hold).
-
-    relative: variance of the level over its mean's square; weight: detections in so long a time. Nobody knows when it
-    jumps: by the likelihood of the powers of its spectrum (Whittle), but for what the mean alone would tell.
-    """
-    k = np.arange(1, max(50, math.ceil(5 * length / hold)))
-    power = relative * weight * 2 * hold / length / (1 + (2 * np.pi * k * hold / length) ** 2)
-    return 2 * float((power - np.log1p(power)).sum())
-
-
-def edge(lab: Lab, width: float) -> float:
-    """Z of detections within `width` of the end of the dead time that one model has and the other has not.
-
-    2 per detection; less where the converter's ticks, which blur an interval by about two, are wider.
-    """
-    found = sum(lab.pixels * lab.detections(c) * lab.rate(c) * width for c in lab.stated)
-    return math.sqrt(2 * found * width / (width + 2 * TICK))
-
-
 # ---- what can be hidden -----------------------------------------------------------------------------------
 
 
@@ -356,6 +278,70 @@ def afterpulsing_set(lab: Lab, x: float) -> Hidden:
     )
 
 
+@hides(EFFECTS, "tr", 1e-3, 3.0)
+def lifetime_set(lab: Lab, x: float) -> Hidden:
+    """The data sheet's afterpulses, released later or sooner than it says."""
+    lab.afterpulses(AFTERPULSES)
+    value = LIFETIME * math.exp(x if lab.rng.random() < 0.5 else -x)
+    lab.world.traps = [Traps(AFTERPULSES, value, value, single=True)]
+    stated = band(AFTERPULSES, LIFETIME, LIFETIME)
+    z = followers(lab, band(AFTERPULSES, value, value) - stated, stated)
+    truth = changed("set", "afterpulsing", "lifetime")
+    return Hidden(
+        z, "intervals: hazard unlike the data sheet's", truth, {"lifetime": value}, {"afterpulsing.lifetime": value}
+    )
+
+
+@hides(EFFECTS, "tr qis str", 1e-4, 20.0)
+def dark_counts_set(lab: Lab, x: float) -> Hidden:
+    """Another dark count rate than the data sheet's in every pixel: a warmer chip, or a cooler one."""
+    stated = FAMILIES[lab.family]["dark"]
+    ratio = math.exp(x if lab.rng.random() < 0.5 else -x)
+    lab.world.dark_rate = lab.world.dark_rate * ratio
+    expected = lab.pixels * lab.detections(lab.stated[0])
+    z = math.sqrt(2 * float(gain(expected, expected * (ratio - 1))))
+    value = {"dark_counts.rate": stated * ratio}
+    return Hidden(z, "level of the dark capture", changed("set", "dark_counts", "rate"), {"ratio": ratio}, value)
+
+
+STATED_CROSSTALK, CROSSTALK_DELAY = 0.002, 0.6e-9  # a side neighbour's chance and the mean delay of a data sheet
+
+
+@hides(EFFECTS, "tr qis str", 1e-6, 0.05)
+def crosstalk_set(lab: Lab, x: float) -> Hidden:
+    """More crosstalk than the data sheet says; diagonal neighbours and the delay as it says."""
+    stated, real = STATED_CROSSTALK, STATED_CROSSTALK + x
+    sheet = {"probability": stated, "diagonal_ratio": 0.16}
+    if lab.family == "tr":
+        sheet["delay"] = f"{CROSSTALK_DELAY * 1e9:g} ns"
+    lab.effects["crosstalk"] = sheet
+    near = {(dx, dy): 1.0 if dx * dy == 0 else 0.16 for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy}
+    lab.world.crosstalk = {place: real * ratio for place, ratio in near.items()}
+    lab.world.crosstalk_delay = CROSSTALK_DELAY
+    ratios = np.array(list(near.values()))
+    if lab.family == "tr":
+        hazard = np.exp(-LAGS / CROSSTALK_DELAY) / CROSSTALK_DELAY
+        z = math.sqrt(sum(followers(lab, x * r * hazard, stated * r * hazard) ** 2 for r in ratios))
+    else:
+        z = oracle.within_frames(lab, x * ratios)
+    truth = changed("set", "crosstalk", "probability")
+    return Hidden(
+        z, "pairs of pixels: beyond the data sheet's", truth, {"probability": real}, {"crosstalk.probability": real}
+    )
+
+
+@hides(EFFECTS, "tr")
+def resolution_set(lab: Lab, x: float) -> Hidden:
+    """The converter's steps are coarser than the data sheet says and than the file's ticks."""
+    del x
+    coarse = int(lab.rng.integers(2, 5))
+    lab.world.code_widths = (float(coarse), *[0.0] * (coarse - 1))
+    n = sum(lab.pixels * lab.detections(c) for c in lab.stated)
+    truth = changed("set", "tdc", "resolution")
+    value = {"tdc.resolution": coarse * TICK}
+    return Hidden(math.sqrt(2 * n * math.log(coarse)), "ticks that never come", truth, {"ticks": coarse}, value)
+
+
 @hides(EFFECTS, "tr qis str", 1e-6, 0.5)
 def slow_afterpulsing(lab: Lab, x: float) -> Hidden:
     middle = float(np.exp(lab.rng.uniform(math.log(1.5e-6), math.log(12e-6))))
@@ -366,7 +352,8 @@ def slow_afterpulsing(lab: Lab, x: float) -> Hidden:
     if lab.family == "tr":
         z, argument = followers(lab, band(x, short, long)), "intervals: excess hazard of the trap band"
     else:
-        z, argument = later_frames(lab, x, np.geomspace(short, long, 9)), "frames after a detection fire more often"
+        z = oracle.later_frames(lab, x, np.geomspace(short, long, 9))
+        argument = "frames after a detection fire more often"
     near = {"slow_afterpulsing.probability": x, "slow_afterpulsing.lifetime": (long - short) / math.log(long / short)}
     return Hidden(z, argument, added("slow_afterpulsing"), {"mean": x, "band": [short, long]}, near=near)
 
@@ -388,11 +375,8 @@ def crosstalk(lab: Lab, x: float) -> Hidden:
         z = math.sqrt(sum(followers(lab, chance * hazard) ** 2 for chance in table.values()))
         argument = "pairs of pixels: excess within the delay"
     else:
-        total = 0.0
-        for c in lab.stated:
-            correlation = 2 * np.array(list(table.values())) * math.exp(-lab.rate(c) * c.frame_time)
-            total += 0.5 * lab.pixels * c.frames * float((correlation**2).sum())
-        z, argument = math.sqrt(total), "pairs of pixels: correlation 2 c exp(-lambda T_f) within a frame"
+        z = oracle.within_frames(lab, np.array(list(table.values())))
+        argument = "pairs of pixels: correlation 2 c exp(-lambda T_f) within a frame"
     return Hidden(
         z,
         argument,
@@ -407,7 +391,7 @@ def crosstalk(lab: Lab, x: float) -> Hidden:
 def dead_time_set(lab: Lab, x: float) -> Hidden:
     sign = 1 if lab.rng.random() < 0.5 else -1
     lab.world.dead_time = value = DEAD_TIME + sign * x
-    z = edge(lab, x)
+    z = oracle.edge(lab, x, TICK)
     return Hidden(
         z,
         "detections in the shifted edge",
@@ -420,10 +404,16 @@ def dead_time_set(lab: Lab, x: float) -> Hidden:
 @hides(EFFECTS, "tr", 1e-12, 12e-9)
 def dead_time_spread(lab: Lab, x: float) -> Hidden:
     shift = x * lab.rng.standard_normal(lab.pixels).clip(-3, 3)
-    lab.world.dead_time = DEAD_TIME + shift
-    z = edge(lab, float(np.abs(shift).mean()))
+    lab.world.dead_time = lab.world.dead_time + shift
+    telling = oracle.edge_detections(lab, np.abs(shift), TICK)
+    # what comes too early tells by itself; what is missing, against what another pixel has too much
+    twice = np.where(shift < 0, telling, np.log(np.cosh(telling)))
+    z = math.sqrt(2 * float(twice.sum()))
     return Hidden(
-        z, "detections in each pixel's shifted edge", changed("per_pixel", "dead_time", "duration"), {"sigma": x}
+        z,
+        "detections in each pixel's shifted edge, its direction unknown",
+        changed("per_pixel", "dead_time", "duration"),
+        {"sigma": x},
     )
 
 
@@ -462,17 +452,17 @@ def blinking(lab: Lab, x: float) -> Hidden:
     chosen = lab.rng.choice(lab.pixels, lab.pixels // 12, replace=False)
     on, off = lab.rng.uniform(3, 10), lab.rng.uniform(3, 10)
     lab.world.defects = [(int(p), x * k, on * r, off * r) for p in chosen for k, r in ((1.0, 1.0), (0.5, 2.0))]
-    total, up = 0.0, on / (on + off)
+    each, up = 0.0, on / (on + off)
     for c in lab.stated:
         for k, r in ((1.0, 1.0), (0.5, 2.0)):
             rate = lab.rate(c) + 1.5 * x * up
             relative = (k * x / rate) ** 2 * up * (1 - up)
-            total += len(chosen) * random_level(c.length, relative, 1 / (r * (on + off)), rate * c.length)
+            each += oracle.random_level(c.length, relative, 1 / (r * (on + off)), rate * c.length) / 2
     settings = {"pixels": len(chosen), "rate": x, "on": on, "off": off}
     near = {"blinking_dark_counts.amplitude": x, "blinking_dark_counts.fraction": len(chosen) / lab.pixels}
     return Hidden(
-        math.sqrt(total),
-        "spectra of pixels whose level jumps at random",
+        oracle.some_of(each, len(chosen), lab.pixels),
+        "spectra of pixels whose level jumps at random, which is unknown",
         added("blinking_dark_counts"),
         settings,
         near=near,
@@ -482,9 +472,15 @@ def blinking(lab: Lab, x: float) -> Hidden:
 @hides(EFFECTS, "tr qis str", 1e-4, 0.3)
 def pdp_spread(lab: Lab, x: float) -> Hidden:
     factor = 1 + x * lab.rng.standard_normal(lab.pixels).clip(-3, 3)
-    lab.world.pdp_factor = factor / factor.mean()
-    z = of_map(light_map(lab, factor), lab.pixels - 1)
-    return Hidden(z, "chi-squared of the map", changed("per_pixel", "detection", "pdp"), {"sigma": x})
+    factor /= factor.mean()
+    lab.world.pdp_factor = lab.world.pdp_factor * factor
+    precision = oracle.light_errors(lab)
+    z = oracle.normal_pattern(precision * (factor - 1), precision * x)
+    return Hidden(z, "likelihood of a normal spread", changed("per_pixel", "detection", "pdp"), {"sigma": x})
+
+
+LOSSES = np.linspace(0.7, 1.0, 9)  # of lazy pixels, in units of the greatest
+EXCESSES = np.linspace(0.3, 1.7, 29)  # of hot pixels, in units of their mean
 
 
 @hides(EFFECTS, "tr qis", 1e-3, 0.95)
@@ -492,21 +488,27 @@ def lazy_pixels(lab: Lab, x: float) -> Hidden:
     factor = np.ones(lab.pixels)
     chosen = lab.rng.choice(lab.pixels, max(3, lab.pixels // 40), replace=False)
     factor[chosen] = 1 - x * lab.rng.uniform(0.7, 1.0, chosen.size)
-    lab.world.pdp_factor = factor
-    z = of_map(light_map(lab, factor), lab.pixels - 1)
+    lab.world.pdp_factor = lab.world.pdp_factor * factor
+    precision, mean = oracle.light_errors(lab), factor.mean()
+    values, chances = few(chosen.size, lab.pixels, 1 - x * LOSSES)
+    z = oracle.drawn_pattern(precision * (factor / mean - 1), precision * (values / mean - 1), chances)
     return Hidden(
-        z, "chi-squared of the map", changed("per_pixel", "detection", "pdp"), {"pixels": chosen.size, "loss": x}
+        z,
+        "likelihood of a few pixels with a loss",
+        changed("per_pixel", "detection", "pdp"),
+        {"pixels": chosen.size, "loss": x},
     )
 
 
 @hides(EFFECTS, "tr qis", 1e-3, 3.0)
 def dark_spread(lab: Lab, x: float) -> Hidden:
     factor = np.exp(x * lab.rng.standard_normal(lab.pixels))
-    factor /= factor.mean()  # another mean would be another finding
-    lab.world.dark_rate = FAMILIES[lab.family]["dark"] * factor
-    expected = lab.detections(lab.stated[0])
-    z = of_map(2 * float(gain(expected, expected * (factor - 1)).sum()), lab.pixels - 1)
-    return Hidden(z, "deviance of the dark map", changed("per_pixel", "dark_counts", "rate"), {"sigma of log": x})
+    lab.world.dark_rate = lab.world.dark_rate * factor / factor.mean()  # another mean would be another finding
+    spread = np.exp(x * oracle.HERMITE - x**2 / 2)
+    z = oracle.drawn_counts(lab.detections(lab.stated[0]), factor / factor.mean(), spread, oracle.WEIGHTS)
+    return Hidden(
+        z, "likelihood of a lognormal spread", changed("per_pixel", "dark_counts", "rate"), {"sigma of log": x}
+    )
 
 
 @hides(EFFECTS, "tr qis", 1e-2, 1e4)
@@ -514,12 +516,21 @@ def hot_pixels(lab: Lab, x: float) -> Hidden:
     factor = np.ones(lab.pixels)
     chosen = lab.rng.choice(lab.pixels, max(3, lab.pixels // 50), replace=False)
     factor[chosen] = 1 + x * lab.rng.uniform(0.3, 1.7, chosen.size)
-    lab.world.dark_rate = FAMILIES[lab.family]["dark"] * factor
-    expected = lab.detections(lab.stated[0])
-    z = of_map(2 * float(gain(expected, expected * (factor - 1)).sum()), lab.pixels - 1)
+    lab.world.dark_rate = lab.world.dark_rate * factor
+    values, chances = few(chosen.size, lab.pixels, 1 + x * EXCESSES)
+    z = oracle.drawn_counts(lab.detections(lab.stated[0]), factor, values, chances)
     return Hidden(
-        z, "deviance of the dark map", changed("per_pixel", "dark_counts", "rate"), {"pixels": chosen.size, "times": x}
+        z,
+        "likelihood of a few pixels with an excess",
+        changed("per_pixel", "dark_counts", "rate"),
+        {"pixels": chosen.size, "times": x},
     )
+
+
+def few(chosen: int, pixels: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(factors, their chances) where so many of the pixels have one of the values, the others 1."""
+    share = chosen / pixels
+    return np.append(values, 1.0), np.append(np.full(values.size, share / values.size), 1 - share)
 
 
 @hides(EFFECTS, "tr qis str", 1e-4, 0.8)
@@ -529,8 +540,9 @@ def gradient(lab: Lab, x: float) -> Hidden:
     w = lab.world
     u = np.linspace(-0.5, 0.5, w.columns)[None, :]
     v = np.linspace(-0.5, 0.5, w.rows)[:, None]
-    w.illumination = (1 + along_x * u + along_y * v).ravel()
-    z = math.sqrt(light_map(lab, w.illumination))
+    falls = (1 + along_x * u + along_y * v).ravel()
+    w.illumination = w.illumination * falls
+    z = math.sqrt(oracle.light_map(lab, falls))
     parameters = {"illumination_gradient.x": along_x, "illumination_gradient.y": along_y}
     return Hidden(
         z, "a known slope over the map", added("illumination_gradient"), {"x": along_x, "y": along_y}, parameters
@@ -541,18 +553,22 @@ def gradient(lab: Lab, x: float) -> Hidden:
 def rows(lab: Lab, x: float) -> Hidden:
     w = lab.world
     gains = 1 + x * lab.rng.standard_normal(w.rows).clip(-3, 3)
-    w.pdp_factor = np.repeat(gains / gains.mean(), w.columns)
-    z = of_map(light_map(lab, w.pdp_factor), w.rows - 1)
-    return Hidden(z, "chi-squared of the rows", added("row_pattern"), {"sigma": x})
+    gains /= gains.mean()
+    w.pdp_factor = w.pdp_factor * np.repeat(gains, w.columns)
+    precision = oracle.light_errors(lab) * math.sqrt(w.columns)
+    z = oracle.normal_pattern(precision * (gains - 1), precision * x)
+    return Hidden(z, "likelihood of a normal spread of the rows", added("row_pattern"), {"sigma": x})
 
 
 @hides(EFFECTS, "tr qis", 1e-4, 0.25)
 def columns(lab: Lab, x: float) -> Hidden:
     w = lab.world
     gains = 1 + x * lab.rng.standard_normal(w.columns).clip(-3, 3)
-    w.pdp_factor = np.tile(gains / gains.mean(), w.rows)
-    z = of_map(light_map(lab, w.pdp_factor), w.columns - 1)
-    return Hidden(z, "chi-squared of the columns", added("column_pattern"), {"sigma": x})
+    gains /= gains.mean()
+    w.pdp_factor = w.pdp_factor * np.tile(gains, w.rows)
+    precision = oracle.light_errors(lab) * math.sqrt(w.rows)
+    z = oracle.normal_pattern(precision * (gains - 1), precision * x)
+    return Hidden(z, "likelihood of a normal spread of the columns", added("column_pattern"), {"sigma": x})
 
 
 @hides(EFFECTS, "tr qis", 0.1, 5e3)
@@ -577,11 +593,11 @@ def flicker(lab: Lab, x: float) -> Hidden:
     lab.world.lamp.swing = x
     lab.world.lamp.frequency = frequency = float(lab.rng.choice([100.0, 120.0, 200.0, 300.0]))
     seen = [lab.pixels * lab.weight(c) * lab.share(c) ** 2 for c in lab.lit if c.length * frequency > 1]
-    z = math.sqrt(sum(seen) * x**2 / 2)
+    z = math.sqrt(sum(oracle.sine(x * math.sqrt(weight / 2)) for weight in seen))
     settings = {"swing": x, "frequency": frequency, "second harmonic": 0.1 * x}
     return Hidden(
         z,
-        "a known sine in captures of more than a period",
+        "a sine of known frequency in captures of more than a period",
         added("flicker"),
         settings,
         {"flicker.frequency": frequency},
@@ -594,7 +610,7 @@ def drift(lab: Lab, x: float) -> Hidden:
     lab.world.lamp.warming = x * (1 if lab.rng.random() < 0.5 else -1)
     t = np.linspace(0, 1, 1001)
     rise = (1 - np.exp(-1.5 * t)) / (1 - math.exp(-1.5))
-    z = math.sqrt(all_lit(lab, x**2 * float(rise.var())))
+    z = math.sqrt(oracle.all_lit(lab, x**2 * float(rise.var())))
     return Hidden(
         z,
         "a known rise in every lit capture",
@@ -609,7 +625,7 @@ def source_noise(lab: Lab, x: float) -> Hidden:
     """A lamp that jumps between levels: its correlation falls as exp(-t / hold), its coherence time is twice that."""
     lab.world.lamp.contrast = x
     lab.world.lamp.hold = hold = float(np.exp(lab.rng.uniform(math.log(40e-6), math.log(400e-6))))
-    total = sum(random_level(c.length, x * lab.share(c) ** 2, hold, lab.pixels * lab.weight(c)) for c in lab.lit)
+    total = sum(oracle.random_level(c.length, x * lab.share(c) ** 2, hold, lab.pixels * lab.weight(c)) for c in lab.lit)
     settings = {"contrast": x, "hold": hold}
     return Hidden(
         math.sqrt(total),
@@ -625,7 +641,7 @@ def source_noise(lab: Lab, x: float) -> Hidden:
 def jitter(lab: Lab, x: float) -> Hidden:
     lab.world.jitter = x
     # the edge is a step of height lambda, smeared by two stamps' jitter: half of a mean |N| on its wrong side
-    z = edge(lab, math.sqrt(2) * x / math.sqrt(2 * math.pi))
+    z = oracle.edge(lab, math.sqrt(2) * x / math.sqrt(2 * math.pi), TICK)
     return Hidden(z, "detections before the edge of the dead time", added("jitter"), {"sigma": x}, {"jitter.sigma": x})
 
 
@@ -634,8 +650,10 @@ def converter(lab: Lab, x: float) -> Hidden:
     widths = np.maximum(1 + x * lab.rng.standard_normal(140), 0.02)
     widths *= 140 / widths.sum()
     lab.world.code_widths = tuple(widths.tolist())
-    total = sum(lab.pixels * lab.detections(c) for c in lab.stated) * float(((widths - 1) ** 2).mean())
-    return Hidden(of_map(total, 139), "chi-squared of the codes", added("tdc_nonlinearity"), {"sigma": x, "codes": 140})
+    precision = math.sqrt(sum(lab.pixels * lab.detections(c) for c in lab.stated) / widths.size)
+    z = oracle.normal_pattern(precision * (widths - 1), precision * x)
+    settings = {"sigma": x, "codes": 140}
+    return Hidden(z, "likelihood of a normal spread of the codes", added("tdc_nonlinearity"), settings)
 
 
 @hides(EFFECTS, "tr", 0.1e-9, 8e-9)
@@ -698,12 +716,7 @@ def bursts(lab: Lab, x: float) -> Hidden:
         total += 2 * x * c.length * lab.world.burst_size * -math.log(chance)
     settings = {"rate": x, "size": lab.world.burst_size}
     number = x * sum(c.length for c in lab.stated)
-    return Hidden(_if_any(math.sqrt(total), number), "adjacent pixels at once, by chance or not", UNKNOWN, settings)
-
-
-def _if_any(z: float, number: float) -> float:
-    """The significance of rare things, each of which says much: there may be none, and then nobody sees anything."""
-    return min(z, max(0.0, -float(ndtri_exp(-number))))
+    return Hidden(if_any(math.sqrt(total), number), "adjacent pixels at once, by chance or not", UNKNOWN, settings)
 
 
 @hides(OUTSIDE, "tr", 1e-8, 50e-6)
@@ -720,7 +733,7 @@ def erlang_dead_time(lab: Lab, x: float) -> Hidden:
     lab.world.dead_time_order = order = round(x**-2)
     # half of a mean |N| on the wrong side
     width = DEAD_TIME / math.sqrt(order) / math.sqrt(2 * math.pi)
-    return Hidden(edge(lab, width), "detections on the wrong side of the edge", UNKNOWN, {"order": order})
+    return Hidden(oracle.edge(lab, width, TICK), "detections on the wrong side of the edge", UNKNOWN, {"order": order})
 
 
 @hides(OUTSIDE, "tr", 1e-5, 0.2)
@@ -744,7 +757,7 @@ def copied_frames(lab: Lab, x: float) -> Hidden:
         fires = -math.expm1(-lab.rate(c) * c.frame_time)
         total += 2 * x * c.frames * lab.pixels * -math.log(fires**2 + (1 - fires) ** 2)
     copies = x * sum(c.frames for c in lab.stated)
-    return Hidden(_if_any(math.sqrt(total), copies), "frames equal to the one before", UNKNOWN, {"share": x})
+    return Hidden(if_any(math.sqrt(total), copies), "frames equal to the one before", UNKNOWN, {"share": x})
 
 
 # ---- what is wrong in the laboratory ----------------------------------------------------------------------
@@ -814,6 +827,22 @@ DOUBLES = [
     ("qis", "gate", "columns"),
     ("str", "slow-afterpulsing", "gradient"),
 ]
+TRIPLES = [
+    ("tr", "afterpulsing", "crosstalk", "hot-pixels"),
+    ("tr", "gradient", "dead-time-set", "slow-afterpulsing"),
+    ("tr", "converter", "pdp-spread", "flicker"),
+    ("tr", "dark-counts-set", "crosstalk-set", "drift"),
+    ("qis", "lazy-pixels", "crosstalk", "gate"),
+    ("qis", "hot-pixels", "gradient", "slow-afterpulsing"),
+    ("str", "converter", "gradient", "crosstalk"),
+    ("str", "pdp-spread", "gate", "flicker"),
+]
+# A real camera lacks many things at once: five or six of these that its kind can have, in random company.
+CAMERA = (
+    *("gradient", "pdp-spread", "hot-pixels", "lazy-pixels", "crosstalk", "slow-afterpulsing", "dead-time-set"),
+    *("converter", "flicker"),
+)
+CAMERAS = 8  # of each family
 QUICK = [
     *("null-tr-1", "null-qis-1", "null-str-1", "tr-afterpulsing-clear", "tr-crosstalk-clear", "tr-pdp-spread-clear"),
     *("tr-flicker-moderate", "tr-dead-time-set-clear", "qis-hot-pixels-clear", "qis-slow-afterpulsing-clear"),
@@ -825,7 +854,7 @@ QUICK = [
 @dataclass(frozen=True)
 class Case:
     name: str
-    kind: str  # null, single, double, outside, setup
+    kind: str  # null, single, double, triple, camera, outside, setup
     family: str
     effects: tuple[str, ...] = ()
     tier: str | None = None
@@ -844,8 +873,11 @@ def all_cases(nulls: int = 30) -> list[Case]:
             if effect.solved and family == "tr":
                 tiers.append("below")
             cases += [Case("-".join(filter(None, (family, name, t))), "single", family, (name,), t) for t in tiers]
-    for family, *both in DOUBLES:
-        cases.append(Case(f"double-{family}-{'-and-'.join(both)}", "double", family, tuple(both), "clear"))
+    for kind, listed in (("double", DOUBLES), ("triple", TRIPLES)):
+        for family, *names in listed:
+            cases.append(Case(f"{kind}-{family}-{'-and-'.join(names)}", kind, family, tuple(names), "clear"))
+    for family in FAMILIES:
+        cases += [Case(f"camera-{family}-{number + 1}", "camera", family) for number in range(CAMERAS)]
     for kind, registry in (("outside", OUTSIDE), ("setup", SETUP)):
         for name, effect in registry.items():
             for family in effect.families:
@@ -881,10 +913,10 @@ def built(case: Case, seed: int, quick: bool = False) -> tuple[Lab, list[tuple[s
     registry = {**EFFECTS, **OUTSIDE, **SETUP}
     lab = Lab(case.family, number, quick)
     hidden = []
-    for name in case.effects:
+    for name, tier in company(case, draw):
         effect, strength = registry[name], 1.0
         if effect.solved:
-            low, high = (3.33, 3.34) if case.tier == "five-per-cent" else TIERS[case.tier or "clear"]
+            low, high = (3.33, 3.34) if tier == "five-per-cent" else TIERS[tier or "clear"]
             target = float(np.exp(draw.uniform(math.log(low), math.log(high))))
             # always the same draws, scaled: Z grows with the strength
             a, b = math.log(effect.low), math.log(effect.high)
@@ -895,3 +927,12 @@ def built(case: Case, seed: int, quick: bool = False) -> tuple[Lab, list[tuple[s
             strength = math.exp(b)
         hidden.append((name, strength, effect.hide(lab, strength)))
     return lab, hidden
+
+
+def company(case: Case, draw: np.random.Generator) -> list[tuple[str, str | None]]:
+    """The effects of a case and the tier of each."""
+    if case.kind != "camera":
+        return [(name, case.tier) for name in case.effects]
+    able = [name for name in CAMERA if case.family in EFFECTS[name].families]
+    many = int(draw.integers(5, 7))
+    return [(able[k], str(draw.choice(["obvious", "clear"]))) for k in sorted(draw.permutation(len(able))[:many])]

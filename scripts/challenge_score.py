@@ -15,8 +15,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 CLEARLY = 1e-6  # p-value of an error that is worth dividing by: 5 standard deviations
+
+# One-step changes that a search chooses among (added effects, wrong values, maps), about: an ideal test of one of them
+# must reach the threshold that keeps 1 % of false alarms over all of them.
+CANDIDATES = 50
+THRESHOLD = float(-ndtri(0.01 / CANDIDATES))  # standard deviations: 3.5
 
 # A baseline, not the tool: what a lab reads off the check that fails most clearly, by rules that fit on a page (same
 # pixel: traps or dead time; neighbours: crosstalk; everyone: lamp or clock; maps: the dark, or the light).
@@ -115,8 +121,18 @@ class Judged:
         return self.verdict not in ("adequate", "no answer")
 
     @property
+    def ideal(self) -> float:
+        """Chance that an ideal test, which knows all effects of this case but one, finds each of them."""
+        return math.prod(float(ndtr(z - THRESHOLD)) for z in self.truth["z"])
+
+    @property
     def right(self) -> list[str]:
         return [label(step) for step in self.truth["truth"]]
+
+    @property
+    def said(self) -> list[str]:
+        """The steps that were added, a set-up fault's apart."""
+        return [label(step) for step in (self.answer or {}).get("steps") or []] if self.verdict != "setup" else []
 
     def removed(self, oracle: float) -> float | None:
         """Share of the error on unseen captures that the findings remove."""
@@ -219,22 +235,32 @@ def table(*rows: Iterable[object]) -> list[str]:
 def report(cases: list[Judged], made: int | None = None) -> str:
     """The table of the benchmark in Markdown, with everything that went wrong by name. made: cases there are."""
 
-    def line(what: str, members: list[Judged], good: Callable[[Judged], bool], must: str, bad: bool = False) -> str:
+    def line(
+        what: str,
+        members: list[Judged],
+        good: Callable[[Judged], bool],
+        must: str,
+        bad: bool = False,
+        best: bool = False,
+    ) -> str:
         told = [c for c in members if c.answer is not None]
         # silence is no success: it stays among the cases unless the line counts failures
-        return row(what, sum(map(good, told)), len(told if bad else members), must, len(members) - len(told))
+        ideal = sum(c.ideal for c in members) / len(members) if best and members else None
+        return row(what, sum(map(good, told)), len(told if bad else members), must, len(members) - len(told), ideal)
 
-    def row(what: str, successes: int, trials: int, must: str, silent: int = 0) -> str:
+    def row(what: str, successes: int, trials: int, must: str, silent: int = 0, ideal: float | None = None) -> str:
         low, high = wilson(successes, trials)
         share = f"{100 * successes / trials:.0f} %" if trials else "-"
         interval = f"{100 * low:.0f}-{100 * high:.0f} %" if trials else "-"
-        return f"| {what} | {successes} of {trials} | {share} | {interval} | {must} | {silent} |"
+        best = "" if ideal is None else f"{100 * ideal:.0f} %"
+        return f"| {what} | {successes} of {trials} | {share} | {interval} | {best} | {must} | {silent} |"
 
     def of(kind: str, low: float = -1.0, high: float = math.inf) -> list[Judged]:
         return [c for c in cases if c.truth["class"] == kind and low <= c.z < high]
 
     nulls, singles, strong = of("null"), of("single"), of("single", 10)
     doubles, outside, setups = of("double"), of("outside"), of("setup")
+    several = of("triple"), of("camera")
     made = len(cases) if made is None else made
     out = [
         "# Hidden-effect challenge",
@@ -243,11 +269,12 @@ def report(cases: list[Judged], made: int | None = None) -> str:
         if len(cases) == made
         else f"{len(cases)} of {made} cases, those asked so far (their numbers are random: a fair sample).",
         "",
-        "Z: the weakest hidden effect's expected significance for an oracle. "
-        "Intervals: Wilson, 95 %. A case without an answer is no success, and none of the failures that a line counts.",
+        "Z: the weakest hidden effect's expected significance in the best test that knows its family and strength. "
+        "Intervals: Wilson, 95 %. Ideal: what that test finds at the threshold that keeps 1 % of false alarms over "
+        f"{CANDIDATES} candidates. A case without an answer is no success and none of the failures that a line counts.",
         "",
-        "| what | cases | share | 95 % | to reach | no answer |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| what | cases | share | 95 % | ideal | to reach | no answer |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
         line("nulls: false alarm (any verdict but adequate)", nulls, lambda c: c.detected, "<= 1 %", True),
     ]
     compared = [c for c in nulls if c.compared]
@@ -260,7 +287,13 @@ def report(cases: list[Judged], made: int | None = None) -> str:
     bands += [("4-6", 4, 6, ">= 75 %"), ("3-4", 3, 4, ""), ("below 3", -1, 3, "")]
     for name, low, high, must in bands:
         out.append(
-            line(f"single, Z {name}: right effect first", of("single", low, high), lambda c: c.first_right, must)
+            line(
+                f"single, Z {name}: right effect first",
+                of("single", low, high),
+                lambda c: c.first_right,
+                must,
+                best=True,
+            )
         )
     for name, low, high, _ in bands[2:]:
         out.append(
@@ -275,11 +308,22 @@ def report(cases: list[Judged], made: int | None = None) -> str:
     limits = [above for c in of("single", -1, 3) for _, above in c.limits]
     out.append(row("single, Z below 3: upper limit above the truth", sum(limits), len(limits), ">= 93 %"))
     out.append(line("single: exact set of findings", singles, lambda c: c.exact, ""))
-    out.append(line("double: both found", doubles, lambda c: c.both, ">= 92 %"))
+    out.append(line("double: both found", doubles, lambda c: c.both, ">= 92 %", best=True))
     out.append(line("double: exact set", doubles, lambda c: c.exact, ">= 65 %"))
+    out.append(line("triple: all found", several[0], lambda c: c.both, ">= 80 %", best=True))
+    hidden_in = [(set(c.right), set(c.said)) for c in several[1]]
+    found_in, all_in = (sum(len(x) for x in y) for y in ([a & b for a, b in hidden_in], [a for a, _ in hidden_in]))
+    silent = sum(c.answer is None for c in several[1])
+    out.append(row("camera: share of what is hidden that is found", found_in, all_in, ">= 85 %", silent))
     out.append(line("outside the catalogue: flagged as unexplained", outside, lambda c: c.flagged, ">= 95 %"))
     out.append(line("outside the catalogue: confidently wrong", outside, lambda c: c.confident_wrong, "<= 1 %", True))
     out.append(line("set-up: said so, and where", setups, lambda c: c.setup_right, ">= 95 %"))
+    steps = [(step in c.right) for c in cases for step in c.said]
+    out.append(row("steps that are not hidden, of all steps added", steps.count(False), len(steps), "<= 3 %"))
+    unfinished = [c for c in cases if c.answer and "finished" in c.answer]
+    if unfinished:
+        late = sum(not (c.answer or {})["finished"] for c in unfinished)
+        out.append(row("unfinished within the budget", late, len(unfinished), "<= 3 %"))
     everything = [found for c in cases for found in c.found]
     for exact, what, must in ((True, "by the catalogue's law", "93-97 %"), (False, "another law", "")):
         covers = [found.covers for found in everything if found.exact is exact]
