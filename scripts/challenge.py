@@ -259,33 +259,38 @@ def ask(folder: Path, question: str, case: str, args: argparse.Namespace) -> tup
         shutil.rmtree(found, ignore_errors=True)
         answer_file(folder, case, "unseen-found").unlink(missing_ok=True)
         options += ["--output", str(found), *(["--quick"] if args.quick else [])]
-    command = [verb, str(sensor), str(place), *options]
+    kept, said = answered([verb, str(sensor), str(place), *options], told, args.timeout)
+    if verb == "diagnose":
+        for page in found.glob("*.html"):
+            page.unlink()
+    kept["after_opening"] = (folder / "sealed" / "opened").exists()
+    target.write_text(json.dumps(kept, indent=1))
+    return f"{case} {question}: {said}, {kept['seconds']:.0f} s", kept["answer"] is not None
+
+
+def answered(command: list[str], told: Path, timeout: float) -> tuple[dict[str, Any], str]:
+    """(answer of one command whose JSON goes to `told`, with its seconds and why there is none; its verdict)."""
     began, status, error = time.perf_counter(), None, ""
     try:
-        done = subprocess.run([*program(), *command], capture_output=True, text=True, timeout=args.timeout)
+        done = subprocess.run([*program(), *command], capture_output=True, text=True, timeout=timeout)
         status, error = done.returncode, done.stderr[-2000:]
     except subprocess.TimeoutExpired:
-        error = f"no answer in {args.timeout:g} s"
+        error = f"no answer in {timeout:g} s"
     seconds = time.perf_counter() - began
     answer = None
     if status in (0, 1) and told.exists():
         answer, error = json.loads(told.read_text()), ""
     told.unlink(missing_ok=True)
-    if verb == "diagnose":
-        for page in found.glob("*.html"):
-            page.unlink()
     kept = {
         "command": command,
         "seconds": round(seconds, 1),
         "status": status,
         "error": error,
-        "after_opening": (folder / "sealed" / "opened").exists(),
         "package": package(),
         "answer": answer,
     }
-    target.write_text(json.dumps(kept, indent=1))
-    said = answer["verdict"] if answer else f"no answer ({error.strip().splitlines()[-1] if error.strip() else status})"
-    return f"{case} {question}: {said}, {seconds:.0f} s", answer is not None
+    last = error.strip().splitlines()[-1] if error.strip() else status
+    return kept, answer["verdict"] if answer else f"no answer ({last})"
 
 
 # ---- score ------------------------------------------------------------------------------------------------
