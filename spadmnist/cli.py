@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from . import interrupts
-from .foreign import quoted, visible, visible_lines
+from .foreign import quoted, short, visible, visible_lines
 from .workers import safe_path
 
 if TYPE_CHECKING:
@@ -957,7 +957,7 @@ def _say(text: str) -> None:
     """One line, for people."""
     # where nobody can be told there is nothing to do about it
     with contextlib.suppress(OSError, ValueError):
-        click.echo(visible(text), err=True)
+        click.echo(visible(short(text)), err=True)
 
 
 def _print(text: str) -> None:
@@ -982,6 +982,7 @@ def _duration(seconds: float) -> str:
 
 
 _HEAD = 200  # bytes in which an answer says its format
+_MISTAKES = 30  # of a file, said one a line; a screen holds them
 
 
 def _processors() -> int:
@@ -1112,8 +1113,10 @@ def _failed(error: Exception) -> int:
         for line in shown.getvalue().replace(words, visible(words)).rstrip("\n").split("\n"):
             _say(line)
     elif isinstance(error, ConfigError):
-        for problem in error.problems:
+        for problem in error.problems[:_MISTAKES]:
             _say(f"Error: {problem}")
+        if len(error.problems) > _MISTAKES:
+            _say(f"Error: there are {len(error.problems) - _MISTAKES:,} mistakes more; correct these first")
     elif isinstance(error, SpadError):
         _say(f"Error: {error}")
     elif isinstance(error, MemoryError):

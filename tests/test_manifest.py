@@ -70,7 +70,7 @@ def test_every_entry_is_checked(root: Path) -> None:
     use(root)
     wrong = []
     for place in leaves(good):
-        for value in ("gone", None, "x", -1, [], {}):
+        for value in ("gone", None, "x", -1, [], {}, "{a: " * 1000, json.loads("[" * 300 + "]" * 300)):
             changed = copy.deepcopy(good)
             group = changed
             for key in place[:-1]:
@@ -82,8 +82,9 @@ def test_every_entry_is_checked(root: Path) -> None:
             (root / "manifest.json").write_bytes(dataset.seal(changed))
             try:
                 use(root)
+                verify.verify(root)
             except SpadError as error:
-                if "\n" in str(error):
+                if "\n" in str(error) or len(str(error)) > 3000:
                     wrong.append(f"{place} {value}: {error}")
             except Exception as error:
                 wrong.append(f"{place} {value}: {type(error).__name__}: {error}")
