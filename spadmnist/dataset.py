@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -512,19 +511,6 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
         more = f" (and {len(wrong) - 4} more)" if len(wrong) > 4 else ""
         raise InputError(f"{said}{more}; spadmnist verify {root} --repair makes {MANIFEST} again")
     return manifest, intact
-
-
-def around(root: Path) -> Path | None:
-    """The dataset, finished or not, that a folder lies in; None where it lies in none."""
-    for folder in Path(os.path.realpath(root)).parents:
-        if (folder / STATE / "plan.json").exists():
-            return folder
-        try:
-            if b'"format": "spadmnist-dataset/' in disk.read_file(folder / MANIFEST, _LARGEST_MANIFEST):
-                return folder
-        except OSError:
-            continue
-    return None
 
 
 def intact_manifest(root: Path) -> dict[str, Any]:

@@ -543,8 +543,7 @@ def _memory_there() -> int:
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
     """Is the dataset there and finished? Refuse a folder that holds something else, before anything is written."""
-    if (outer := dataset.around(root)) is not None:
-        raise SpadError(f"{root}: lies inside the dataset {outer}, which holds its own files alone; choose another -o")
+    disk.check_outside(root)
     with _writable(root):
         if not root.exists():
             return False
