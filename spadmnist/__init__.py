@@ -40,8 +40,10 @@ def _leave_the_current_folder() -> None:
 
 _leave_the_current_folder()  # before anything is imported: no `from __future__` above
 
-from importlib import import_module  # noqa: E402
-from typing import Any  # noqa: E402
+# A program answers no signal before this is done (`start`): what takes time is imported where it is needed.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
 
 __version__ = "0.1.0"
 
@@ -67,9 +69,11 @@ _PUBLIC = {
 __all__ = sorted(_PUBLIC)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name not in _PUBLIC:
         raise AttributeError(f"module 'spadmnist' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from . import interrupts
-from .foreign import quoted, visible, visible_lines
+from .foreign import quoted, short, visible, visible_lines
 from .workers import safe_path
 
 if TYPE_CHECKING:
@@ -65,6 +65,20 @@ def _plugin(command: F) -> F:
     )(command)
 
 
+class _Place(click.Path):
+    """A place to write to. Refused before the work begins where it lies inside a dataset."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        place = super().convert(value, param, ctx)
+        from . import disk
+
+        disk.check_outside(os.fsdecode(place))
+        return place
+
+
 def _jobs(command: F) -> F:
     return click.option(
         "--jobs",
@@ -102,7 +116,7 @@ def _beside(command: F) -> F:
             metavar="N",
             help="Of the simulations.  [default: 0]",
         ),
-        click.option("--json", "json_file", type=path, metavar="FILE", help="Write the answer there, as JSON."),
+        click.option("--json", "json_file", type=_Place(), metavar="FILE", help="Write the answer there, as JSON."),
         click.argument("measurement", type=path),
         click.argument("sensor", type=path),
     ):
@@ -115,7 +129,7 @@ def _beside(command: F) -> F:
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="OUT",
     help="Folder of the dataset.  [default: the config's name]",
 )
@@ -232,7 +246,7 @@ def generate(
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="FOLDER",
     help="Of a measurement: folder of its images.  [default: NAME-flux, here]",
 )
@@ -332,7 +346,7 @@ def _reconstruct_measurement(
 @click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="FILE.png",
     help="Draw a sheet: images in all readouts and methods, or maps, rates and intervals of captures.",
 )
@@ -395,7 +409,7 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="OUT",
     required=True,
     help="Folder of the twin, which is a measurement too.",
@@ -528,7 +542,7 @@ def _import_option(name: str, declared: Any, about: str) -> click.Option:
 
 @cli.command("import", cls=_ImportCommand, short_help="Make a measurement of files that other programs wrote.")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@click.option("--output", "-o", type=click.Path(path_type=Path), metavar="MEASUREMENT", help="Its folder.")
+@click.option("--output", "-o", type=_Place(), metavar="MEASUREMENT", help="Its folder.")
 @click.option("--name", metavar="NAME", help="Of the measurement.  [default: that of the file or folder]")
 @click.option(
     "--light",
@@ -594,7 +608,7 @@ def import_(
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="OUT",
     help="A file, or a folder for several.",
 )
@@ -705,7 +719,7 @@ def statistics_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool)
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="REPORT",
     help="Folder for a report: one HTML page with pictures.",
 )
@@ -778,7 +792,7 @@ def compare(
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="FOLDER",
     help="Folder for the report, an HTML page, and for the next sensor.yaml with its maps.",
 )
@@ -831,7 +845,7 @@ def diagnose(
 
 
 @cli.command(short_help="Settle parameters of a model.")
-@click.option("--output", "-o", type=click.Path(path_type=Path), metavar="NEXT.yaml", required=True, help="New file.")
+@click.option("--output", "-o", type=_Place(), metavar="NEXT.yaml", required=True, help="New file.")
 @click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and settle it.")
 @click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a parameter.")
 @click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a map.")
@@ -957,7 +971,7 @@ def _say(text: str) -> None:
     """One line, for people."""
     # where nobody can be told there is nothing to do about it
     with contextlib.suppress(OSError, ValueError):
-        click.echo(visible(text), err=True)
+        click.echo(visible(short(text)), err=True)
 
 
 def _print(text: str) -> None:
@@ -982,6 +996,7 @@ def _duration(seconds: float) -> str:
 
 
 _HEAD = 200  # bytes in which an answer says its format
+_MISTAKES = 30  # of a file, said one a line; a screen holds them
 
 
 def _processors() -> int:
@@ -1112,8 +1127,10 @@ def _failed(error: Exception) -> int:
         for line in shown.getvalue().replace(words, visible(words)).rstrip("\n").split("\n"):
             _say(line)
     elif isinstance(error, ConfigError):
-        for problem in error.problems:
+        for problem in error.problems[:_MISTAKES]:
             _say(f"Error: {problem}")
+        if len(error.problems) > _MISTAKES:
+            _say(f"Error: there are {len(error.problems) - _MISTAKES:,} mistakes more; correct these first")
     elif isinstance(error, SpadError):
         _say(f"Error: {error}")
     elif isinstance(error, MemoryError):

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -29,7 +28,7 @@ from .disk import Files
 from .errors import InputError, SpadError
 from .events import Events
 from .experiment import Experiment, Level, level_of
-from .foreign import quoted
+from .foreign import from_json, quoted, short
 from .gather import gather, indices_of, join
 from .images import Images
 from .readout import Frames, Recorded, summarised
@@ -38,6 +37,7 @@ from .store import Column, Expected, ShardReader
 
 FORMAT = "spadmnist-dataset/1"
 _LARGEST_MANIFEST = 1 << 30  # bytes
+_LONGEST_SENTENCE = 600  # characters of one mistake in a manifest, which may quote endless names
 MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
 STATE = ".spadmnist"
@@ -496,33 +496,21 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
             f"{path}: cannot be read ({error.strerror}); spadmnist verify {quoted(root)} says more"
         ) from None
     try:
-        manifest = json.loads(raw)
+        manifest = from_json(raw)
         intact = isinstance(manifest, dict) and seal(manifest) == raw
-    except (ValueError, RecursionError):
+    except ValueError as error:
         raise InputError(
-            f"{path}: is damaged (not JSON); spadmnist verify {quoted(root)} --repair makes it again"
+            f"{path}: is damaged ({error}); spadmnist verify {quoted(root)} --repair makes it again"
         ) from None
     if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
         raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
     if manifest["format"] != FORMAT:
         raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
     if intact and (wrong := manifests.problems(manifest, str(path))):
+        said = "; ".join(short(sentence, _LONGEST_SENTENCE) for sentence in wrong[:4])
         more = f" (and {len(wrong) - 4} more)" if len(wrong) > 4 else ""
-        raise InputError(f"{'; '.join(wrong[:4])}{more}; spadmnist verify {root} --repair makes {MANIFEST} again")
+        raise InputError(f"{said}{more}; spadmnist verify {root} --repair makes {MANIFEST} again")
     return manifest, intact
-
-
-def around(root: Path) -> Path | None:
-    """The dataset, finished or not, that a folder lies in; None where it lies in none."""
-    for folder in Path(os.path.realpath(root)).parents:
-        if (folder / STATE / "plan.json").exists():
-            return folder
-        try:
-            if b'"format": "spadmnist-dataset/' in disk.read_file(folder / MANIFEST, _LARGEST_MANIFEST):
-                return folder
-        except OSError:
-            continue
-    return None
 
 
 def intact_manifest(root: Path) -> dict[str, Any]:

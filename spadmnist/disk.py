@@ -21,6 +21,7 @@ from typing import IO, Any
 
 from .errors import InputError, SpadError
 
+_LARGEST_MANIFEST = 1 << 30  # bytes
 _LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
@@ -74,15 +75,33 @@ def opened(path: str | os.PathLike[str]) -> IO[bytes]:
 _HANDED_OVER = re.compile(r"/dev/stdin|/dev/fd/[0-9]+|/proc/self/fd/[0-9]+")
 
 
+def check_outside(place: str | os.PathLike[str]) -> None:
+    """Raise SpadError where a place lies inside a dataset, finished or not: that holds its own files alone."""
+    for folder in Path(os.path.realpath(place)).parents:
+        begun = (folder / ".spadmnist" / "plan.json").exists()
+        if begun or _is_manifest(folder / "manifest.json"):
+            raise SpadError(
+                f"{place}: lies inside the dataset {folder}, which holds its own files alone; choose another -o"
+            )
+
+
+def _is_manifest(path: Path) -> bool:
+    try:
+        return b'"format": "spadmnist-dataset/' in read_file(path, _LARGEST_MANIFEST)
+    except OSError:
+        return False
+
+
 @contextlib.contextmanager
 def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
     """A file among the user's own, to be written piece by piece: there as a whole or not at all; an older one goes.
 
     size: bytes, about. It grows beside its place under a hidden name that is the same each time, so that a run that
-    was killed leaves nothing that the next one does not write over. Raises SpadError where it cannot be written, or is
-    being written by another run.
+    was killed leaves nothing that the next one does not write over. Raises SpadError where it cannot be written, is
+    being written by another run, or would lie inside a dataset.
     """
     path = Path(path)
+    check_outside(path)
     part = path.with_name(f".{path.name}.part")
     with writing(path, size):
         _make_folder(path.parent)

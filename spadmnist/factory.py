@@ -37,6 +37,7 @@ from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
+from .foreign import from_json
 from .heap import keep_freed_memory
 from .images import Images
 from .reconstruct import median_of_nonzero
@@ -542,8 +543,7 @@ def _memory_there() -> int:
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
     """Is the dataset there and finished? Refuse a folder that holds something else, before anything is written."""
-    if (outer := dataset.around(root)) is not None:
-        raise SpadError(f"{root}: lies inside the dataset {outer}, which holds its own files alone; choose another -o")
+    disk.check_outside(root)
     with _writable(root):
         if not root.exists():
             return False
@@ -569,8 +569,8 @@ def _plan(root: Path) -> dict[str, Any]:
     """What an unfinished run makes. Raises SpadError where that cannot be read."""
     path = root / STATE / "plan.json"
     try:
-        found = json.loads(disk.read_file(path, _LARGEST_NOTE))
-    except (OSError, ValueError, RecursionError):
+        found = from_json(disk.read_file(path, _LARGEST_NOTE))
+    except (OSError, ValueError):
         found = None
     if not isinstance(found, dict):
         again = "remove it" if os.path.lexists(root / MANIFEST) else f"remove {root}"
@@ -626,8 +626,8 @@ def _is_made(root: Path, shard: Shard, format: str, like: Likeness) -> bool:
 def _record(root: Path, shard: Shard) -> Files | None:
     """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
     try:
-        found = json.loads(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
-    except (OSError, ValueError, RecursionError):
+        found = from_json(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
+    except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
 
@@ -930,7 +930,7 @@ def statistics_of(
         reader = shard.reader(root, format, like)
         place = store.location(shard.path, format)
         try:
-            for readout, numbers in json.loads(reader.attributes["statistics"]).items():
+            for readout, numbers in from_json(reader.attributes["statistics"]).items():
                 sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
                 for key, value in numbers.items():
                     sums[key] += value

@@ -1,4 +1,4 @@
-"""Text that others wrote, as it may be shown: on a terminal, in a page, in a command to paste.
+"""Text that others wrote: as it may be shown (on a terminal, in a page, in a command to paste), and JSON of it.
 
 The name of a file or of a sensor may hold characters that move the cursor, end a line or turn the order of what
 follows. Nothing that cannot be seen is passed on as it is.
@@ -6,8 +6,15 @@ follows. Nothing that cannot be seen is passed on as it is.
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
+from collections.abc import Iterable
+from typing import Any
+
+_DEEPEST = 64  # groups within groups of JSON: a config has at most 50, and stands in a manifest
+_TOO_DEEP = f"it is nested more than {_DEEPEST} deep"
+_LONGEST_LINE = 2000  # characters of a line for people; names of files and of captures fit
 
 
 def visible(text: object) -> str:
@@ -23,6 +30,32 @@ def visible(text: object) -> str:
 def visible_lines(text: str) -> str:
     r"""As `visible`, of several lines: only `\n` ends one."""
     return "\n".join(map(visible, text.split("\n")))
+
+
+def short(text: str, most: int = _LONGEST_LINE) -> str:
+    """Text without its middle where it has more characters than a line for people may: it quotes something endless."""
+    half = (most - 5) // 2
+    return text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
+
+
+def from_json(text: str | bytes) -> Any:
+    """What JSON of a file says. Raises ValueError, with a short reason, where it is none or is nested too deeply."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+    except ValueError:
+        raise ValueError("it is not JSON") from None
+    level = [value]
+    for _ in range(_DEEPEST + 1):
+        level = [held for group in level for held in _inside(group) if isinstance(held, dict | list)]
+        if not level:
+            return value
+    raise ValueError(_TOO_DEEP)
+
+
+def _inside(group: Any) -> Iterable[Any]:
+    return group.values() if isinstance(group, dict) else group if isinstance(group, list) else ()
 
 
 def quoted(word: str | os.PathLike[str]) -> str:

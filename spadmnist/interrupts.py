@@ -6,14 +6,19 @@ swallowed it, the program leaves all the same: whatever is written appears by on
 rest.
 """
 
-from __future__ import annotations
-
+# This comes before everything that takes time to import, in which Ctrl-C would be a traceback: `os` and `sys` are there
+# already, and `_signal`, of which `signal` is made, is part of the interpreter.
 import os
-import signal
 import sys
-from types import FrameType
 
-_STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}  # what a shell makes of the end by that signal
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import signal as _signal
+    from types import FrameType
+else:
+    import _signal
+
+_STATUS = {int(_signal.SIGINT): 130, int(_signal.SIGTERM): 143}  # what a shell makes of the end by that signal
 _SECONDS = 4.0  # for tidying up, before the program leaves all the same
 _TWICE = 0.5  # s, in which one key press may come twice: to the program, and to its group
 _SENTENCE = "Interrupted. What is complete is kept: the same command goes on from there."
@@ -25,8 +30,8 @@ _under_way = False
 def install() -> None:
     """Answer the signals from now on, at once. One that the caller lets the program ignore stays ignored."""
     for number in _STATUS:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _answer)
+        if _signal.getsignal(number) != _signal.SIG_IGN:
+            _signal.signal(number, _answer)
     sys.unraisablehook = _unraisable
 
 
@@ -43,13 +48,13 @@ def came() -> bool:
 
 def status() -> int:
     """The exit status after an interruption, which is said."""
-    number = _came[0][0] if _came else signal.SIGINT
-    if number == signal.SIGINT:
+    number = _came[0][0] if _came else int(_signal.SIGINT)
+    if number == _signal.SIGINT:
         _say()
-    return _STATUS[signal.Signals(number)]
+    return _STATUS[number]
 
 
-def _answer(number: int, frame: FrameType | None) -> None:
+def _answer(number: int, frame: "FrameType | None") -> None:
     import time
 
     now = time.monotonic()
@@ -80,7 +85,7 @@ def _leave() -> None:
     os._exit(status())
 
 
-def _unraisable(about: sys.UnraisableHookArgs) -> None:
+def _unraisable(about: "sys.UnraisableHookArgs") -> None:
     """A signal that came in a callback, from which nothing can be raised, is answered here."""
     if isinstance(about.exc_value, KeyboardInterrupt) and _came:
         _leave()

@@ -10,9 +10,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from . import config as configs
+from . import store
 from .document import Document
 from .section import Section
-from .validated import Reader
+from .validated import Reader, brief
 
 Whole = Annotated[int, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
@@ -22,11 +23,18 @@ Text = Annotated[str, Field(min_length=1)]
 
 def _inside(name: str) -> str:
     if {"", ".", ".."} & set(name.split("/")) or "\0" in name:
-        raise ValueError(f"{name!r} leads out of the dataset; it must be the name of a file inside")
+        raise ValueError(f"{brief(name)} leads out of the dataset; it must be the name of a file inside")
+    return name
+
+
+def _on_disk(name: str) -> str:
+    if not store.is_name(name):
+        raise ValueError(f"{brief(name)} cannot be a name on disk, and shards lie under their names")
     return name
 
 
 FileName = Annotated[str, AfterValidator(_inside)]
+Name = Annotated[str, AfterValidator(_on_disk)]
 
 
 class _File(Section):
@@ -43,7 +51,7 @@ class _Images(Section):
     shape: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=3)]
     dtype: Literal["uint8", "uint16", "float32"]
     white: Positive
-    splits: Annotated[dict[Text, _Split], Field(min_length=1)]
+    splits: Annotated[dict[Name, _Split], Field(min_length=1)]
 
 
 class _Level(Section):
@@ -63,8 +71,8 @@ class _Settings(Section):
 
 class _Shard(Section):
     level: Text | None
-    folder: Text
-    split: Text
+    folder: Name
+    split: Name
     number: Whole
     start: Whole
     stop: Annotated[int, Field(ge=1)]

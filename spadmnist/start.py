@@ -1,7 +1,5 @@
 """The program's first lines: from here on it answers signals, before anything that takes time is imported."""
 
-from __future__ import annotations
-
 from . import interrupts
 
 interrupts.install()

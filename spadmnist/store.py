@@ -42,7 +42,7 @@ from numcodecs.fletcher32 import Fletcher32
 
 from .disk import Files, commit_file, inside, install, put_tree, temporary, workspace, writing
 from .errors import InputError
-from .foreign import quoted
+from .foreign import from_json, quoted
 
 # One task is one core; with threads of its own Blosc would use more of them without need.
 numcodecs.blosc.use_threads = False
@@ -108,8 +108,13 @@ def _check_format(format: str) -> None:
         raise ValueError(f"{format!r} is not a format; choose one of {', '.join(FORMATS)}")
 
 
+def is_name(name: str) -> bool:
+    """May it name a folder, a file or an array of a store?"""
+    return bool(_NAME.fullmatch(name)) and name != "zarr.json"
+
+
 def _check_name(name: str, where: str) -> None:
-    if not _NAME.fullmatch(name) or name == "zarr.json":
+    if not is_name(name):
         raise ValueError(
             f"{where!r}: {name!r} cannot be a name on disk; use letters, digits and _ . + - inside, "
             "beginning with a letter or a digit"
@@ -810,10 +815,10 @@ class ShardReader:
         try:
             if length > _LARGEST_JSON:
                 raise ValueError("it is too large")
-            document = json.loads(text)
+            document = from_json(text)
             if not isinstance(document, dict):
                 raise ValueError("it is not a mapping")
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             raise self._refuse(file, f"this is not a description of an array or group ({error})") from None
         known = None if self._expected is None else self._expected.files
         if known is not None and hashlib.sha256(text).hexdigest() != known[file]["sha256"]:

@@ -181,3 +181,63 @@ def test_what_a_parser_says_of_signs_stays(tmp_path: Path) -> None:
     file.write_text("seed: [1, 2\nscene: 3\n")
     with pytest.raises(ConfigError, match=r"a.yaml:2: is not well-formed YAML: expected ',' or '\]', but got '<.*>'|:"):
         config.read(file)
+
+
+def deep(kind: str, depth: int) -> str:
+    """Groups within groups, whole as a parser sees it; `[`: JSON and YAML, `- `: YAML."""
+    return {"{": '{"a": ' * depth + "1" + "}" * depth, "[": "[" * depth + "]" * depth, "-": "- " * depth + "1"}[kind]
+
+
+@pytest.mark.parametrize("depth", [70, 990, 100_000])
+@pytest.mark.parametrize("kind", ["{", "["])
+def test_json_nested_too_deeply(kind: str, depth: int) -> None:
+    text = deep(kind, depth)
+    with pytest.raises(ValueError, match=r"^it is nested more than 64 deep$"):
+        foreign.from_json(text)
+    with pytest.raises(ValueError, match=r"^it is not JSON$"):
+        foreign.from_json(deep(kind, 60)[:-1])
+    assert foreign.short(text) == text if depth == 70 else len(foreign.short(text)) < 2001
+    assert foreign.from_json(deep(kind, 60)) is not None
+
+
+@pytest.mark.parametrize("depth", [60, 5000])
+@pytest.mark.parametrize("kind", ["{", "[", "-"])
+@pytest.mark.parametrize("read", [config.read, config.read_sensor, measurement.open])
+def test_yaml_nested_too_deeply(read: object, kind: str, depth: int, tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    for before in ("", "sensor: {effects: "):
+        text = deep(kind, depth) + ("}" if before.endswith("{effects: ") and kind != "-" else "")
+        file.write_text(before + ("\n" if kind == "-" else "") + text)
+        with pytest.raises(SpadError) as error:
+            read(file)  # type: ignore[operator]
+        assert "deep" in str(error.value) or kind == "-", error.value
+        assert len(str(error.value)) < 400 + len(str(file)) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("depth", [70, 990, 100_000])
+def test_files_of_a_dataset_nested_too_deeply(depth: int, tmp_path: Path) -> None:
+    """The manifest, the description of an array, the plan of a run that is not finished."""
+    root = tmp_path / "out"
+    file = write_config(tmp_path / "c.yaml", train=2, test=1)
+    make(file, root)
+    arrays = sorted(root.rglob("zarr.json"))
+    for path in (arrays[-1], root / "manifest.json", root / ".spadmnist" / "plan.json"):
+        before = path.read_bytes() if path.exists() else b""
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(deep("{", depth))
+        for verb in (("inspect", str(root), "--json"), ("verify", str(root)), ("generate", str(file), "-o", str(root))):
+            status, out, err = said(*verb)
+            assert status in (0, 1, 2) and "fault of the program" not in err and len(err) < 1000, (verb, err[-300:])
+            assert status == 0 or len(out) + len(err.strip()) > 0
+            assert all(line.startswith("Error: ") for line in err.splitlines() if status == 2), err
+        if before:
+            path.write_bytes(before)
+
+
+def test_mistakes_without_end(tmp_path: Path) -> None:
+    """A file of a hundred thousand wrong entries is answered in a screen of lines, and by no endless line."""
+    file = tmp_path / "a.yaml"
+    file.write_text("\n".join(f"entry_{n}: 1" for n in range(30_000)) + f"\nseed: {'x' * 100_000}\n")
+    status, _, err = said("generate", str(file), "-o", str(tmp_path / "out"))
+    assert status == 2 and len(err.splitlines()) < 50 and max(map(len, err.splitlines())) <= 2000
+    assert re.search(r"Error: there are [\d,]+ mistakes more", err)

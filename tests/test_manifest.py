@@ -14,8 +14,10 @@ from commands import run
 from test_factory import assert_same, assert_sentence, make, tree, write_config
 
 import spadmnist
-from spadmnist import dataset, factory, manifest, report, verify
+from spadmnist import cli, dataset, disk, manifest, report, verify
 from spadmnist.errors import InputError, SpadError
+from spadmnist.events import Layout
+from spadmnist.measurement import write
 
 
 @pytest.fixture(scope="module", params=["zarr", "hdf5"])
@@ -70,7 +72,7 @@ def test_every_entry_is_checked(root: Path) -> None:
     use(root)
     wrong = []
     for place in leaves(good):
-        for value in ("gone", None, "x", -1, [], {}):
+        for value in ("gone", None, "x", -1, [], {}, "{a: " * 1000, json.loads("[" * 300 + "]" * 300)):
             changed = copy.deepcopy(good)
             group = changed
             for key in place[:-1]:
@@ -82,8 +84,9 @@ def test_every_entry_is_checked(root: Path) -> None:
             (root / "manifest.json").write_bytes(dataset.seal(changed))
             try:
                 use(root)
+                verify.verify(root)
             except SpadError as error:
-                if "\n" in str(error):
+                if "\n" in str(error) or len(str(error)) > 3000:
                     wrong.append(f"{place} {value}: {error}")
             except Exception as error:
                 wrong.append(f"{place} {value}: {type(error).__name__}: {error}")
@@ -190,6 +193,27 @@ def test_no_dataset_is_made_inside_another(where: str, root: Path, made: Path) -
         make(made.parent / "small.yaml", root.parent / "link" / "new")
 
 
+def test_nothing_else_is_written_inside_a_dataset(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever a verb writes: it is refused before the work begins, whether what is read is there or not."""
+    before = tree(root)
+    outputs = {
+        name: [option for option in verb.params if option.name in ("output", "plot", "json_file")]
+        for name, verb in cli.cli.commands.items()
+    }
+    assert sum(map(len, outputs.values())) > 10
+    for name, options in outputs.items():
+        for option in options:
+            needed = ["x"] * sum(isinstance(p, cli.click.Argument) for p in cli.cli.commands[name].params)
+            for place in (root / "new", root / "images" / "new.x"):
+                assert cli._run([name, *needed, option.opts[0], str(place)]) == 2
+                assert capsys.readouterr().err.startswith(f"Error: {place}: lies inside the dataset {root}")
+    with pytest.raises(SpadError, match="lies inside the dataset"):
+        disk.put_file(root / "new.json", b"")
+    with pytest.raises(SpadError, match="lies inside the dataset"):
+        write(root / "new", "lab", Layout(1, 1, 1e-10, 1.0), [])
+    assert_same(root, before)
+
+
 def test_no_dataset_is_made_inside_an_unfinished_one(root: Path, made: Path) -> None:
     (root / "manifest.json").unlink()
     (root / ".spadmnist").mkdir()
@@ -200,4 +224,4 @@ def test_no_dataset_is_made_inside_an_unfinished_one(root: Path, made: Path) -> 
 
 def test_a_manifest_of_something_else_is_no_dataset(made: Path, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"name": "a web page"}')
-    assert factory.dataset.around(tmp_path / "new") is None
+    disk.check_outside(tmp_path / "new")

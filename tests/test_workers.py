@@ -1,19 +1,26 @@
-"""No file of the current folder is run in place of a library: not by the program, not by its workers.
+"""No file of the current folder is run in place of a library: not by the program, not by its workers. And what is left
+of workers that were killed is removed.
 
 The decoys have the names of everything that a real run asks for; each says so where it is run.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import tinylab
 from commands import COMMAND
+from test_factory import alive, descendants, wait_for
 
+from spadmnist import workers as workers_module
 from spadmnist.workers import safe_path, workers
 
 ROOT = Path(__file__).parents[1]
@@ -201,3 +208,88 @@ def test_the_environment_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     with workers(1) as parallel:
         assert parallel.n_jobs == 1
     assert dict(os.environ) == before
+
+
+# --- what is left of a run that was killed ------------------------------------------------------------------------
+
+HOLDING = """
+import sys, time
+import numpy as np
+from joblib import delayed
+from spadmnist.factory import pool
+with pool(2) as parallel:
+    parallel(delayed(np.sum)(np.full(200_000, n)) for n in range(4))
+    print("ready", flush=True)
+    if "wait" in sys.argv:
+        time.sleep(120)
+"""
+MEMORY = Path("/dev/shm")
+
+
+def holding(place: Path, *arguments: str) -> subprocess.Popen[str]:
+    """A process whose workers have been given arrays, in a group of its own."""
+    environment = {**os.environ, "JOBLIB_TEMP_FOLDER": str(place)}
+    command = [sys.executable, "-c", HOLDING, *arguments]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    return process
+
+
+def semaphores(folder: Path) -> list[Path]:
+    return list(MEMORY.glob(f"sem.*-{folder.name}-*"))
+
+
+@pytest.mark.skipif(not MEMORY.is_dir(), reason="semaphores are no files here")
+def test_the_next_run_removes_what_a_killed_one_left_and_nothing_of_a_living_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed with its workers and with what cleans up behind them; its folder has arrays, and semaphores its name."""
+    killed, living = holding(tmp_path, "wait"), None
+    try:
+        (left,) = tmp_path.iterdir()
+        assert semaphores(left) and list(left.iterdir())
+        os.killpg(killed.pid, signal.SIGKILL)
+        killed.wait(10)
+        assert wait_for(lambda: not alive(descendants(psutil.Process())), 5)
+        (tmp_path / "spadmnist-workers-of-nobody").write_text("no folder")
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "spadmnist-workers-link").symlink_to(tmp_path / "elsewhere")
+        assert semaphores(left) and left.is_dir()
+
+        living = holding(tmp_path, "wait")
+        assert not left.exists() and not semaphores(left)
+        (own,) = (p for p in tmp_path.glob("spadmnist-workers-*") if p.is_dir() and not p.is_symlink())
+        held = semaphores(own)
+        assert held and list(own.iterdir())
+
+        other = holding(tmp_path)
+        other.communicate(timeout=30)
+        assert other.returncode == 0
+        assert own.is_dir() and semaphores(own) == held
+        names = {"spadmnist-workers-of-nobody", "spadmnist-workers-link", "elsewhere", own.name}
+        assert {path.name for path in tmp_path.iterdir()} == names, "a run that ends leaves nothing"
+    finally:
+        for process in filter(None, (killed, living)):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+        monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+        workers_module.clear()
+
+
+def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of another user, and one that is held; the same is removed when it is ours and nobody's."""
+    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    folder = tmp_path / "spadmnist-workers-abcdefgh"
+    folder.mkdir()
+    with monkeypatch.context() as other:
+        other.setattr(os, "geteuid", lambda: os.getuid() + 1)
+        workers_module.clear()
+        assert folder.is_dir()
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    workers_module.clear()
+    assert folder.is_dir()
+    os.close(handle)
+    workers_module.clear()
+    assert not folder.exists()

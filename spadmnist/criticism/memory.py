@@ -21,6 +21,7 @@ import numpy as np
 from .. import disk, plugins
 from ..compiled import digest_of_sources
 from ..errors import SpadError
+from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
@@ -55,7 +56,7 @@ def recall(name: str) -> tuple[dict[str, np.ndarray], dict[str, Null], dict[str,
     try:
         with np.load(_intact(path.read_bytes()), allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
-        facts = json.loads(arrays.pop("facts").tobytes().decode())
+        facts = from_json(arrays.pop("facts").tobytes())
         nulls, apart = (
             {
                 statistic: Null(**told, **{key: arrays.pop(f"{group}/{statistic}/{key}") for key in _ARRAYS})

@@ -40,6 +40,7 @@ def write(
     root = Path(path)
     for capture in captures:
         _check_counts(capture)
+    disk.check_outside(root)
     if root.exists() and not root.is_dir():
         raise SpadError(f"{root} is a file; choose another place with -o")
     begun = not root.exists()
@@ -83,6 +84,7 @@ def fill(plan: Measurement, recordings: Iterable[Recording]) -> None:
     """
     root, described = plan.folder, plan.file
     assert root is not None and described is not None
+    disk.check_outside(root)
     ids, names = [capture.id for capture in plan.captures], _files_of_plan(plan)
     made: list[Path] = []
     with _alone(root):
