@@ -22,9 +22,8 @@ recording: {exposure: 100 us, frames: 10, frame_time: 10 us, readouts: [qis]}
 sensor: {layout: {rows: 40, columns: 50, pixel_area: 25 um^2}, effects: {detection: {pdp: 0.5}}}
 output: {format: FORMAT}
 """
-CHART = (
-    "{source: chart, of: {source: digits, train: 20, test: 8, rows: 8, columns: 8}, count: 6, columns: 4, pitch: 11}"
-)
+OF = "{source: digits, train: 20, test: 8, rows: 8, columns: 8}"
+CHART = f"{{source: chart, of: {OF}, count: 6, columns: 4, pitch: 11}}"
 
 
 def config_in(folder: Path, images: str = CHART, format: str = "zarr") -> Path:
@@ -60,13 +59,15 @@ def test_a_chart_is_its_tiles_and_black_between_them() -> None:
         assert part.pixels.sum(dtype=int) == originals[split].pixels[laid.numbers].sum(dtype=int)
         # in the middle: (40 - 11 - 8) // 2 rows and (50 - 3 * 11 - 9) // 2 columns above and left of them
         assert laid.corners.tolist() == [[10, 4], [10, 15], [10, 26], [10, 37], [21, 4], [21, 15]]
-    assert splits["train"].tiles.numbers.tolist() != splits["test"].tiles.numbers.tolist()  # type: ignore[union-attr]
+    alike = Chart(of=Digits(train=20, test=20, rows=8, columns=9), count=20).load((40, 50))
+    assert len({str(part.tiles.numbers) for part in alike.values() if part.tiles is not None}) == 2
 
 
 def test_the_chart_of_the_paper_is_the_default() -> None:
     chart = Chart()
     assert (chart.of.source, chart.count, chart.columns, chart.pitch) == ("mnist", 256, None, None)
     corners = tiles.grid(256, None, None, (28, 28))
+    assert tiles.grid(3, 2, None, (8, 9)).tolist() == [[0, 0], [0, 9], [8, 0]]
     assert corners.max() == 15 * 28 and len(np.unique(corners, axis=0)) == 256
 
 
@@ -180,7 +181,7 @@ def test_tiles_are_had_back_from_a_dataset_and_from_its_config(format: str, tmp_
 
 def test_images_of_no_chart_have_no_tiles(tmp_path: Path) -> None:
     part = spadmnist.open(config_in(tmp_path, "{source: uniform}"))["1 lux"]
-    with pytest.raises(SpadError, match="not of one chart; scene.images of a chart has source: chart"):
+    with pytest.raises(SpadError, match=r"not of one chart; scene\.images of a chart has source: chart"):
         part.tiles  # noqa: B018
 
 
@@ -189,7 +190,7 @@ def test_a_dataset_of_a_chart_is_verified_and_repaired(tmp_path: Path) -> None:
     root = made(file, tmp_path / "out")
     assert not verify.verify(root)
     before = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
-    hurt = next(p for p in sorted(before) if "1_lux" in str(p) and "/c/" in str(p))
+    hurt = next(p for p in sorted(before) if "1_lux" in str(p) and p.name.startswith("c.0"))
     hurt.write_bytes(b"x")
     (root / dataset.CONFIG).unlink()
     verify.repair(root, verify.verify(root), 1)

@@ -68,9 +68,9 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
     with pytest.raises(InputError, match="is the sensor file itself"):
         next_sensor.check_place(lab, file)
     out = next_sensor.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
-    again = config.read_sensor(out).settled()
-    assert getattr(again.effect("crosstalk"), "probability") == 0.005
-    assert np.array_equal(getattr(again.effect("dark_counts"), "rate"), np.arange(1.0, 7.0))
+    found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).settled().effects}
+    assert found["crosstalk"].probability == 0.005
+    assert np.array_equal(found["dark_counts"].rate, np.arange(1.0, 7.0))
     assert "# measured" in out.read_text() and "scene" not in out.read_text()
 
 
