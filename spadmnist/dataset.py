@@ -34,6 +34,7 @@ from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
 from .store import Column, Expected, ShardReader
+from .tiles import Tiles, of_facts
 
 FORMAT = "spadmnist-dataset/1"
 _LARGEST_MANIFEST = 1 << 30  # bytes
@@ -542,6 +543,8 @@ class _Backend(Protocol):
 
     def labels(self) -> np.ndarray | None: ...
 
+    def tiles(self) -> Tiles | None: ...
+
     def cuts(self, length: int, most: int) -> list[int]: ...
 
 
@@ -661,9 +664,10 @@ class Part:
 
     tr: `Events` of an image's pixels, row by row; qis: (frames, rows, columns) uint8; str: (frames, rows, columns)
     float64, s, the frame time where there is no detection; reconstruction: by method; images: the originals;
-    labels: (n,) uint8, or None where the source has none; readouts: what was recorded; stored: read from a dataset,
-    or simulated when it is asked for. Colour adds a leading channel axis. causes: what the numbers in `Events.cause`
-    mean, where the causes were asked for.
+    labels: (n,) uint8, or None where the source has none; tiles: of charts, `part.tiles.cut(image)` and
+    `part.tiles.labels`; readouts: what was recorded; stored: read from a dataset, or simulated when it is asked for.
+    Colour adds a leading channel axis. causes: what the numbers in `Events.cause` mean, where the causes were asked
+    for.
     """
 
     def __init__(
@@ -725,6 +729,14 @@ class Part:
     @cached_property
     def labels(self) -> np.ndarray | None:
         return self._backend.labels()
+
+    @property
+    def tiles(self) -> Tiles:
+        """The tiles of the chart that these images are of. Raises SpadError where they are of none, or of several."""
+        found = self._backend.tiles()
+        if found is None:
+            raise SpadError("these images are not of one chart; scene.images of a chart has source: chart")
+        return found
 
     @property
     def frames(self) -> Field[Frames]:
@@ -891,6 +903,10 @@ class _Stored:
             return None
         return np.concatenate([reader.read("labels") for _, _, reader in self._originals])
 
+    def tiles(self) -> Tiles | None:
+        facts = self._facts["tiles"]
+        return None if facts is None else of_facts(facts, self._facts["size"])
+
     def cuts(self, length: int, most: int) -> list[int]:
         return [start for start, _, _ in self._shards] + [length]
 
@@ -976,6 +992,9 @@ class _Simulated:
         labels = self._splits[self._split].labels
         return None if labels is None else labels[: self._experiment.wanted(self._splits[self._split])]
 
+    def tiles(self) -> Tiles | None:
+        return self._splits[self._split].tiles
+
     def cuts(self, length: int, most: int) -> list[int]:
         return _even_cuts(length, most)
 
@@ -1014,6 +1033,9 @@ class _Chosen:
     def labels(self) -> np.ndarray | None:
         labels = self._inner.labels()
         return None if labels is None else labels[np.asarray(self._indices, np.int64)]
+
+    def tiles(self) -> Tiles | None:
+        return self._inner.tiles()
 
     def cuts(self, length: int, most: int) -> list[int]:
         return _even_cuts(length, most)
@@ -1059,6 +1081,12 @@ class _Concatenated:
         found = [backend.labels() for backend in self._parts]
         known = [labels for labels in found if labels is not None]
         return np.concatenate(known) if len(known) == len(found) else None
+
+    def tiles(self) -> Tiles | None:
+        """Those of a chart that all parts show."""
+        found = [backend.tiles() for backend in self._parts]
+        facts = [None if tiles is None else tiles.facts() for tiles in found]
+        return found[0] if all(one == facts[0] for one in facts) else None
 
     def cuts(self, length: int, most: int) -> list[int]:
         sizes = np.diff(self._starts).tolist()
@@ -1145,6 +1173,7 @@ def stored(root: Path) -> Dataset:
         mine = [s for s in shards if s.level == level.text and s.split == split]
         originals = [s for s in shards if s.level is None and s.split == split]
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
+        own |= {"tiles": manifest["images"]["splits"][split].get("tiles"), "size": shape[-2:]}
         backend = _Stored(root, format, mine, originals, files, like, own)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
         length = manifest["images"]["splits"][split]["images"]

@@ -372,6 +372,7 @@ def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, 
                 split: {
                     "images": experiment.wanted(images),
                     "sha256": images.head(experiment.wanted(images)).sha256,
+                    **({} if images.tiles is None else {"tiles": images.tiles.facts()}),
                 }
                 for split, images in splits.items()
             },

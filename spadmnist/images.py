@@ -1,4 +1,4 @@
-"""Where the images come from: MNIST, IDX files, folders, arrays, digits drawn here, uniform light.
+"""Where the images come from: MNIST, IDX files, folders, arrays, digits drawn here, uniform light, charts.
 
 Each source is one class, chosen in a config by `scene.images: {source: NAME, ...}`; `load` gives the splits.
 Whatever a file contains, the outcome is the images or an InputError that names the file and what to do:
@@ -22,11 +22,12 @@ from typing import IO, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from . import disk, image_files
+from . import disk, image_files, tiles
 from .digits import draw_digit
 from .errors import InputError
 from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
-from .section import Section
+from .section import LATER, Section
+from .tiles import Tiles
 
 # SHA-256 of the unpacked files: packed copies differ from mirror to mirror
 MNIST_SHA256 = {
@@ -58,6 +59,7 @@ class Images:
     names        the file of each image, relative to the folder, where the source is a folder
     label_names  the class folder that each label stands for, where the source is a folder with classes
     ignored      how many files of the folder were left out because they are not images
+    tiles        where the tiles lie and which images they are, where the images are charts
     """
 
     pixels: np.ndarray
@@ -66,6 +68,7 @@ class Images:
     names: tuple[str, ...] | None = None
     label_names: tuple[str, ...] | None = None
     ignored: int = 0
+    tiles: Tiles | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (3, 4) or self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
@@ -114,6 +117,18 @@ class Images:
         names = None if self.names is None else self.names[:n]
         return replace(self, pixels=pixels, labels=labels, names=names)
 
+    def repeated(self, times: int) -> Images:
+        """Every image, with its label and name, `times` times, one after the other; of one image no memory is used."""
+        if times == 1:
+            return self
+        if len(self) == 1:
+            pixels = np.broadcast_to(self.pixels, (times, *self.pixels.shape[1:]))
+        else:
+            pixels = np.repeat(self.pixels, times, axis=0)
+        labels = None if self.labels is None else np.repeat(self.labels, times)
+        names = None if self.names is None else tuple(name for name in self.names for _ in range(times))
+        return replace(self, pixels=pixels, labels=labels, names=names)
+
     def describe(self) -> str:
         """One line for people: `400 images of 28 x 28, uint8, 10 classes`."""
         shape = " x ".join(str(n) for n in self.pixels.shape[1:])
@@ -148,6 +163,11 @@ def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) ->
 class _Source(Section):
     """What every source shares. `load` is for callers; each source writes `_read` and `describe`."""
 
+    source: str
+    repetitions: Annotated[int, LATER] = Field(
+        default=1, ge=1, le=1_000_000, description="how often each image comes, one after the other"
+    )
+
     def load(
         self,
         shape: tuple[int, int],
@@ -169,7 +189,10 @@ class _Source(Section):
         try:
             if images_dir is not None and not images_dir.is_dir():
                 raise InputError(f"{images_dir}: there is no such folder; correct --images-dir")
-            splits = self._read(shape, images_dir, base, limit)
+            least = None if limit is None else -(-limit // self.repetitions)
+            splits = self._read(shape, images_dir, base, least)
+            self._check_room(splits)
+            splits = {split: part.repeated(self.repetitions).head(limit) for split, part in splits.items()}
         except OSError as error:
             place = error.filename or self.describe()
             raise InputError(
@@ -187,9 +210,19 @@ class _Source(Section):
             )
         return splits
 
+    def _check_room(self, splits: dict[str, Images]) -> None:
+        """Raise InputError where the repetitions of several images take more than is allowed."""
+        several = sum(part.pixels.nbytes for part in splits.values() if len(part) > 1)
+        if self.repetitions > 1 and several * self.repetitions > image_files.MAX_BYTES:
+            raise InputError(
+                f"scene.images: {self.repetitions} repetitions of {self.describe()} take more than the "
+                f"{image_files.MAX_BYTES} bytes allowed; ask for fewer, or for fewer images (--limit)"
+            )
+
     def _read(
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
+        """The splits, each image once; of each split the first `limit` images will do."""
         raise NotImplementedError
 
     def describe(self) -> str:
@@ -752,12 +785,64 @@ class Uniform(_Source):
     def _read(
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
-        number = min(self.repetitions, limit or self.repetitions)
-        image = np.full((1, *shape), self.grey, np.uint8)
-        return {"train": Images(np.broadcast_to(image, (number, *shape)), None, 255.0)}
+        return {"train": Images(np.full((1, *shape), self.grey, np.uint8), None, 255.0)}
+
+
+# --- charts ----------------------------------------------------------------------------------------------
+
+
+class Chart(_Source):
+    """Many images of another source as tiles on one image of the sensor's size, as on a printed chart.
+
+    Each split of the source is a chart of its own: of `count` of its images, drawn by lot, each at most once. Tiles
+    lie row by row in the middle of the chart, which is black between them. `Part.tiles` cuts them out of an image.
+    """
+
+    source: Literal["chart"] = "chart"
+    of: Annotated[Mnist | Idx | Folder | Array | Digits | Uniform, Field(discriminator="source")] = Field(
+        default=Mnist(), description="the source of the tiles, as scene.images would name it"
+    )
+    count: int = Field(default=256, ge=1, le=1_000_000, description="number of tiles on a chart")
+    columns: int | None = Field(default=None, ge=1, le=100_000, description="tiles in a row; as many as rows")
+    pitch: int | None = Field(default=None, ge=1, le=100_000, description="pixels from tile to tile; the tile's size")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="another seed, other images of the source")
+
+    def describe(self) -> str:
+        return f"chart of {self.count} tiles from {self.of.describe()}"
+
+    def _read(
+        self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
+    ) -> dict[str, Images]:
+        found = self.of.load(shape, images_dir, base)
+        return {split: self._lay(stream, split, found[split], shape) for stream, split in enumerate(found)}
+
+    def _lay(self, stream: int, split: str, of: Images, shape: tuple[int, int]) -> Images:
+        if self.count > len(of):
+            raise InputError(
+                f"scene.images.count: {self.count} tiles cannot be drawn from the {len(of)} {split} images of "
+                f"{self.of.describe()}; ask for at most {len(of)}"
+            )
+        if self.pitch is not None and self.pitch < max(of.size):
+            raise InputError(
+                f"scene.images.pitch: tiles of {of.size[0]} x {of.size[1]} pixels would overlap at a pitch of "
+                f"{self.pitch}; give at least {max(of.size)}"
+            )
+        corners = tiles.grid(self.count, self.columns, self.pitch, of.size)
+        whole = corners.max(axis=0) + of.size
+        if (whole > shape).any():
+            raise InputError(
+                f"scene.images: the chart of {self.count} tiles of {of.size[0]} x {of.size[1]} pixels is "
+                f"{whole[0]} x {whole[1]} pixels (rows x columns), larger than the sensor's {shape[0]} x {shape[1]}; "
+                "lower count or pitch, change columns, or take a larger sensor.layout"
+            )
+        corners += (np.array(shape) - whole) // 2
+        numbers = tiles.drawn(len(of), self.count, (self.seed, stream))
+        chart = tiles.lay(of.pixels[numbers], corners, shape)
+        labels = None if of.labels is None else of.labels[numbers]
+        return Images(chart[None], None, of.white, tiles=Tiles(shape, of.size, corners, numbers, labels))
 
 
 ImageSource = Annotated[
-    Mnist | Idx | Folder | Array | Digits | Uniform,
+    Mnist | Idx | Folder | Array | Digits | Uniform | Chart,
     Field(discriminator="source"),
 ]

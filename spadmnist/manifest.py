@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -42,9 +42,17 @@ class _File(Section):
     sha256: Digest
 
 
+class _Tiles(Section):
+    size: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
+    corners: Annotated[list[Annotated[list[Whole], Field(min_length=2, max_length=2)]], Field(min_length=1)]
+    numbers: list[Whole]
+    labels: list[Annotated[int, Field(ge=0, le=255)]] | None = None
+
+
 class _Split(Section):
     images: Annotated[int, Field(ge=1)]
     sha256: Digest
+    tiles: _Tiles | None = None
 
 
 class _Images(Section):
@@ -149,6 +157,9 @@ def _compare(manifest: Mapping[str, Any], reader: Reader) -> None:
         elif (shard["number"], shard["start"]) != (number, start) or shard["stop"] <= start:
             say(("shards", i), f"it does not go on where the one before it ends, at number {number} and image {start}")
         ends[which] = [number + 1, shard["stop"]]
+    for split, facts in splits.items():
+        if tiles := facts.get("tiles"):
+            _check_tiles(tiles, manifest["images"]["shape"][-2:], ("images", "splits", split, "tiles"), reader)
     for level in (None, *texts):
         for split, facts in splits.items():
             held = ends.get((level, split), [0, 0])[1]
@@ -169,3 +180,14 @@ def _compare(manifest: Mapping[str, Any], reader: Reader) -> None:
                         say(("statistics", level, split, "saturated_pixels"), f"{method} is missing")
         if level is not None and level not in manifest["normalisation"]:
             say(("normalisation",), f"{level} is missing")
+
+
+def _check_tiles(tiles: Mapping[str, Any], shape: Sequence[int], path: tuple[str, ...], reader: Reader) -> None:
+    """Tiles of a chart lie on it, and each has a number and, where there are any, a label."""
+    n = len(tiles["corners"])
+    for key in ("numbers", "labels"):
+        if len(tiles.get(key) or [0] * n) != n:
+            reader.say((*path, key), f"there are {len(tiles[key])} for {n} tiles")
+    for axis in range(2):
+        if max(corner[axis] for corner in tiles["corners"]) + tiles["size"][axis] > shape[axis]:
+            reader.say((*path, "corners"), f"a tile leads beyond the chart of {shape[0]} x {shape[1]} pixels")

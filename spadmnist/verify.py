@@ -24,6 +24,7 @@ from .errors import InputError, SpadError
 from .experiment import Experiment
 from .factory import POSITIONS, Progress
 from .images import Images
+from .tiles import of_facts
 
 _PIECE = 1 << 22
 
@@ -279,7 +280,9 @@ def _images(
                 pixels = np.concatenate([r.read("pixels") for r in readers])
                 labelled = readers[0].has("labels")
                 labels = np.concatenate([r.read("labels") for r in readers]) if labelled else None
-                splits[split] = Images(pixels, labels, manifest["images"]["white"])
+                laid = manifest["images"]["splits"][split].get("tiles")
+                tiles = None if laid is None else of_facts(laid, pixels.shape[-2:])
+                splits[split] = Images(pixels, labels, manifest["images"]["white"], tiles=tiles)
             if all(splits[s].sha256 == facts["sha256"] for s, facts in manifest["images"]["splits"].items()):
                 return splits
     return experiment.load_images(images_dir)

@@ -23,7 +23,7 @@ LAYERS = [
     {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "compiled"},
     {"import_options"},
     {"disk", "kernels", "workers"},
-    {"document", "section", "plugins", "events", "image_files", "digits", "store"},
+    {"document", "section", "plugins", "events", "image_files", "digits", "store", "tiles"},
     {"validated"},
     {"effects", "readout", "images", "pictures", "window"},
     {"gather", "grids", "recording"},

@@ -36,6 +36,7 @@ from spadmnist.errors import InputError
 from spadmnist.image_files import read_idx
 from spadmnist.images import (
     Array,
+    Chart,
     Digits,
     Folder,
     Idx,
@@ -138,6 +139,7 @@ def test_check_size() -> None:
         ({"source": "array", "path": "a.npy"}, Array),
         ({"source": "digits", "train": 3}, Digits),
         ({"source": "uniform"}, Uniform),
+        ({"source": "chart", "of": {"source": "digits"}}, Chart),
     ],
 )
 def test_union(config: dict[str, Any], kind: type) -> None:

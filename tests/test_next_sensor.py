@@ -56,6 +56,24 @@ def test_a_value_is_written_along_what_it_runs(per: str, rows: int, columns: int
     assert np.array_equal(found, value)
 
 
+def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path) -> None:
+    """What is written is a sensor file, with the comments and the maps of the file that describes it."""
+    folder = tmp_path / "sensors"
+    folder.mkdir()
+    file = sensor_in(folder, 2, 3)
+    np.save(folder / "dcr.npy", np.arange(1.0, 7.0))
+    file.write_text(file.read_text().replace("{rate: 100 Hz}", "{rate: {file: dcr.npy}}  # measured"))
+    lab = tmp_path / "lab.yaml"
+    lab.write_text("seed: 1\nscene: {images: {source: uniform}, lux: [1 lux]}\nsensor: sensors/sensor.yaml\n")
+    with pytest.raises(InputError, match="is the sensor file itself"):
+        next_sensor.check_place(lab, file)
+    out = next_sensor.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
+    found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).settled().effects}
+    assert found["crosstalk"].probability == 0.005
+    assert np.array_equal(found["dark_counts"].rate, np.arange(1.0, 7.0))
+    assert "# measured" in out.read_text() and "scene" not in out.read_text()
+
+
 def test_codes_of_each_pixel_are_written_as_they_are(tmp_path: Path) -> None:
     file, widths = sensor_in(tmp_path, 2, 2), np.linspace(0.9, 1.1, 16).reshape(4, 4)
     key = OF_KIND["code"]

@@ -31,6 +31,7 @@ def check_place(source: Path, out: Path, ours: bool = False) -> None:
     """
     if not out.exists():
         return
+    source = _described_in(source)
     if source.exists() and out.samefile(source):
         raise InputError(f"{out} is the sensor file itself, which stays as it is; name another folder or file with -o")
     if out.is_dir():
@@ -40,6 +41,15 @@ def check_place(source: Path, out: Path, ours: bool = False) -> None:
             f"{out} is there already and no sensor file that a fit or a diagnosis has written; it is left alone: name "
             "another folder or file with -o"
         )
+
+
+def _described_in(source: Path) -> Path:
+    """The file that describes the sensor: `source`, or the one that it names, as a config may."""
+    if not source.is_file():
+        return source
+    raw = document.read(source).value
+    named = raw.get("sensor") if isinstance(raw, Mapping) else None
+    return source.parent / named if isinstance(named, str) else source
 
 
 def _is_ours(file: Path) -> bool:
@@ -57,6 +67,7 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     median where it does not. Raises SpadError where the file cannot be read again; then none is left there.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
+    source = _described_in(source)
     text = source.read_text(encoding="utf-8-sig")
     chip = config.read_sensor(source)
     shape = chip.layout.shape
