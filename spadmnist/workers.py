@@ -11,6 +11,14 @@ if TYPE_CHECKING:
     from joblib import Parallel
 
 
+def processors() -> int:
+    """How many processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
 @contextlib.contextmanager
 def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
     """joblib's `Parallel` with these options, whose workers run no file of the current folder.
