@@ -54,6 +54,11 @@ _PUBLIC = {
     "Dataset": "dataset",
     "Part": "dataset",
     "open_measurement": "measurement",
+    "Capture": "measurement",
+    "simulate": "library",
+    "compare": "library",
+    "diagnose": "library",
+    "fit": "library",
     "Measurement": "measurement",
     "Events": "events",
     "Layout": "events",
@@ -66,14 +71,18 @@ _PUBLIC = {
     "SpadError": "errors",
 }
 
-__all__ = sorted(_PUBLIC)
+_MODULES = ("effects",)  # spadmnist.effects.DarkCounts(rate=100.0)
+
+__all__ = sorted([*_PUBLIC, *_MODULES])
 
 
 def __getattr__(name: str) -> "Any":
-    if name not in _PUBLIC:
-        raise AttributeError(f"module 'spadmnist' has no attribute {name!r}")
     from importlib import import_module
 
+    if name in _MODULES:
+        return import_module(f".{name}", __name__)
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'spadmnist' has no attribute {name!r}")
     return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
 
 

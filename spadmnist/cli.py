@@ -22,7 +22,7 @@ import click
 
 from . import interrupts
 from .foreign import quoted, short, visible, visible_lines
-from .workers import safe_path
+from .workers import processors, safe_path
 
 if TYPE_CHECKING:
     from .criticism.answer import Diagnosis
@@ -205,7 +205,7 @@ def generate(
         _say(f"Note: {note}")
     images = experiment.load_images(images_dir)
     root = output if output is not None else Path(config.stem)
-    workers = jobs or factory.most_workers(experiment, images, _processors())
+    workers = jobs or factory.most_workers(experiment, images, processors())
     if dry_run:
         from . import plan
 
@@ -307,7 +307,7 @@ def reconstruct_(
                 "sensor: leave it out"
             )
     with _terminal() as progress:
-        added, manifest = factory.add_reconstructions(dataset, methods, jobs or _processors(), progress)
+        added, manifest = factory.add_reconstructions(dataset, methods, jobs or processors(), progress)
     if as_json:
         _print_json({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
         return
@@ -481,7 +481,7 @@ def verify(
         damage = library.verify(dataset, progress)
         left, did = damage, []
         if repair:
-            did = library.repair(dataset, damage, jobs or _processors(), images_dir, progress)
+            did = library.repair(dataset, damage, jobs or processors(), images_dir, progress)
             left = library.verify(dataset, progress) if damage else damage
     if as_json:
         found = {
@@ -777,7 +777,7 @@ def compare(
             progress.advance(100 * share - done[0], what)
             done[0] = 100 * share
 
-        found = criticism.compare(model, data, seed, smallest, jobs or _processors(), progress=told)
+        found = criticism.compare(model, data, seed, smallest, jobs or processors(), progress=told)
         progress.stop()
     _write_answer(json_file, criticism.canonical(found))
     if output is not None:
@@ -821,7 +821,8 @@ def diagnose(
     spadmnist diagnose sensor.yaml lab/2025-03-01 --plugin echo.py --json answer.json
     """
     from . import measurement as measurements
-    from .criticism import answer, next_sensor
+    from . import sensor_file
+    from .criticism import answer
     from .criticism import diagnose as criticism
 
     _load(plugin_files)
@@ -830,9 +831,9 @@ def diagnose(
         from . import pages
 
         pages.check_place(output, "diagnosis")
-        next_sensor.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
+        sensor_file.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
     _check_answer(json_file)
-    found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or _processors(), progress=_say)
+    found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or processors(), progress=_say)
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
@@ -870,14 +871,15 @@ def fit(
     spadmnist fit sensor.yaml lab --free dead_time.duration --per-pixel detection.pdp -o next.yaml
     """
     from . import measurement as measurements
-    from .criticism import answer, next_sensor
+    from . import sensor_file
+    from .criticism import answer
     from .criticism import fitted as criticism
 
     _load(plugin_files)
     model, data = _model(sensor, crop), measurements.open(measurement)
-    next_sensor.check_place(sensor, output)
+    sensor_file.check_place(sensor, output)
     _check_answer(json_file)
-    found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or _processors(), progress=_say)
+    found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or processors(), progress=_say)
     _write_next(found, sensor, output, model)
     _write_answer(json_file, answer.canonical(found))
     _print_lines(answer.table(found))
@@ -887,11 +889,12 @@ def fit(
 
 def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:
     """Write the next sensor file. Where that fails the answer says why, and stays."""
-    from .criticism import answer, next_sensor
+    from . import sensor_file
+    from .criticism import answer
 
     try:
         with _writing(out):
-            found.file = str(next_sensor.write(source, out, found.values, answer.notes(found), model.window))
+            found.file = str(sensor_file.write(source, out, found.values, answer.notes(found), model.window))
     except Exception as error:  # whatever it is, hours of work are not lost for it
         if os.environ.get("SPADMNIST_DEBUG"):
             raise
@@ -997,13 +1000,6 @@ def _duration(seconds: float) -> str:
 
 _HEAD = 200  # bytes in which an answer says its format
 _MISTAKES = 30  # of a file, said one a line; a screen holds them
-
-
-def _processors() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
 
 
 def _load(plugin_files: tuple[Path, ...]) -> None:
@@ -1186,7 +1182,7 @@ def _check_limits() -> None:
             "to begin with; raise that limit"
         )
     told = [os.environ.get(name, "") for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")]
-    each = min(_processors(), _MOST_THREADS, *(int(text) for text in told if text.isdecimal() and int(text) > 0))
+    each = min(processors(), _MOST_THREADS, *(int(text) for text in told if text.isdecimal() and int(text) > 0))
     end = threading.Event()
     started = []
     try:

@@ -6,10 +6,11 @@ follows. Nothing that cannot be seen is passed on as it is.
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 _DEEPEST = 64  # groups within groups of JSON: a config has at most 50, and stands in a manifest
@@ -68,6 +69,16 @@ def quoted(word: str | os.PathLike[str]) -> str:
     # what a shell calls ANSI-C quoting takes bytes by their numbers
     escapes = {"'": "\\'", "\\": "\\\\"}
     return "$'" + "".join(escapes.get(c) or (c if c.isprintable() else _bytes_of(c)) for c in text) + "'"
+
+
+def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table for a notebook, everything in it escaped."""
+
+    def line(cells: Sequence[object], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(visible(cell))}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f"<div><p>{html.escape(visible(title))}</p><table>{line(head, 'th')}{body}</table></div>"
 
 
 def _seen(character: str) -> str:

@@ -440,6 +440,65 @@ class Plugin:
         return (inspect.cleandoc(cls.__doc__) if cls.__doc__ else "(no description)").split("\n")[0]
 
 
+def check_values(plugin: Plugin) -> None:
+    """Raise InputError where a parameter has a value that is not possible: numbers, arrays and tables of them."""
+    for name, declared in plugin.parameters.items():
+        value, place = getattr(plugin, name), f"{plugin.name}.{name}"
+        if declared.required and value is None:
+            raise InputError(f"{place} is missing; it is {declared.about}")
+        if value is None or isinstance(value, MapFile | Distribution):
+            continue
+        if declared.choices:
+            if value not in declared.choices:
+                raise InputError(f"{place} is {value!r}; it is {declared.allowed()}")
+            continue
+        if declared.unit == "bool":
+            if not isinstance(value, bool | np.bool_):
+                raise InputError(f"{place} is {value!r}; it is True or False")
+            continue
+        if isinstance(value, Mapping):
+            raise InputError(f"{place}: give a table over the wavelength as ByWavelength(wavelengths, values)")
+        numbers = np.asarray(value.values if isinstance(value, ByWavelength) else value)
+        if numbers.dtype.kind not in "fiu":
+            raise InputError(f"{place} is {value!r}; it is a number in {declared.unit or 'units of 1'}")
+        if numbers.ndim and not declared.per and not isinstance(value, ByWavelength):
+            raise InputError(f"{place} is one number for all pixels, not an array")
+        for end in (numbers.min(), numbers.max()) if numbers.size else ():
+            try:
+                declared.check(float(end))
+            except ValueError as error:
+                raise InputError(f"{plugin.name}: {error}") from None
+
+
+def described(declared: Parameter, value: Any) -> str:
+    """A value with its unit in a few words: a number, a table over the wavelength, a map by its median and range."""
+
+    def number(x: float) -> str:
+        return units.show(float(x), declared.unit) if declared.unit not in ("", "bool") else f"{float(x):.4g}"
+
+    if value is None:
+        return "-"
+    if isinstance(value, ByWavelength):
+        pairs = zip(value.wavelengths, value.values, strict=True)
+        return ", ".join(f"{units.show(at, 'm')}: {number(x)}" for at, x in pairs)
+    if isinstance(value, MapFile):
+        return f"map {value.path.name}"
+    if isinstance(value, Distribution):
+        if value.parts:
+            return "mixture of " + " and ".join(f"{share:.3g} {described(declared, one)}" for share, one in value.parts)
+        names = _DISTRIBUTIONS[value.kind]
+        first, second = value.numbers
+        spread = f"{second:.4g}" if value.kind == "lognormal" else number(second)
+        return f"{value.kind}, {names[0]} {number(first)}, {names[1]} {spread}"
+    if isinstance(value, bool | np.bool_ | str):
+        return str(value).lower() if not isinstance(value, str) else value
+    if np.ndim(value):
+        flat = np.asarray(value, float)
+        per = declared.per or "pixel"
+        return f"per {per}: median {number(np.median(flat))}, {number(flat.min())} to {number(flat.max())}"
+    return number(value)
+
+
 def source_file(cls: type) -> str:
     """The file in which a class stands."""
     module = sys.modules.get(cls.__module__)

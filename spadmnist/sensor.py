@@ -7,21 +7,22 @@ beyond the paper's line, `kernels.paper_line` does the same, image by image, in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from . import kernels
+from . import kernels, units
 from .effects import Chip, Conditions, Effect, in_order
 from .effects.afterpulsing import Afterpulsing
 from .effects.dead_time import DeadTime
 from .effects.tdc import Tdc
-from .errors import EffectError, InputError, SpadError
+from .errors import EffectError, InputError, SpadError, did_you_mean
 from .events import Children, Events, Layout
-from .plugins import blame, settle, source_file
+from .foreign import html_table, visible
+from .plugins import blame, check_values, described, settle, source_file
 from .readout import Frames, Recorded, counts_type, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
 from .window import Window
@@ -34,7 +35,7 @@ _NOBODY = np.zeros(0, np.int64)
 _HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more of them is left out
 
 
-@dataclass
+@dataclass(repr=False)
 class Sensor:
     """Layout, effects and chip seed. The effects' values may still be distributions and files; see `settled`.
 
@@ -71,6 +72,76 @@ class Sensor:
     def changed(self, **fields: Any) -> Sensor:
         """The same sensor, or the same part of it, with other `effects` or another `chip_seed`, settled."""
         return replace(self, **fields, _settled=False).settled()
+
+    def with_effect(self, effect: Effect) -> Sensor:
+        """The same sensor with one effect more, settled. Raises InputError where it lists it, or for a wrong value."""
+        if self.effect(effect.name) is not None:
+            named = next(iter(effect.parameters), "parameter")
+            raise InputError(
+                f"the sensor lists {effect.name} already; another value of it: "
+                f'with_values({{"{effect.name}.{named}": ...}})'
+            )
+        check_values(effect)
+        return self.changed(effects=[*self.effects, effect])
+
+    def without(self, effect: str) -> Sensor:
+        """The same sensor without an effect, settled. Raises InputError where it does not list it."""
+        self._listed(effect)
+        return self.changed(effects=[e for e in self.effects if e.name != effect])
+
+    def with_values(self, values: Mapping[str, Any]) -> Sensor:
+        """The same sensor with other values, settled.
+
+        values: `"effect.parameter"` -> a number in SI, or a map, (pixels,) or (rows, columns). Raises InputError for
+        what the sensor does not list, or a value that is not possible.
+        """
+        given: dict[str, dict[str, Any]] = {}
+        for key, value in values.items():
+            name, _, parameter = key.partition(".")
+            listed = self._listed(name)
+            if parameter not in listed.parameters:
+                hint = did_you_mean(parameter, listed.parameters)
+                raise InputError(f"{key}: {name} has {', '.join(listed.parameters) or 'no parameters'}.{hint}")
+            given.setdefault(name, {})[parameter] = value
+        effects = []
+        for effect in self.effects:
+            own = {name: getattr(effect, name) for name in effect.parameters}
+            effects.append(type(effect)(**{**own, **given.get(effect.name, {})}))
+            check_values(effects[-1])
+        return self.changed(effects=effects)
+
+    def _listed(self, name: str) -> Effect:
+        effect = self.effect(name)
+        if effect is None:
+            known = [e.name for e in self.effects]
+            add = "; with_effect adds one" if name in Effect.registry else ""
+            raise InputError(f"the sensor lists no {name}, but {', '.join(known)}{add}.{did_you_mean(name, known)}")
+        return effect
+
+    def rows(self) -> list[tuple[str, str, str, str]]:
+        """(stage, effect, parameter, value with its unit) of every parameter, in the order of the stages."""
+        return [
+            (effect.stage, effect.name, name, described(declared, getattr(effect, name)))
+            for effect in in_order(self.effects)
+            for name, declared in effect.parameters.items()
+        ] or [("", "no effects", "", "")]
+
+    def _title(self) -> str:
+        at = self.layout
+        area = (
+            "" if np.isnan(at.pixel_area) else f" of {units.show(at.pixel_area, 'm^2')}, fill factor {at.fill_factor:g}"
+        )
+        part = f", {self.window}" if self.window else ""
+        return f"Sensor {self.name or '(no name)'}: {at.rows} x {at.columns} pixels{area}, rules: {self.rules}{part}"
+
+    def __repr__(self) -> str:
+        rows = [tuple(map(visible, row)) for row in (("stage", "effect", "parameter", "value"), *self.rows())]
+        widths = [max(len(row[i]) for row in rows) for i in range(4)]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return "\n".join([visible(self._title()), *lines])
+
+    def _repr_html_(self) -> str:
+        return html_table(self._title(), ("stage", "effect", "parameter", "value"), self.rows())
 
     def cropped(self, rows: slice, columns: slice) -> Sensor:
         """The part of the chip in these rows and columns, settled; of pixels that are listed one by one, of one row.

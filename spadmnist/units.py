@@ -181,6 +181,15 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     return f"{rounded:.0f} {best[0]}" if plain else f"{number:.{digits}g} {best[0]}"
 
 
+def exact(value: float, unit: str) -> str:
+    """The shortest text that is read back as exactly this number (SI)."""
+    for digits in (6, 9, 12, 15, 17):
+        text = show(value, unit, digits)
+        if "e" not in text.split()[0] and parse(text, unit) == value:
+            return text
+    return f"{float(value)!r} {unit}"
+
+
 def factor(value: float) -> str:
     """A factor for people: 1.0203, 0.00041."""
     return f"{value:.4f}" if value == 0 or abs(value) >= 0.01 else f"{value:.2g}"

@@ -26,6 +26,14 @@ _LEAST = 2 << 30  # bytes of it, from which on arrays are put there
 _PREFIX = "spadmnist-workers-"
 
 
+def processors() -> int:
+    """How many processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
 @contextlib.contextmanager
 def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
     """joblib's `Parallel` with these options, whose workers run no file of the current folder.

@@ -12,8 +12,8 @@ import laws
 import numpy as np
 import pytest
 
-from spadmnist import config, measurement, plugins, twin
-from spadmnist.criticism import candidates, likelihood, memory, next_sensor, recordings
+from spadmnist import config, measurement, plugins, sensor_file, twin
+from spadmnist.criticism import candidates, likelihood, memory, recordings
 from spadmnist.effects import Chip, Conditions, Effect, parameter
 from spadmnist.errors import EffectError, InputError
 from spadmnist.events import Events, Layout
@@ -612,7 +612,7 @@ def test_the_next_sensor_describes_the_whole_chip(lab: Path, tmp_path: Path) -> 
         ("afterpulsing", "lifetime"): 30e-9,
         ("dead_time", "duration"): 45e-9,
     }
-    out = next_sensor.write(lab / "sensor.yaml", tmp_path / "sensor.yaml", values, {}, part.window)
+    out = sensor_file.write(lab / "sensor.yaml", tmp_path / "sensor.yaml", values, {}, part.window)
     again = config.read_sensor(out).cropped(slice(16, 32), slice(8, 24))
     found = candidates.with_values(part, values)
     for one, other in ((again, found), (again.chip, found.chip)):

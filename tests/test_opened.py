@@ -18,8 +18,7 @@ from test_importers import LINO, run, words
 from test_shards import at_once
 
 import spadmnist
-from spadmnist import config, disk, document, images, measurement, plugins, verify
-from spadmnist.criticism import next_sensor
+from spadmnist import config, disk, document, images, measurement, plugins, sensor_file, verify
 from spadmnist.errors import InputError, SpadError
 
 
@@ -90,7 +89,7 @@ def as_capture(path: Path) -> object:
 
 
 def as_next_sensor(path: Path) -> None:
-    next_sensor.check_place(path.parent / "sensor.yaml", path)
+    sensor_file.check_place(path.parent / "sensor.yaml", path)
 
 
 USES: list[tuple[Callable[[Path], object], str]] = [

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from spadmnist import cli, config
+from spadmnist import cli, config, sensor_file
 from spadmnist import measurement as measurements
-from spadmnist.criticism import answer, compare, diagnose, next_sensor
+from spadmnist.criticism import answer, compare, diagnose
 from spadmnist.errors import InputError
 from spadmnist.measurement import Measurement
 
@@ -213,8 +213,8 @@ def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text(TR)
     with pytest.raises(InputError, match="stays as it is"):
-        next_sensor.check_place(file, tmp_path / "." / "sensor.yaml")
-    next_sensor.check_place(file, tmp_path / "next" / "sensor.yaml")
+        sensor_file.check_place(file, tmp_path / "." / "sensor.yaml")
+    sensor_file.check_place(file, tmp_path / "next" / "sensor.yaml")
 
 
 def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
@@ -223,17 +223,17 @@ def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text(TR + "# typical; from data sheet, 2024-05-01\n")
     with pytest.raises(InputError, match="it is left alone"):
-        next_sensor.check_place(file, own)
-    next_sensor.check_place(file, own, ours=True)
+        sensor_file.check_place(file, own)
+    sensor_file.check_place(file, own, ours=True)
     with pytest.raises(InputError, match="is a folder"):
-        next_sensor.check_place(file, tmp_path)
+        sensor_file.check_place(file, tmp_path)
     key = ("dead_time", "duration")
-    made = next_sensor.write(file, tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"})
-    next_sensor.check_place(file, made)
+    made = sensor_file.write(file, tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"})
+    sensor_file.check_place(file, made)
     made.write_text(made.read_text().partition("\n")[2])  # the line that says so
     with pytest.raises(InputError, match="it is left alone"):
-        next_sensor.check_place(file, made)
-    next_sensor.check_place(file, tmp_path / "new.yaml")
+        sensor_file.check_place(file, made)
+    sensor_file.check_place(file, tmp_path / "new.yaml")
 
 
 def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):

@@ -393,7 +393,7 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     usual, settled = dict(step.values), course.values[DURATION]
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(course_of.Course, "failed", property(lambda self: [] if self.state is state else [check]))
-    exact = likelihood.Exact({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, [1.0])
+    exact = likelihood.Exact({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, [1.0], (DURATION,), np.eye(1))
     monkeypatch.setattr(likelihood, "settled", lambda *_, **__: exact)
     course_of.settle_exactly(course, data)
     assert bool(course.failed) != rival and (course.state is state) == rival

@@ -126,6 +126,8 @@ class Diagnosis:
     dark: list[str] = field(default_factory=list)  # captures without light
     crop: str | None = None  # the part of the sensor that was measured: rows, columns
     untried: list[dict[str, Any]] = field(default_factory=list)  # candidates that cannot be simulated
+    # ("effect.parameter" of fitted numbers, their covariance in SI): of a fit
+    covariance: tuple[list[str], np.ndarray] = field(default_factory=lambda: ([], np.zeros((0, 0))), repr=False)
     unwritten: str = ""  # why there is no next sensor file where one was asked for
 
     def as_data(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 from scipy import stats
 
 from ..effects import Effect
@@ -85,7 +86,32 @@ def fitted(
             bench.simulations,
             bench.dark,
             str(bench.start.window) if bench.start.window else None,
+            covariance=_covariance(course, exact),
         )
+
+
+def _covariance(course: Course, exact: likelihood.Exact | str) -> tuple[list[str], np.ndarray]:
+    """("effect.parameter" of the fitted numbers, their covariance in SI).
+
+    Its diagonal is that of the 95 % intervals, taken as symmetric; the correlations are those of the likelihood, or of
+    the last fit by simulation.
+    """
+    free: tuple[Key, ...] = ()
+    correlations = np.zeros((0, 0))
+    if not isinstance(exact, str):
+        free, correlations = exact.free, exact.correlations
+    elif course.settled is not None:
+        free, matrix = tuple(dial.key for dial in course.settled.dials), course.settled.covariance
+        spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        correlations = matrix / np.outer(spread, spread)
+    told = {(s.change.effect, name): v for s in course.steps if not s.change.carrier for name, v in s.values.items()}
+    at, errors = [], []
+    for i, key in enumerate(free):
+        value = told.get(key)
+        if value is not None and value.low is not None and value.high is not None:
+            at.append(i)
+            errors.append((value.high - value.low) / (2 * 1.96))
+    return [".".join(free[i]) for i in at], correlations[np.ix_(at, at)] * np.outer(errors, errors)
 
 
 def _by_likelihood(course: Course, wanted: Sequence[Change], exact: likelihood.Exact) -> None:

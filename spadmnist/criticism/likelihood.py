@@ -47,11 +47,16 @@ _SHARP = 0.1  # of a lifetime: stamps must be so exact
 
 @dataclass(frozen=True)
 class Exact:
-    """Numbers that maximise the likelihood, with intervals of 95 %; gains: of twice its logarithm, of each change."""
+    """Numbers that maximise the likelihood, with intervals of 95 %; gains: of twice its logarithm, of each change.
+
+    correlations: (n, n) of the numbers `free`, by the curvature of the likelihood at its maximum.
+    """
 
     values: dict[Key, float]
     intervals: dict[Key, tuple[float, float]]
     gains: list[float]
+    free: tuple[Key, ...]
+    correlations: np.ndarray
 
 
 # --- what has a likelihood ---------------------------------------------------------------------------------------
@@ -562,4 +567,6 @@ def settled(
         without.begin(np.zeros(0))
         without.own = function.own
         gains.append(2 * (best - without(np.zeros(0))))
-    return Exact({**fixed, **found}, intervals, gains)
+    inverse = np.linalg.inv(top.curved)
+    spread = np.sqrt(np.diag(inverse))
+    return Exact({**fixed, **found}, intervals, gains, tuple(found), inverse / np.outer(spread, spread))

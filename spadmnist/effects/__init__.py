@@ -39,6 +39,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from .. import plugins
+from ..errors import did_you_mean
 from ..events import Layout
 from ..plugins import Parameter, Plugin, Registry, parameter
 
@@ -187,3 +189,23 @@ def in_order(effects: list[Effect]) -> list[Effect]:
         ordered.append(ready[0])
         waiting.remove(ready[0])
     return sorted(ordered, key=lambda e: (stages.index(e.stage), e.last))
+
+
+def __getattr__(name: str) -> Any:
+    """The class of an effect by its name, `spadmnist.effects.DarkCounts`, whichever file it stands in."""
+    if name.startswith("_"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    plugins.discover()
+    known = _classes()
+    if name not in known:
+        raise AttributeError(f"{name} is not an effect; spadmnist effects lists all.{did_you_mean(name, known)}")
+    return known[name]
+
+
+def __dir__() -> list[str]:
+    plugins.discover()
+    return sorted([*__all__, *_classes()])
+
+
+def _classes() -> dict[str, type[Effect]]:
+    return {cls.__name__: cls for cls in map(Effect.registry.find, Effect.registry)}

@@ -7,6 +7,7 @@ uniform images opens as a measurement.
 
 from __future__ import annotations
 
+from .arrays import Capture, Data, in_memory
 from .entries import FILE, FORMAT, check_name
 from .reader import is_measurement, open
 from .type import Measurement
@@ -14,4 +15,7 @@ from .writer import fill, write
 
 open_measurement = open  # its name in the package
 
-__all__ = ["FILE", "FORMAT", "Measurement", "check_name", "fill", "is_measurement", "open", "open_measurement", "write"]
+__all__ = [
+    "FILE", "FORMAT", "Capture", "Data", "Measurement", "check_name", "fill", "in_memory", "is_measurement", "open",
+    "open_measurement", "write"
+]  # fmt: skip

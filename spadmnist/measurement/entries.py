@@ -32,12 +32,12 @@ def _name(raw: object) -> str:
     raise ValueError(f"{brief(raw)} is not a name: a line of 1 to {_LONGEST} characters{hint}")
 
 
-def check_name(name: str) -> None:
-    """Raise SpadError for a name that a measurement cannot have."""
+def check_name(name: str, place: str = "--name") -> None:
+    """Raise SpadError for a name that a measurement, or a capture, cannot have. place: where it was said."""
     try:
         _name(name)
     except ValueError as error:
-        raise SpadError(f"--name: {error}") from None
+        raise SpadError(f"{place}: {error}") from None
 
 
 def _inside(raw: object, info: ValidationInfo) -> str:

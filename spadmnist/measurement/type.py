@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .. import units
 from ..errors import InputError, did_you_mean
 from ..events import Layout
-from ..foreign import quoted
+from ..foreign import html_table, quoted
 from ..plugins import ByWavelength
 from ..recording import Capture, Recording
 from ..sensor import Sensor
+from .arrays import Data, measurement_of
 from .entries import FILE
 
 
@@ -41,6 +43,46 @@ class Measurement:
 
     def __repr__(self) -> str:
         return f"Measurement({self.name}: {_size(self.layout)} pixels; {_row([c.id for c in self.captures])})"
+
+    @classmethod
+    def from_arrays(cls, layout: Layout, arrays: Mapping[Capture, Any], name: str = "measurement") -> Measurement:
+        """A measurement of arrays in memory.
+
+        Args:
+            layout: of the sensor, `sensor.layout`.
+            arrays: the data of each `spadmnist.Capture`. QIS, STR and counts: (M, rows, columns); QIS 0 or 1, counts
+                unsigned, STR seconds (float; not a number, or the frame time: no detection) or ticks (integers). TR:
+                (times, pixels), both (detections,), in any order: seconds (float) or ticks (integers), and pixels
+                counted row by row.
+            name: of the measurement.
+
+        Raises:
+            InputError: where the arrays are not what their captures say.
+        """
+        return measurement_of(layout, arrays, name)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write it as `measurement.yaml` and a file for each capture; the folder. Raises SpadError as `write` does."""
+        from .writer import write
+
+        data = (c if c.mean is not None else self.recording(c.id) for c in self.captures)
+        return write(folder, self.name, self.layout, data, self.captures)
+
+    def __getitem__(self, id: str) -> Data:
+        """The data of a capture. Raises InputError as `recording` does."""
+        return Data(self.recording(id))
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the captures."""
+        return iter([capture.id for capture in self.captures])
+
+    def __len__(self) -> int:
+        return len(self.captures)
+
+    def _repr_html_(self) -> str:
+        rows = [[c.id, c.modality, _light_of(c), units.show(c.conditions.exposure, "s")] for c in self.captures]
+        head = ["capture", "modality", "light", "exposure"]
+        return html_table(f"{self.name}: {_size(self.layout)} pixels", head, rows)
 
     def capture(self, id: str) -> Capture:
         """The capture of that name. Raises InputError with a sentence."""
@@ -124,6 +166,16 @@ class Measurement:
         theirs = layout.positions
         if mine.positions is not None and theirs is not None and not np.allclose(theirs, mine.positions, 0, 1e-9):
             raise InputError(f"{self.source}: layout.positions are not those of the sensor; correct one of them")
+
+
+def _light_of(capture: Capture) -> str:
+    light = capture.light
+    if light.wavelength is None:
+        return "dark"
+    level = "level free"
+    if light.level is not None:
+        level = units.show(light.level, "lux" if light.kind_of_level == "lux" else "W/m^2")
+    return f"{units.show(light.wavelength, 'm')}, {level}"
 
 
 def _size(layout: Layout) -> str:

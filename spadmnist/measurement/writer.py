@@ -244,9 +244,9 @@ def _entry(capture: Capture, file: str) -> dict[str, Any]:
     lit, c = capture.light, capture.conditions
     shown: dict[str, Any] = {"kind": "dark" if lit.dark else "flat"}
     if lit.wavelength is not None:
-        shown["wavelength"] = _written(lit.wavelength, "m")
+        shown["wavelength"] = units.exact(lit.wavelength, "m")
         if lit.level is not None:
-            shown[lit.kind_of_level] = _written(lit.level, "lux" if lit.kind_of_level == "lux" else "W/m^2")
+            shown[lit.kind_of_level] = units.exact(lit.level, "lux" if lit.kind_of_level == "lux" else "W/m^2")
     for key in ("relative_uncertainty", "own_uncertainty"):
         if getattr(lit, key):
             shown[key] = getattr(lit, key)
@@ -254,18 +254,9 @@ def _entry(capture: Capture, file: str) -> dict[str, Any]:
     entry |= {"file": file} if capture.mean is None else {"mean": float(capture.mean)}
     entry |= {"modality": capture.modality, "light": shown}
     if capture.modality == "tr":
-        return entry | {"exposure": _written(c.exposure, "s")}
+        return entry | {"exposure": units.exact(c.exposure, "s")}
     entry |= {"frames": c.frames}
-    entry |= {"frame_time": _written(c.frame_time, "s"), "frame_period": _written(c.frame_period, "s")}
+    entry |= {"frame_time": units.exact(c.frame_time, "s"), "frame_period": units.exact(c.frame_period, "s")}
     if capture.modality == "counts" and capture.mean is not None:
         entry |= {"bits": c.bits, "counting": c.counting}
     return entry
-
-
-def _written(value: float, unit: str) -> str:
-    """The shortest text that is read back as exactly this number."""
-    for digits in (6, 9, 12, 15, 17):
-        text = units.show(value, unit, digits)
-        if "e" not in text.split()[0] and units.parse(text, unit) == value:
-            return text
-    return f"{value!r} {unit}"

@@ -4,8 +4,8 @@ Names come from users' files, so all text is escaped by the template, every pict
 page forbids the browser to fetch or run anything. The same answer gives the same bytes.
 """
 
-from ._comparison import comparison
-from ._diagnosis import diagnosis
+from ._comparison import check_figure, comparison
+from ._diagnosis import diagnosis, trace_figure
 from ._frame import FILES, check_place
 
-__all__ = ["FILES", "check_place", "comparison", "diagnosis"]
+__all__ = ["FILES", "check_figure", "check_place", "comparison", "diagnosis", "trace_figure"]

@@ -113,16 +113,27 @@ def _colour(check: Check, significant: set[int]) -> str:
     return "low" if check.p_value < 0.01 else "lowish" if check.p_value < 0.05 else "passes"
 
 
+def check_figure(check: Check) -> Figure:
+    """The figure of a check that has cells: measured, expected, residuals."""
+    cells = _cells(check)
+    assert cells is not None
+    return figures.figure_of(cells)
+
+
 def _picture(check: Check) -> Picture | None:
     """Measured beside simulated, cell by cell, and how far they are apart."""
+    cells = _cells(check)
+    words = f"{check.statistic} of {check.capture}: measured and simulated. Clearest at {check.where}: {check.size}"
+    return None if cells is None else figures.picture(cells, words)
+
+
+def _cells(check: Check) -> Cells | None:
     summary, judgement = check.summary, check.judgement
     if summary is None or judgement is None or not np.size(summary.values):
         return None
-    words = f"{check.statistic} of {check.capture}: measured and simulated. Clearest at {check.where}: {check.size}"
     spread = np.broadcast_to(figures.finite(judgement.spread), np.shape(summary.values))
     expected, residuals = figures.finite(judgement.expected), figures.finite(judgement.residuals)
-    cells = Cells(check.statistic, summary, expected, spread, residuals, int(judgement.worst))
-    return figures.picture(cells, words)
+    return Cells(check.statistic, summary, expected, spread, residuals, int(judgement.worst))
 
 
 def _light_picture(nuisances: Sequence[Nuisance]) -> Picture:

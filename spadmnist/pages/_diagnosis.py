@@ -197,17 +197,31 @@ def _limit(entry: Mapping[str, Any]) -> tuple[str, str]:
 # --- pictures -------------------------------------------------------------------------------------------------------
 
 
+def trace_figure(trace: Trace) -> Figure:
+    """The figure of a trace: measured, the model before and after, residuals."""
+    return figures.figure_of(_cells(trace))
+
+
+def _residuals(trace: Trace) -> tuple[np.ndarray, np.ndarray]:
+    """(before, after)."""
+    both = trace.residuals_before, trace.residuals_after
+    earlier, now = (np.clip(figures.finite(z), -_BEYOND, _BEYOND) for z in both)
+    return earlier, now
+
+
+def _cells(trace: Trace) -> Cells:
+    earlier, now = _residuals(trace)
+    before, after, spread = (figures.finite(values) for values in (trace.before, trace.after, trace.spread))
+    worst = int(np.argmax(np.abs(earlier)))
+    return Cells(trace.statistic, trace.summary, after, spread, now, worst, before, earlier)
+
+
 def _checked(trace: Trace) -> _Card:
-    earlier, now = (
-        np.clip(figures.finite(z), -_BEYOND, _BEYOND) for z in (trace.residuals_before, trace.residuals_after)
-    )
+    earlier, now = _residuals(trace)
     picture = None
     if now.size:
-        before, after, spread = (figures.finite(values) for values in (trace.before, trace.after, trace.spread))
-        worst = int(np.argmax(np.abs(earlier)))
-        cells = Cells(trace.statistic, trace.summary, after, spread, now, worst, before, earlier)
         words = f"{trace.statistic} of {trace.capture}: measured, model before, model after"
-        picture = figures.picture(cells, words)
+        picture = figures.picture(_cells(trace), words)
     squares = [float(np.mean(z**2)) if z.size else 0.0 for z in (earlier, now)]
     return _Card(title_of(trace.statistic), trace=trace, picture=picture, before=squares[0], after=squares[1])
 

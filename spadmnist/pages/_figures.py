@@ -8,6 +8,7 @@ import math
 import re
 import textwrap
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -122,19 +123,35 @@ def drawn(draw: Any, *arguments: Any, raster: bool = False) -> str:
 
 def picture(cells: Cells, words: str) -> Picture:
     """Measured beside simulated, cell by cell, and how far they are apart; words: for who cannot see it."""
-    summary = cells.summary
+    draw, n, note = _drawing(cells.summary), cells.summary.values.size, ""
+    if draw is _draw_maps:
+        factor = _merged(cells.summary.shape or (1, 1))
+        note = f"Each point stands for {factor} x {factor} pixels, by the most deviating of them." if factor > 1 else ""
+    elif draw is _draw_series and n > _DRAWN:
+        note = f"Of {n:,} cells {_DRAWN:,} are drawn, evenly spread, those that deviate most among them."
+    return Picture(drawn(draw, cells, raster=draw is _draw_series and n > _VECTOR), words, note)
+
+
+def figure_of(cells: Cells) -> Figure:
+    """The same drawing as a matplotlib figure, in the style of the pages, for a notebook or a paper."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        figure = Figure(facecolor="white")
+        _drawing(cells.summary)(figure, cells)
+        return figure
+
+
+def _drawing(summary: Summary) -> Callable[[Figure, Cells], None]:
+    """How a summary is drawn: as maps, by the names of its cells, or along its axis."""
     shape = summary.shape
     if shape is not None and min(shape) > 1 and math.prod(shape) == summary.values.size:
-        factor = _merged(shape)
-        note = f"Each point stands for {factor} x {factor} pixels, by the most deviating of them." if factor > 1 else ""
-        return Picture(drawn(_draw_maps, cells), words, note)
-    if _axis_of(summary)[0] is None:
-        return Picture(drawn(_draw_named, cells), words)
-    n = summary.values.size
-    note = ""
-    if n > _DRAWN:
-        note = f"Of {n:,} cells {_DRAWN:,} are drawn, evenly spread, those that deviate most among them."
-    return Picture(drawn(_draw_series, cells, raster=n > _VECTOR), words, note)
+        return _draw_maps
+    return _draw_named if _axis_of(summary)[0] is None else _draw_series
 
 
 def _axis_of(summary: Summary) -> tuple[np.ndarray | None, str, bool]:

@@ -1,4 +1,4 @@
-"""The next sensor file: the user's own, its comments kept, with what was found written into it."""
+"""Sensor files: a sensor written as one, and the user's own with what was found written into it, its comments kept."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from .. import config, disk, document, units
-from ..effects import Effect
-from ..errors import InputError, SpadError
-from ..plugins import ByWavelength, Parameter
-from ..window import Window
-from .candidates import Key
+from . import config, disk, document, units
+from .effects import Effect
+from .errors import InputError, SpadError
+from .plugins import ByWavelength, Distribution, MapFile, Parameter
+from .sensor import Sensor
+from .window import Window
 
+Key = tuple[str, str]  # effect, parameter
 Notes = Mapping[Key, str]
 
 # The first line of every file that is written here: without it, a file is the user's own.
@@ -57,6 +58,77 @@ def _is_ours(file: Path) -> bool:
         return disk.read_file(file, 1 << 24).decode(errors="replace").startswith(_OURS)
     except OSError:  # a link, a pipe and the like are nothing that was written here
         return False
+
+
+def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = False) -> Path:
+    """Write a sensor as a file, its maps beside it as `.npy`; `out`. Read again it is the same sensor.
+
+    notes: what stands behind the line of an effect, as a comment. ours: as of `check_place`. Of a part of a chip the
+    whole chip is written. Raises InputError where something else lies there, SpadError where it cannot be written.
+    """
+    out = Path(out)
+    check_place(Path(os.devnull), out, ours)
+    if sensor.chip is not None and sensor.window is not None:
+        effects = [sensor._on_chip(effect) for effect in sensor.effects]
+        sensor = sensor.chip.changed(effects=effects, name=sensor.name)
+    maps: dict[str, np.ndarray] = {}
+
+    def value(effect: Effect, name: str, declared: Parameter) -> Any:
+        held = getattr(effect, name)
+        if isinstance(held, MapFile):
+            return {"file": os.path.relpath(held.path, out.parent.resolve())}
+        if isinstance(held, np.ndarray) and held.ndim:
+            file = f"{out.stem}.{effect.name}.{name}.npy"
+            maps[file] = held.reshape(sensor.layout.shape) if declared.per_pixel else held
+            return {"file": file}
+        return _plain(declared, held)
+
+    at = sensor.layout
+    layout: dict[str, Any] = {"rows": at.rows, "columns": at.columns}
+    if at.positions is not None:
+        layout = {"positions": f"{out.stem}.positions.csv"}
+    layout |= {"pixel_area": units.exact(at.pixel_area, "m^2"), "fill_factor": float(at.fill_factor)}
+    effects_: dict[str, dict[str, Any]] = {}
+    for effect in sensor.effects:
+        told = {name: value(effect, name, declared) for name, declared in effect.parameters.items()}
+        effects_[effect.name] = {name: x for name, x in told.items() if x is not None}
+    head = {"name": sensor.name, "rules": sensor.rules, "chip_seed": int(sensor.chip_seed), "layout": layout}
+    text = document.dump({"sensor": {**head, "effects": effects_}})
+    for (name, _), note in (notes or {}).items():
+        text = re.sub(rf"(?m)^(    {name}:)( *)$", rf"\g<1>  # {note}", text, count=1)
+    with disk.writing(out.parent, 0):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    for file, array in maps.items():
+        held = io.BytesIO()
+        np.save(held, array)
+        disk.put_file(out.parent / file, held.getvalue())
+    if at.positions is not None:
+        disk.put_file(out.parent / layout["positions"], config.positions_text(at.positions).encode())
+    disk.put_file(out, _headed(text).encode())
+    config.read_sensor(out)
+    return out
+
+
+def _plain(declared: Parameter, held: Any) -> Any:
+    """A value as YAML has it."""
+    if held is None or isinstance(held, str):
+        return held
+    if isinstance(held, bool | np.bool_):
+        return bool(held)
+    if isinstance(held, ByWavelength):
+        pairs = zip(held.wavelengths, held.values, strict=True)
+        return {units.exact(at, "m"): _plain(declared, x) for at, x in pairs}
+    if isinstance(held, Distribution):
+        if held.parts:
+            return {"mixture": [{"share": share, **_plain(declared, part)} for share, part in held.parts]}
+        names = ("mean", "sigma") if held.kind == "normal" else ("median", "sigma")
+        plain = Parameter(0.0, "", "")
+        kinds = declared, (declared if held.kind == "normal" else plain)
+        numbers = zip(kinds, held.numbers, strict=True)
+        return {held.kind: dict(zip(names, (_plain(kind, x) for kind, x in numbers), strict=True))}
+    if declared.unit in ("", "bool"):
+        return int(held) if float(held).is_integer() and abs(float(held)) < 2**53 else float(held)
+    return units.exact(float(held), declared.unit)
 
 
 def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, window: Window | None = None) -> Path:

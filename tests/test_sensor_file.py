@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from spadmnist import cli, config, measurement
-from spadmnist.criticism import diagnose, next_sensor
+from spadmnist import cli, config, measurement, sensor_file
+from spadmnist.criticism import diagnose
 from spadmnist.criticism.answer import Diagnosis
 from spadmnist.errors import InputError, SpadError
 from spadmnist.plugins import PER, ByWavelength
@@ -50,7 +50,7 @@ def test_a_value_is_written_along_what_it_runs(per: str, rows: int, columns: int
     size = {"": 0, "pixel": rows * columns, "row": rows, "column": columns, "code": codes}[per]
     value: Any = 0.005 if size == 0 else np.linspace(0.9, 1.1, size)
     key = OF_KIND[per]
-    again = config.read_sensor(next_sensor.write(file, tmp_path / "next" / "sensor.yaml", {key: value}, {})).settled()
+    again = config.read_sensor(sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: value}, {})).settled()
     found = getattr(again.effect(key[0]), key[1])
     assert np.shape(found) == np.shape(value)
     assert np.array_equal(found, value)
@@ -66,8 +66,8 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
     lab = tmp_path / "lab.yaml"
     lab.write_text("seed: 1\nscene: {images: {source: uniform}, lux: [1 lux]}\nsensor: sensors/sensor.yaml\n")
     with pytest.raises(InputError, match="is the sensor file itself"):
-        next_sensor.check_place(lab, file)
-    out = next_sensor.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
+        sensor_file.check_place(lab, file)
+    out = sensor_file.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
     found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).settled().effects}
     assert found["crosstalk"].probability == 0.005
     assert np.array_equal(found["dark_counts"].rate, np.arange(1.0, 7.0))
@@ -77,7 +77,7 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
 def test_codes_of_each_pixel_are_written_as_they_are(tmp_path: Path) -> None:
     file, widths = sensor_in(tmp_path, 2, 2), np.linspace(0.9, 1.1, 16).reshape(4, 4)
     key = OF_KIND["code"]
-    again = config.read_sensor(next_sensor.write(file, tmp_path / "next.yaml", {key: widths}, {})).settled()
+    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {key: widths}, {})).settled()
     assert np.array_equal(again.effect(key[0]).widths, widths)
 
 
@@ -86,7 +86,7 @@ def test_a_table_over_the_wavelength_is_read_again(effects: str, tmp_path: Path)
     file = sensor_in(tmp_path, 2, 2)
     file.write_text(file.read_text().replace("{pdp: 0.42}", effects))
     table = ByWavelength((450e-9, 517.25e-9, 850e-9), (0.3, 0.41, 0.05))
-    again = config.read_sensor(next_sensor.write(file, tmp_path / "next.yaml", {("detection", "pdp"): table}, {}))
+    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {("detection", "pdp"): table}, {}))
     found = again.effect("detection").pdp
     assert found.wavelengths == pytest.approx(table.wavelengths, rel=1e-9)
     assert found.values == pytest.approx(table.values, rel=1e-6)
@@ -102,7 +102,7 @@ def test_every_parameter_of_the_catalogue_runs_along_what_is_tested() -> None:
 def test_what_cannot_be_read_again_is_not_left_there(tmp_path: Path) -> None:
     out = tmp_path / "next.yaml"
     with pytest.raises(SpadError, match="needs one number for each row"):
-        next_sensor.write(sensor_in(tmp_path, 4, 4), out, {OF_KIND["row"]: np.ones(3)}, {})
+        sensor_file.write(sensor_in(tmp_path, 4, 4), out, {OF_KIND["row"]: np.ones(3)}, {})
     assert not out.exists()
 
 
@@ -137,7 +137,7 @@ def test_an_answer_outlives_its_sensor_file(error: Exception, tmp_path: Path, mo
     def fails(*_: Any) -> Path:
         raise error
 
-    monkeypatch.setattr(next_sensor, "write", fails)
+    monkeypatch.setattr(sensor_file, "write", fails)
     done = answered(tmp_path, monkeypatch, {})
     assert done.exit_code == 2
     assert "the next sensor file was not written" in done.stderr and "the disk is full" in done.stderr

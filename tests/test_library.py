@@ -1,0 +1,317 @@
+"""The library: what the verbs do, in Python."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import spadmnist as sp
+from spadmnist import config, sensor_file, twin
+from spadmnist.errors import InputError, SpadError
+from spadmnist.plugins import ByWavelength, Distribution
+
+LIGHT = {"wavelength": 500e-9, "irradiance": 1e-4}  # W/m^2
+FLAT = sp.Capture("flat", "qis", **LIGHT, frames=40, frame_time=10e-6)
+
+
+def sensor(rows: int = 3, columns: int = 5, **more: Any) -> Any:
+    effects = [
+        sp.effects.Detection(pdp=0.4),
+        sp.effects.DarkCounts(rate=2000.0),
+        sp.effects.DeadTime(duration=50e-9),
+        sp.effects.Tdc(resolution=1e-9),
+    ]
+    return sp.Sensor(sp.Layout(rows, columns, 25e-12, 0.5), effects, rules="device", **more)
+
+
+# ---- captures ---------------------------------------------------------------------------------------------
+
+DARK = {"dark": True}
+CLOCK = {"frames": 10, "frame_time": 1e-5}
+
+
+@pytest.mark.parametrize(
+    ("modality", "given", "said"),
+    [
+        ("qiss", {**DARK, **CLOCK}, "'qiss' is not a modality; those are tr, str, qis, counts. Did you mean qis?"),
+        ("qis", CLOCK, "says nothing of its light; give dark=True"),
+        ("qis", {**CLOCK, **DARK, "lux": 3.0}, "has both dark and lux; keep one"),
+        ("qis", {**CLOCK, "irradiance": 1.0}, "give wavelength=500e-9"),
+        ("qis", {**CLOCK, **LIGHT, "lux": 1.0}, "has both irradiance and lux; keep one"),
+        ("qis", {**CLOCK, "wavelength": 500.0}, r"wavelength is 500.0 m; give it in m, 500e-9 for 500 nm"),
+        ("qis", {**CLOCK, **LIGHT, "irradiance": -1.0}, "irradiance is -1.0; it is a number of at least 0"),
+        ("qis", {**CLOCK, **LIGHT, "relative_uncertainty": 1.5}, "a share less than 1, 0.05 for 5 %"),
+        ("qis", {**DARK, "frames": 10}, "QIS needs frames and frame_time"),
+        ("qis", {**DARK, **CLOCK, "frames": 2.5}, "frames is 2.5; it is a whole number"),
+        ("qis", {**DARK, **CLOCK, "frame_period": 1e-6}, "does not fit into the frame_period"),
+        ("qis", {**DARK, **CLOCK, "exposure": 1.0}, "is not frames x frame_period"),
+        ("qis", {**DARK, **CLOCK, "bits": 8}, "bits means nothing for QIS; leave it out"),
+        ("tr", DARK, "a TR capture needs its exposure"),
+        ("tr", {**DARK, "exposure": 1.0, "frames": 3}, "frames means nothing for TR; leave it out"),
+        ("tr", {**DARK, "exposure": -1.0}, "exposure is -1.0; it is more than 0, in s"),
+        ("counts", {**DARK, **CLOCK}, "bits is None; of a count it is a whole number from 1 to 16"),
+        ("counts", {**DARK, **CLOCK, "bits": 2}, "10 binary frames do not fill count frames of 3 each; take 9"),
+        ("counts", {**DARK, **CLOCK, "bits": 2, "counting": "photons"}, "it is 'frames' or 'counter'"),
+    ],
+)
+def test_what_is_no_capture_is_one_sentence(modality: str, given: dict[str, Any], said: str) -> None:
+    with pytest.raises(SpadError, match=said.replace("(", r"\(")) as error:
+        sp.Capture("a", modality, **given)
+    assert "\n" not in str(error.value) and str(error.value).startswith("Capture 'a':")
+
+
+def test_a_capture_is_the_one_that_a_file_describes(tmp_path: Path) -> None:
+    lab = sp.simulate(
+        sensor(),
+        [
+            sp.Capture("dark", "tr", dark=True, exposure=1e-3),
+            FLAT,
+            sp.Capture("lux", "counts", lux=5.0, frames=30, frame_time=1e-5, frame_period=2e-5, bits=2),
+            sp.Capture(
+                "first", "str", **LIGHT, frames=8, frame_time=1e-5, relative_uncertainty=0.02, own_uncertainty=0.01
+            ),
+        ],
+    )
+    again = sp.open_measurement(lab.save(tmp_path / "lab"))
+    assert [c.light for c in again.captures] == [c.light for c in lab.captures]
+    assert [c.conditions for c in again.captures] == [c.conditions for c in lab.captures]
+    assert again.captures[2].light.wavelength == 555e-9
+    for id in lab:
+        mine, its = lab[id], again[id]
+        assert np.array_equal(mine.counts, its.counts)
+        if mine.capture.modality == "tr":
+            assert np.array_equal(mine.events.ticks, its.events.ticks)
+        else:
+            assert np.array_equal(mine.frames, its.frames) and mine.frames.shape[1:] == (3, 5)
+    assert set(np.unique(lab["flat"].frames)) <= {0, 1}
+    assert "flat: QIS, 3 x 5 pixels, 40 frames" in repr(lab["flat"])
+    assert "<td>dark</td>" in lab._repr_html_() and len(lab) == 4
+    with pytest.raises(InputError, match="holds events, not frames"):
+        lab["dark"].frames  # noqa: B018
+    with pytest.raises(InputError, match=r"has no capture 'flatt'. Did you mean flat\?"):
+        lab["flatt"]
+
+
+def test_simulated_in_memory_is_what_is_written(tmp_path: Path) -> None:
+    plan = sp.simulate(sensor(), [FLAT]).save(tmp_path / "plan")
+    written = sp.open_measurement(twin.simulate(sensor(), sp.open_measurement(plan), tmp_path / "twin", 3))
+    assert np.array_equal(sp.simulate(sensor(), plan, seed=3)["flat"].frames, written["flat"].frames)
+    assert not np.array_equal(sp.simulate(sensor(), plan, seed=4)["flat"].frames, written["flat"].frames)
+    with pytest.raises(InputError, match="the light level of a is free"):
+        sp.simulate(sensor(), [sp.Capture("a", "tr", wavelength=500e-9, exposure=1e-3)])
+    with pytest.raises(InputError, match="'a' is not a capture"):
+        sp.simulate(sensor(), ["a"])  # type: ignore[list-item]
+
+
+# ---- arrays -----------------------------------------------------------------------------------------------
+
+STAMPS = sp.Capture("a", "tr", **LIGHT, exposure=1e-3, tick=1e-9)
+FIRST = sp.Capture("a", "str", **LIGHT, frames=4, frame_time=1e-5, tick=1e-9)
+COUNTS = sp.Capture("a", "counts", **LIGHT, frames=12, frame_time=1e-5, bits=2)
+
+
+def test_arrays_are_the_data() -> None:
+    lab = sp.simulate(sensor(), [FLAT, sp.Capture("tr", "tr", **LIGHT, exposure=1e-3)], seed=2)
+    events = lab["tr"].events
+    pixels = np.repeat(np.arange(15), np.diff(events.offsets))
+    order = np.random.default_rng(0).permutation(len(pixels))  # in whatever order they come
+    again = sp.Measurement.from_arrays(
+        sensor().layout,
+        {
+            FLAT: lab["flat"].frames.astype(bool),
+            sp.Capture("tr", "tr", **LIGHT, exposure=1e-3, tick=1e-9): (events.times[order], pixels[order]),
+            sp.Capture("raw", "tr", **LIGHT, exposure=1e-3): (events.times[order], pixels[order]),
+        },
+    )
+    assert np.array_equal(again["flat"].frames, lab["flat"].frames)
+    assert np.array_equal(again["tr"].events.ticks, events.ticks)
+    assert np.array_equal(again["tr"].events.offsets, events.offsets)
+    assert again["raw"].events.ticks is None and np.array_equal(again["raw"].events.times, events.times)
+    seconds = np.full((4, 3, 5), np.nan)
+    seconds[0, 0, 0], seconds[1, 2, 4], seconds[2, 0, 0] = 0.0, 7.123e-6, 1e-5
+    first = sp.Measurement.from_arrays(sensor().layout, {FIRST: seconds})["a"]
+    assert first.none == 10_000 and first.frames[1, 2, 4] == 7123 and first.frames[0, 0, 0] == 0
+    assert int((first.frames < first.none).sum()) == 2
+    ticks = np.where(np.isfinite(seconds), np.rint(np.nan_to_num(seconds) * 1e9), 10_000).astype(np.int32)
+    assert np.array_equal(sp.Measurement.from_arrays(sensor().layout, {FIRST: ticks})["a"].frames, first.frames)
+
+
+@pytest.mark.parametrize(
+    ("capture", "data", "said"),
+    [
+        (FLAT, np.zeros((39, 3, 5), np.uint8), r"shape \(39, 3, 5\), not \(frames, rows, columns\), \(40, 3, 5\)"),
+        (FLAT, np.full((40, 3, 5), 2), "values other than 0 and 1"),
+        (FLAT, np.zeros((40, 3, 5)), "values other than 0 and 1"),
+        (COUNTS, np.full((4, 3, 5), 4), "no counts of 2 bits, 0 to 3"),
+        (COUNTS, np.full((4, 3, 5), -1), "no counts of 2 bits, 0 to 3"),
+        (STAMPS, np.zeros(3), r"needs \(times, pixels\)"),
+        (STAMPS, (np.zeros(3), np.zeros(2, int)), r"both are \(detections,\)"),
+        (STAMPS, (np.zeros(2), np.array([0, 15])), "there are 0 to 14"),
+        (STAMPS, (np.zeros(2), np.array([0.0, 1.0])), "they are whole numbers"),
+        (STAMPS, (np.array([0.5]), np.array([0])), "from 500 ms to 500 ms, outside the exposure of 1 ms"),
+        (STAMPS, (np.array([np.nan]), np.array([0])), "outside the exposure"),
+        (STAMPS, (np.array([1.5e-9]), np.array([0])), "no whole ticks of 1e-09 s"),
+        (sp.Capture("a", "tr", dark=True, exposure=1.0), (np.array([5]), np.array([0])), "give the Capture its tick"),
+        (FIRST, np.full((4, 3, 5), 10_001), "outside a frame, 0 to 10000 ticks"),
+        (FIRST, np.full((4, 3, 5), 1.5e-9), "no whole ticks"),
+    ],
+)
+def test_arrays_that_are_not_what_their_capture_says(capture: Any, data: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as error:
+        sp.Measurement.from_arrays(sensor().layout, {capture: data})
+    assert "\n" not in str(error.value)
+
+
+def test_a_measurement_of_arrays_needs_captures() -> None:
+    with pytest.raises(InputError, match="is not a capture; the keys are"):
+        sp.Measurement.from_arrays(sensor().layout, {"flat": np.zeros(3)})  # type: ignore[dict-item]
+    with pytest.raises(InputError, match="needs a capture"):
+        sp.Measurement.from_arrays(sensor().layout, {})
+
+
+# ---- sensors ----------------------------------------------------------------------------------------------
+
+
+def test_a_sensor_shows_itself_and_changes() -> None:
+    one = sensor(name="lab\x1b[2J")
+    assert "lab\\x1b[2J: 3 x 5 pixels of 25 um^2, fill factor 0.5, rules: device" in repr(one)
+    assert "dark         dark_counts  rate         2 kHz" in " ".join(repr(one).split(" ")) or "2 kHz" in repr(one)
+    assert "\x1b" not in repr(one) + one._repr_html_()
+    more = one.with_effect(sp.effects.Crosstalk(probability=0.01)).with_values({"dark_counts.rate": 250.0})
+    assert more.effect("crosstalk").probability == 0.01 and more.effect("dark_counts").rate == 250.0
+    assert one.effect("crosstalk") is None and one.effect("dark_counts").rate == 2000.0
+    assert more.without("crosstalk").effect("crosstalk") is None
+    map_ = np.arange(1.0, 16.0)
+    assert "per pixel: median 8 Hz, 1 Hz to 15 Hz" in repr(one.with_values({"dark_counts.rate": map_}))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda s: s.with_effect(sp.effects.DarkCounts()),
+            "lists dark_counts already; another value of it: with_values",
+        ),
+        (lambda s: s.with_effect(sp.effects.Crosstalk(probability=2.0)), "probability is between 0 and 1"),
+        (lambda s: s.with_values({"dark_count.rate": 1.0}), r"lists no dark_count, .* Did you mean dark_counts\?"),
+        (lambda s: s.with_values({"crosstalk.probability": 1.0}), "lists no crosstalk, .*with_effect adds one"),
+        (lambda s: s.with_values({"dark_counts.rat": 1.0}), r"dark_counts has rate. Did you mean rate\?"),
+        (lambda s: s.with_values({"dark_counts.rate": -1.0}), "-1 Hz is not possible; rate is at least 0 Hz"),
+        (lambda s: s.with_values({"dark_counts.rate": "5 Hz"}), "it is a number in Hz"),
+        (lambda s: s.with_values({"dead_time.duration": np.nan}), "is not possible"),
+        (lambda s: s.with_values({"dead_time.paralyzable": 1.0}), "it is True or False"),
+        (lambda s: s.with_values({"tdc.rounding": "up"}), "it is nearest or floor"),
+        (lambda s: s.with_values({"detection.pdp": {500e-9: 0.4}}), "ByWavelength"),
+        (lambda s: s.with_values({"tdc.resolution": np.ones(15)}), "one number for all pixels"),
+    ],
+)
+def test_what_no_sensor_can_have_is_one_sentence(change: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as error:
+        change(sensor())
+    assert "\n" not in str(error.value)
+
+
+def test_an_effect_that_there_is_not() -> None:
+    with pytest.raises(AttributeError, match=r"Crostalk is not an effect.* Did you mean Crosstalk\?"):
+        sp.effects.Crostalk  # noqa: B018
+    assert {"Crosstalk", "Effect"} <= set(dir(sp.effects))
+
+
+def test_a_sensor_is_saved_and_read_again(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    places = rng.uniform(0, 1e-4, (15, 2))
+    layout = sp.Layout(1, 15, 25e-12, 0.5, places)
+    effects = [
+        sp.effects.Detection(pdp=ByWavelength((500e-9, 700e-9), (1 / 3, 0.16)), relative=rng.uniform(0.9, 1.1, 15)),
+        sp.effects.DarkCounts(rate=Distribution("lognormal", (20.0, 1.5))),
+        sp.effects.DeadTime(duration=rng.uniform(4e-8, 5e-8, 15), paralyzable=True),
+        sp.effects.Tdc(resolution=1e-10 / 3),
+    ]
+    one = sp.Sensor(layout, effects, rules="device", chip_seed=7, name="a: b # c")
+    for made in (one, one.settled()):
+        again = sp.read_sensor(sensor_file.save(made, tmp_path / f"{made._settled}" / "s.yaml"))
+        assert (again.rules, again.chip_seed, again.name) == ("device", 7, "a: b # c")
+        assert np.allclose(again.layout.positions, places, rtol=1e-12)
+        for effect in one.settled().effects:
+            for name in effect.parameters:
+                assert np.all(getattr(again.effect(effect.name), name) == getattr(effect, name)), (effect.name, name)
+    with pytest.raises(InputError, match="no sensor file that a fit"):
+        (tmp_path / "own.yaml").write_text("mine")
+        sensor_file.save(one, tmp_path / "own.yaml")
+    part = sensor(4, 4).with_values({"dark_counts.rate": np.arange(1.0, 17.0)}).cropped(slice(1, 3), slice(0, 2))
+    chip = config.read_sensor(sensor_file.save(part, tmp_path / "chip.yaml"))
+    assert chip.layout.shape == (4, 4) and np.array_equal(chip.effect("dark_counts").rate, np.arange(1.0, 17.0))
+
+
+# ---- answers ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def asked() -> tuple[Any, Any]:
+    """A model and data with afterpulses that it lacks."""
+    plan = [
+        sp.Capture("dark", "tr", dark=True, exposure=0.1),
+        sp.Capture("flat", "tr", **LIGHT, exposure=0.1, relative_uncertainty=0.02),
+    ]
+    model = sensor(2, 2)
+    return model, sp.simulate(
+        model.with_effect(sp.effects.Afterpulsing(probability=0.1, lifetime=100e-9)), plan, seed=1
+    )
+
+
+def test_a_comparison_shows_itself(asked: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gof = sp.compare(*asked, jobs=1)
+    assert gof.verdict == "fails" and gof.misfit == gof.misfit_in_sample
+    assert "The model fails" in repr(gof) and "<table>" in gof._repr_html_()
+    assert gof.figure(0).axes and "<html" in gof.save(tmp_path / "report").read_text()
+    with pytest.raises(InputError, match=r"figure 1000: there are .* checks with cells, counted from 0"):
+        gof.figure(1000)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="needs pandas, which is not installed: pip install pandas"):
+        gof.to_frame()
+    with pytest.raises(InputError, match="tolerance is 5"):
+        sp.compare(*asked, tolerance=5)
+
+
+def test_a_fit_has_values_intervals_and_covariance(asked: tuple[Any, Any], tmp_path: Path) -> None:
+    model, data = asked
+    path, source = data.save(tmp_path / "lab"), sensor_file.save(model, tmp_path / "sensor.yaml")
+    source.write_text(source.read_text() + "# mine\n")
+    fit = sp.fit(str(source), str(path), add=["afterpulsing"], jobs=1)
+    for name, true in (("probability", 0.1), ("lifetime", 100e-9)):
+        low, high = fit.intervals[f"afterpulsing.{name}"]
+        assert low - (high - low) < true < high + (high - low)  # 5.9 standard deviations
+        assert low < fit.values[f"afterpulsing.{name}"] < high
+        assert getattr(fit.model.effect("afterpulsing"), name) == fit.values[f"afterpulsing.{name}"]
+    names, covariance = fit.covariance
+    assert sorted(names) == ["afterpulsing.lifetime", "afterpulsing.probability"]
+    ends = np.array([fit.intervals[name] for name in names])
+    assert np.allclose(np.sqrt(np.diag(covariance)) * 3.92, ends[:, 1] - ends[:, 0])
+    assert np.linalg.eigvalsh(covariance / np.outer(*[np.sqrt(np.diag(covariance))] * 2)).min() > 0
+    assert fit.misfit["before"] > fit.misfit["after"] and fit.path[0]["model"] == "start"
+    fit.save(tmp_path / "next")
+    text = (tmp_path / "next" / "sensor.yaml").read_text()
+    assert "# mine" in text and (tmp_path / "next" / "report.html").exists()
+    again = sp.read_sensor(tmp_path / "next" / "sensor.yaml")
+    assert np.isclose(again.effect("afterpulsing").probability, fit.values["afterpulsing.probability"], rtol=1e-5)
+    with pytest.raises(InputError, match="it is a list of names"):
+        sp.fit(model, data, free="dark_counts.rate")
+
+
+def test_a_diagnosis_gives_the_model_that_it_found(asked: tuple[Any, Any], tmp_path: Path) -> None:
+    model, data = asked
+    found = sp.diagnose(model, data, quick=True, jobs=1, max_steps=1)
+    assert found.finished and found.verdict in ("explained", "confused") and found.steps
+    assert found.figure(0).axes and "afterpulsing" in repr(found) + found._repr_html_()
+    found.save(tmp_path / "next")
+    again = sp.read_sensor(tmp_path / "next" / "sensor.yaml")
+    for effect in found.model.effects:
+        for name in effect.parameters:
+            mine, its = getattr(effect, name), getattr(again.effect(effect.name), name)
+            assert its == mine if isinstance(mine, str) else np.allclose(its, mine, rtol=1e-5, atol=0)
+    with pytest.raises(InputError, match="max_steps is 0"):
+        sp.diagnose(model, data, max_steps=0)
