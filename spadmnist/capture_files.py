@@ -7,6 +7,7 @@
 | | or (M, rows, columns) of 0 and 1 | |
 | str | `frames` (M, rows, columns) ticks since the start of the frame; none = ceil(frame time / tick) | `tick` (s) |
 | counts | `frames` (M, rows, columns) | `bits`, `counting` (`frames` or `counter`) |
+| any | | `capture_id`, where it was written here: a file that has taken another one's place is refused |
 
 Only plain data sets of unsigned integers that lie in the file itself are read: no links, no data of other files, no
 filter but HDF5's own. What a file declares is compared with the capture before any memory is taken for it. Frames are
@@ -37,6 +38,7 @@ from .kernels import jit
 from .readout import counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
 
+OWNER = "capture_id"  # attribute of a file in a measurement that was written here: which capture it is
 _MOST_EVENTS = 1 << 29  # of a capture: 16 bytes each are 8 GiB
 _MOST_BITS = 16  # of a count
 _LARGEST_CHUNK = 1 << 28  # bytes
@@ -254,6 +256,12 @@ def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _
         raise InputError(
             f"{path}: says that it is {str(said)[:40]!r}, but the capture {capture.id} is {capture.modality!r}; "
             "correct one of them"
+        )
+    owner = attribute((file,), OWNER, path)
+    if owner is not None and owner != capture.id:
+        raise InputError(
+            f"{path}: is the file of the capture {str(owner)[:40]!r}, and stands for {capture.id[:40]!r}; put the "
+            f"right file there, or, where the capture was renamed, take out the file's attribute {OWNER}"
         )
     if capture.modality == "tr":
         return _found_events(file, capture, math.prod(shape), path)

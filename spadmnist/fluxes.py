@@ -298,7 +298,9 @@ def sheet(found: Fluxes) -> bytes:
     def draw(figure: Any) -> None:
         rest = f", {len(shown)} of {len(captures)} captures" if len(shown) < len(captures) else ""
         figure.set_facecolor(pictures.PAGE)
-        figure.suptitle(f"{found.measurement.name}: flux images{rest}", fontsize=13, y=1 - 0.2 / height)
+        figure.suptitle(
+            f"{pictures.words(found.measurement.name[:80])}: flux images{rest}", fontsize=13, y=1 - 0.2 / height
+        )
         cells = figure.subplots(
             len(shown), len(methods), squeeze=False, gridspec_kw={**room, "wspace": 0.3, "hspace": 0.4}
         )
@@ -316,7 +318,9 @@ def _draw(axes: Any, measurement: Measurement, image: Flux) -> None:
     values = image.values.ravel().astype(np.float64)
     white, brighter = pictures.white_of(measurement.layout, values)
     id = image.capture.id
-    words = f"{id if len(id) <= 32 else f'{id[:29]}...'}: {image.method}\n{light_text(image.capture.light)}"
+    words = (
+        f"{pictures.words(id if len(id) <= 32 else f'{id[:29]}...')}: {image.method}\n{light_text(image.capture.light)}"
+    )
     if brighter:
         largest = values.max()
         words += f"; brighter: {brighter:,}, up to {largest:{',.0f' if largest >= 1000 else '.4g'}}"

@@ -11,6 +11,7 @@ import numpy as np
 
 from .errors import SpadError
 from .events import Layout
+from .foreign import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +33,11 @@ _STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+
+
+def words(text: str) -> str:
+    """Text that others wrote, for matplotlib: one line that can be seen, in which no $ begins a formula."""
+    return visible(text).replace("$", r"\$")
 
 
 def pixel_at(places: np.ndarray, side: int) -> tuple[np.ndarray, tuple[float, float, float, float]]:

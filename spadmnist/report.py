@@ -598,7 +598,7 @@ def _draw(
 
         def text(x: int, y: int, words: str, size: int = 11, color: str = "0.25", **style: Any) -> None:
             points = size * 72 / pictures.DPI
-            figure.text(x / full, 1 - y / tall, words, fontsize=points, color=color, va="top", **style)
+            figure.text(x / full, 1 - y / tall, pictures.words(words), fontsize=points, color=color, va="top", **style)
 
         def picture(x: int, y: int, pixels: np.ndarray) -> None:
             figure.figimage(pixels, x, tall - y - len(pixels))
@@ -750,8 +750,9 @@ mean to max: over the pixels. saturated: pixels in which a rule stands in for th
 method (spadmnist methods NAME tells it). q: nominal PDP. T: exposure, or frames x frame time."""
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= 24 else f"{text[:21]}..."
+def _short(text: str, most: int = 24) -> str:
+    text = visible(text)
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _recorded(numbers: Mapping[str, Any]) -> str:
@@ -777,7 +778,9 @@ def capture_sheet(measurement: Measurement, looks: Sequence[Look], path: str | P
 def _draw_captures(measurement: Measurement, looks: Sequence[Look], captures: int) -> bytes:
     def draw(figure: Any) -> None:
         rest = f", {len(looks)} of {captures} captures" if len(looks) < captures else ""
-        figure.suptitle(f"{measurement.name}: {_size_of(measurement)} pixels{rest}", fontsize=13)
+        figure.suptitle(
+            f"{pictures.words(_short(measurement.name, 80))}: {_size_of(measurement)} pixels{rest}", fontsize=13
+        )
         cells = figure.subplots(len(looks), 3, squeeze=False, width_ratios=(1, 1.2, 1.6))
         for row, one in zip(cells, looks, strict=True):
             _rate_map(row[0], measurement, one)
@@ -802,7 +805,8 @@ def _rate_map(axes: Any, measurement: Measurement, one: Look) -> None:
     spread = max(float(above - below) / 2, 1 / one.numbers["live"])
     low, high = max(float(rates.min()), median - 4 * spread), min(float(rates.max()), median + 4 * spread)
     scale, unit = _scaled(float(high))
-    axes.set_title(f"{_short(one.capture.id)}: {one.numbers['light']}, {_recorded(one.numbers)}", loc="left")
+    name = pictures.words(_short(one.capture.id))
+    axes.set_title(f"{name}: {one.numbers['light']}, {_recorded(one.numbers)}", loc="left")
     label = f"detections / pixel, {unit}"
     pictures.draw_map(axes, measurement.layout, rates * scale, low * scale, high * scale, label)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from importfiles import (
 from spadmnist import measurement
 from spadmnist.errors import SpadError
 from spadmnist.importers import Said
+from spadmnist.importers import ptu as reader
 from spadmnist.importers.captures import Imported, import_files
 from spadmnist.importers.ptu import LAYOUTS, SYNC, Decoded, decode
 
@@ -130,6 +132,29 @@ def test_records_are_decoded_one_by_one(kind: int, seed: int) -> None:
     steps = np.diff(right.ticks.astype(np.int64))
     assert steps.max() > _SILENCE and steps.min() >= 0 and right.markers
     assert kind == PICOHARP_T2 or (right.unknown and (right.channel == SYNC).any())
+
+
+def test_a_long_recording_is_decoded_by_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Across their borders as within, and without memory for more than its detections and a block."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    for kind in LAYOUTS:
+        records = rng.integers(0, 1 << 32, 300, np.uint32)
+        if not LAYOUTS[kind].special:
+            records[records >> 28 > 4] |= np.uint32(15 << 28)
+        whole = decode(records, LAYOUTS[kind])
+        with monkeypatch.context() as small:
+            small.setattr(reader, "_BLOCK", 7)
+            parts = decode(records, LAYOUTS[kind])
+        assert np.array_equal(whole.channel, parts.channel) and np.array_equal(whole.ticks, parts.ticks)
+        assert (whole.markers, whole.unknown) == (parts.markers, parts.unknown)
+    count, block = 1 << 20, 1 << 14
+    (rng.integers(0, 1 << 25, count, np.uint32)).astype("<u4").tofile(tmp_path / "records")
+    monkeypatch.setattr(reader, "_BLOCK", block)
+    tracemalloc.start()
+    decode(reader._Records(tmp_path / "records", 0, count), LAYOUTS[MULTIHARP_T2])
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 9 * count + 100 * block
 
 
 @pytest.mark.parametrize("kind", [kind for kind in EVERY_T2 if LAYOUTS[kind].numbered], ids=NAMES.get)

@@ -27,7 +27,7 @@ from spadmnist.effects import Conditions
 from spadmnist.effects.dark_counts import DarkCounts
 from spadmnist.effects.detection import Detection
 from spadmnist.effects.tdc import Tdc
-from spadmnist.errors import SpadError
+from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Layout
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -328,3 +328,21 @@ def test_stamps_without_a_converter_are_stored_in_picoseconds(tmp_path: Path) ->
     assert read.events is not None and np.array_equal(read.events.offsets, made.events.offsets)
     assert read.tick == 1e-12 and 0 <= np.max(made.events.times - read.events.times) < 1.001e-12
     refused(lambda: list(recordings(sensor, (CAPTURES[3],))), "add tdc")
+
+
+def test_a_file_that_took_another_ones_place_is_refused(tmp_path: Path) -> None:
+    """Of the same shape, by another capture of the same measurement; a file that does not say whose it is is read."""
+    sensor = device()
+    captures = [replace(CAPTURES[0], id=id) for id in ("one", "zwei é")]
+    root = measurement.write(tmp_path / "lab", "lab", sensor.layout, recordings(sensor, captures))
+    first, second = (root / name for name in ("one.h5", "zwei.h5"))
+    measurement.open(root)
+    before = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(InputError, match=r"one\.h5: is the file of the capture 'zwei é', and stands for 'one'; put"):
+        measurement.open(root)
+    with h5py.File(first, "r+") as file:
+        del file.attrs["capture_id"]
+    assert measurement.open(root).recording("one").totals.sum() > 0
+    first.write_bytes(before)
+    assert measurement.open(root).recording("one").totals.sum() > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from spadmnist import config, dataset, document, measurement, pictures, report
+from spadmnist import config, dataset, document, fluxes, measurement, pictures, report
 from spadmnist.cli import cli
 from spadmnist.effects import Conditions
 from spadmnist.events import Events, Layout
@@ -116,6 +117,24 @@ def test_inspect_finds_the_places_of_a_dataset(tmp_path: Path) -> None:
         with Image.open(png) as image:
             sizes[name] = image.size
     assert sizes["c"][1] > sizes["grid"][1] + 50
+
+
+def test_names_are_drawn_as_what_can_be_seen_of_them(tmp_path: Path) -> None:
+    """ESC, the end of a line and a mark of direction as their numbers, and no $ begins a formula."""
+    layout, offsets = Layout(1, 2, np.nan, np.nan), np.array([0, 2, 3])
+    events = Events(None, offsets, 2, np.array([1, 90, 50], np.uint32), 1e-9)
+    clock = Conditions(1e-7, 1, 1e-7, 1e-7, None)
+
+    def drawn(name: str, number: int) -> list[bytes]:
+        recorded = Recording(Capture("a", "tr", Light(), clock), layout, events, None, 1e-9)
+        lab = measurement.open(measurement.write(tmp_path / f"lab{number}", "lab", layout, [recorded]))
+        lab = replace(lab, name=name, captures=(replace(lab.captures[0], id=name),))  # as others may make one
+        report.capture_sheet(lab, report.looks(lab, True), tmp_path / "x.png")
+        return [(tmp_path / "x.png").read_bytes(), fluxes.sheet(fluxes.of_measurement(lab, ("counts",)))]
+
+    assert drawn("a\x1b[2J\n\u202eb", 0) == drawn(r"a\x1b[2J\x0a\u202eb", 1)
+    formula, plain = drawn(r"$\frac{$", 2), drawn(r"\frac{", 3)
+    assert all(one != other for one, other in zip(formula, plain, strict=True))
 
 
 def test_a_map_of_a_capture_is_drawn_at_the_places(tmp_path: Path) -> None:

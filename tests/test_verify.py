@@ -156,7 +156,8 @@ def damaged_and_repaired(made: Path, work: Path, count: int, seed: int) -> None:
 
 @pytest.mark.slow
 def test_many_damages(made: Path, tmp_path: Path) -> None:
-    damaged_and_repaired(made, tmp_path, 500, seed=2)
+    """Each kind at each kind of place once; damages by the hundred are those of `make faults`."""
+    damaged_and_repaired(made, tmp_path, len(DAMAGES) * 8, seed=2)
 
 
 def test_the_command(root: Path, made: Path) -> None:

@@ -12,6 +12,7 @@ from ..errors import InputError
 from . import LASER_PULSES, MOST_EVENTS, Format, Found, Said, damaged, facts, heard, library
 
 _MOST_TICKS = 1 << 63  # that are added up here
+_BLOCK = 1 << 20  # records that are decoded at a time
 SYNC = 64  # the number by which the sync input is known here; the inputs of all instruments have smaller ones
 
 
@@ -54,39 +55,67 @@ class Decoded:
     unknown: int
 
 
-def decode(records: np.ndarray, layout: Layout) -> Decoded:
+def decode(records: np.ndarray | _Records, layout: Layout) -> Decoded:
     """Detections from raw T2 records: overflows are added up in 64 bits. Raises ValueError where that is not possible.
+
+    records: an array of uint32, or what gives one where it is sliced: a block of them at a time is in memory, besides
+    the detections (9 bytes each).
 
     Source: PicoQuant, demonstration readers of the "Unified TTTR File Format".
     """
-    time = records & np.uint32((1 << layout.time) - 1)
-    channel = (records >> np.uint32(layout.time) & np.uint32((1 << layout.channel) - 1)).astype(np.uint8)
-    if layout.special:
-        special = records >> np.uint32(31) == 1
-        overflow = special & (channel == 63)
-        marker = special & (channel > 0) & (channel < 16)
-        sync = special & (channel == 0)
-        channel[sync] = SYNC
-        detection = ~special | sync
-        unknown = special & ~(overflow | marker | sync)
-    else:
-        extra = channel == 15
-        overflow = extra & (time & np.uint32(15) == 0)
-        marker = extra & ~overflow
-        detection = ~extra
-        unknown = np.zeros(len(records), bool)
-        wrong = detection & (channel >= layout.inputs)
-        if wrong.any():
-            raise ValueError(f"record {int(wrong.argmax()):,} is of channel {channel[wrong.argmax()]}, which is none")
-    # how often the clock has gone round before each record
-    rounds = overflow.astype(np.int64)
-    if layout.numbered:
-        rounds[overflow] = np.maximum(time[overflow], 1)  # early firmware leaves the number 0
-    rounds = np.cumsum(rounds)
-    if len(rounds) and rounds[-1] >= _MOST_TICKS // layout.wrap:
-        raise ValueError(f"its clock goes round {rounds[-1]:,} times")
-    ticks = (rounds[detection] * layout.wrap + time[detection]).astype(np.uint64)
-    return Decoded(channel[detection], ticks, int(marker.sum()), int(unknown.sum()))
+    # memory that is not filled is not taken
+    channels, ticks = np.empty(len(records), np.uint8), np.empty(len(records), np.uint64)
+    count = markers = unknown = rounds = 0  # rounds: how often the clock has gone round before the block
+    for start in range(0, len(records), _BLOCK):
+        block = records[start : start + _BLOCK]
+        time = block & np.uint32((1 << layout.time) - 1)
+        channel = (block >> np.uint32(layout.time) & np.uint32((1 << layout.channel) - 1)).astype(np.uint8)
+        if layout.special:
+            special = block >> np.uint32(31) == 1
+            overflow = special & (channel == 63)
+            marker = special & (channel > 0) & (channel < 16)
+            sync = special & (channel == 0)
+            channel[sync] = SYNC
+            detection = ~special | sync
+            unknown += int((special & ~(overflow | marker | sync)).sum())
+        else:
+            extra = channel == 15
+            overflow = extra & (time & np.uint32(15) == 0)
+            marker = extra & ~overflow
+            detection = ~extra
+            wrong = detection & (channel >= layout.inputs)
+            if wrong.any():
+                at = int(wrong.argmax())
+                raise ValueError(f"record {start + at:,} is of channel {channel[at]}, which is none")
+        markers += int(marker.sum())
+        gone = overflow.astype(np.int64)
+        if layout.numbered:
+            gone[overflow] = np.maximum(time[overflow], 1)  # early firmware leaves the number 0
+        gone = rounds + np.cumsum(gone)
+        rounds = int(gone[-1])
+        end = count + int(detection.sum())
+        channels[count:end] = channel[detection]
+        ticks[count:end] = (gone[detection] * layout.wrap + time[detection]).astype(np.uint64)
+        count = end
+    if rounds >= _MOST_TICKS // layout.wrap:
+        raise ValueError(f"its clock goes round {rounds:,} times")
+    return Decoded(channels[:count], ticks[:count], markers, unknown)
+
+
+@dataclass(frozen=True)
+class _Records:
+    """The records of a file, read where they are sliced."""
+
+    path: Path
+    start: int  # bytes
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, place: slice) -> np.ndarray:
+        first, last, _ = place.indices(self.count)
+        return np.fromfile(self.path, "<u4", last - first, offset=self.start + 4 * first)
 
 
 class Ptu(Format):
@@ -162,8 +191,8 @@ def _header(path: Path, tags: dict[str, Any]) -> tuple[dict[str, float], dict[st
     return known, sources
 
 
-def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[np.ndarray, list[str]]:
-    """((records,) uint32, as many as the header declares; all that follow where it was never finished, notes)."""
+def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[_Records, list[str]]:
+    """(records, as many as the header declares; all that follow where it was never finished, notes)."""
     declared, held, notes = tags.get("TTResult_NumberOfRecords", 0), (path.stat().st_size - start) // 4, []
     if not isinstance(declared, int) or declared <= 0:
         declared = held
@@ -175,17 +204,18 @@ def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[np.ndarray, 
             f"{path}: declares {declared:,} records, {held:,} follow and {MOST_EVENTS:,} can be read; copy it again, "
             "or cut it into several"
         )
-    return np.fromfile(path, "<u4", declared, offset=start), notes
+    return _Records(path, start, declared), notes
 
 
 def _check_order(path: Path, ticks: np.ndarray, wrap: int) -> None:
     """Raise InputError where a time falls back by more than half an overflow: one is missing, and all later times are
     wrong. Less is disorder between inputs.
     """
-    lost = np.diff(ticks.astype(np.int64)) < -(wrap // 2)
-    if lost.any():
-        at = int(lost.argmax())
-        raise InputError(
-            f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {at + 1:,}; "
-            "records are missing there: copy it again from where it was made"
-        )
+    for start in range(0, len(ticks), _BLOCK):
+        lost = np.diff(ticks[start : start + _BLOCK + 1].astype(np.int64)) < -(wrap // 2)
+        if lost.any():
+            at = start + int(lost.argmax())
+            raise InputError(
+                f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {at + 1:,}; "
+                "records are missing there: copy it again from where it was made"
+            )

@@ -208,7 +208,7 @@ def _commit_recording(root: Path, name: str, one: Recording, planned: str | None
     with disk.writing(final, capture_files.size(one)), disk.workspace(disk.temporary(root)) as work:
         new = work / final.name
         with new.open("x+b") as file:
-            capture_files.write(one, file)
+            capture_files.write(one, file, {capture_files.OWNER: one.capture.id})
             file.flush()
             os.fsync(file.fileno())
         if not final.exists():
