@@ -549,7 +549,10 @@ def _import_option(name: str, declared: Any, about: str) -> click.Option:
     "lights",
     multiple=True,
     metavar="LIGHT",
-    help='What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2". Once for all files, or once for each.',
+    help=(
+        'What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2", or a scene, '
+        '"image:chart.npy 80 mlux". Once for all files, or once for each.'
+    ),
 )
 @click.option(
     "--capture", "ids", multiple=True, metavar="ID", help="Of a plan: the capture that a file is, once for each file."
@@ -647,6 +650,10 @@ def export(
         paths = exporters.export(opened, output, format_, ids, progress)
     if opened.layout.positions is not None:
         _say("Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv.")
+    if any(capture.light.scene for capture in opened.captures if not ids or capture.id in ids):
+        _say(
+            "Note: these files do not hold the scene that was seen; to import them again, give --light image:FILE.npy."
+        )
     if as_json:
         _print_json({"files": [str(path) for path in paths]})
         return

@@ -34,8 +34,9 @@ def facts(recording: Recording) -> dict[str, float | int]:
         known |= {"width": layout.columns}
     if recording.modality == "counts":
         known |= {"bits": c.bits, "counter": int(c.counting == "counter")}
-    known |= {"wavelength": lit.wavelength, lit.kind_of_level: lit.level}
-    known |= {"relative_uncertainty": lit.relative_uncertainty, "own_uncertainty": lit.own_uncertainty}
+    if lit.scene is None:  # without its scene, the light of white would be taken for flat light
+        known |= {"wavelength": lit.wavelength, lit.kind_of_level: lit.level}
+        known |= {"relative_uncertainty": lit.relative_uncertainty, "own_uncertainty": lit.own_uncertainty}
     return {name: value for name, value in known.items() if value is not None}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from . import units
 from .events import Events
+from .foreign import visible
 from .measurement import Measurement
 from .recording import Capture, Light, Recording
 
@@ -85,12 +86,13 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
 
 
 def light_text(lit: Light) -> str:
-    """What fell on the sensor, for people: `500 nm, 3 nW/cm^2`."""
+    """What fell on the sensor, for people: `500 nm, 3 nW/cm^2`; of a scene its file, too."""
     if lit.wavelength is None:
         return "dark"
     unit = "lux" if lit.kind_of_level == "lux" else "W/m^2"
     level = "level free" if lit.level is None else units.show(lit.level, unit)
-    return f"{units.show(lit.wavelength, 'm')}, {level}"
+    scene = "" if lit.scene is None else f"scene {visible(lit.scene.name)}, "
+    return f"{scene}{units.show(lit.wavelength, 'm')}, {level}"
 
 
 # --- an interruption ----------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from .effects import Conditions
 from .errors import InputError
 from .events import Events, Layout
 from .readout import Recorded, no_detection, unsigned_for
+from .scene import Scene
 from .units import show
 
 T = TypeVar("T")
@@ -36,7 +37,8 @@ class Light:
 
     wavelength: m; level: irradiance in W/m^2 or lux, as `kind_of_level` ("irradiance", "lux") says, None where it is
     not known. relative_uncertainty: standard deviation of the light's calibration, common to all captures;
-    own_uncertainty: the capture's own part. Both relative, 1. A dark capture has no wavelength.
+    own_uncertainty: the capture's own part. Both relative, 1. A dark capture has no wavelength. scene: the image that
+    the light follows, whose white has that level; None where it is the same on all pixels.
     """
 
     wavelength: float | None = None
@@ -44,6 +46,7 @@ class Light:
     kind_of_level: str = "irradiance"
     relative_uncertainty: float = 0.0
     own_uncertainty: float = 0.0
+    scene: Scene | None = None
 
     @property
     def dark(self) -> bool:

@@ -99,7 +99,8 @@ def statistic_list() -> str:
 def statistic_page(name: str) -> str:
     """All about one statistic. Raises KeyError with a sentence where there is none."""
     cls: type[Statistic] = Statistic.registry.find(name)
-    return _page(cls, [f"of: {', '.join(cls.modalities)}", f"unit: {cls.unit}"], [])
+    light = ["light: the same on all pixels; a scene is not asked"] if cls.flat else []
+    return _page(cls, [f"of: {', '.join(cls.modalities)}", f"unit: {cls.unit}", *light], [])
 
 
 # kind of plug-in -> its registry, the list of all, the page of one

@@ -266,6 +266,7 @@ class Sensor:
 
     def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """(rate of all avalanches' seeds, the light's part), 1/s, from photons/s; each (images, pixels)."""
+        photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             # by this very rule: one that a subclass has set is upon what it finds here
             there = Sensor.rates(self.chip, self.window.spread(photons), conditions)
@@ -290,6 +291,7 @@ class Sensor:
 
     def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
+        photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             there = self.chip.expected(self.window.spread(photons), conditions)
             return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
@@ -318,6 +320,7 @@ class Sensor:
 
     def drawn(self, photons: np.ndarray, conditions: Conditions, readouts: Collection[str]) -> float:
         """Expected candidates that `expose` has at once for such images, those around a part of a chip among them."""
+        photons, conditions = conditions.lit(photons)
         if self.chip is None or self.window is None:
             return float(self.expected(photons, conditions)[0].sum())
         there, _ = self.chip.expected(self.window.spread(photons), conditions)
@@ -362,6 +365,7 @@ class Sensor:
             raise ValueError(
                 f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
             )
+        photons, conditions = conditions.lit(photons)
         stamped = bool({"tr", "str"} & set(readouts))
         counter = "counts" in readouts and conditions.counting == "counter"
         part = self.chip is not None

@@ -24,7 +24,7 @@ LAYERS = [
     {"import_options"},
     {"disk", "kernels", "workers"},
     {"document", "section", "plugins", "events", "image_files", "digits", "store", "tiles"},
-    {"validated"},
+    {"validated", "scene"},
     {"effects", "readout", "images", "pictures", "window"},
     {"gather", "grids", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},

@@ -177,7 +177,7 @@ def compare(
             checks += _level_checks(sensor, capture, total, made, levels)
             if recording is None:
                 continue
-            for statistic in statistics_for(recording.modality):
+            for statistic in statistics_for(recording.capture):
                 null = made.nulls.get(statistic.name)
                 summary = reduced(statistic, recording)
                 if null is None or summary is None:

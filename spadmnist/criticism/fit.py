@@ -85,7 +85,7 @@ class Seen:
     def of(cls, recording: Recording) -> Seen:
         """What is looked at of a recording."""
         summaries = {}
-        for statistic in recordings.statistics_for(recording.modality):
+        for statistic in recordings.statistics_for(recording.capture):
             summary = recordings.reduced(statistic, recording)
             if summary is not None:
                 summaries[statistic.name] = summary.apart()
@@ -300,7 +300,7 @@ def _task(
     keep_freed_memory()
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = [s for s in recordings.statistics_for(capture.modality) if not (hasty and s.costly)]
+    known = [s for s in recordings.statistics_for(capture) if not (hasty and s.costly)]
 
     def take(recording: Recording) -> None:
         if second is not None:

@@ -36,10 +36,11 @@ _DROWNED = 0.5  # of the elasticity at the stated level: where it is less, the l
 _CLOSED = 5e-4  # relative error of the closed forms, at most
 
 
-def statistics_for(modality: str) -> list[Statistic]:
-    """Every registered statistic that makes sense for a modality."""
+def statistics_for(capture: Capture) -> list[Statistic]:
+    """Every registered statistic that makes sense for a capture: of its modality, and of its light."""
     kinds = [Statistic.registry.find(name) for name in Statistic.registry]
-    return [kind() for kind in kinds if modality in kind.modalities]
+    scene = capture.light.scene is not None
+    return [kind() for kind in kinds if capture.modality in kind.modalities and not (kind.flat and scene)]
 
 
 def simulated(
@@ -218,7 +219,7 @@ def _recordings_of(
     sensor = model.sensor
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    known = statistics_for(capture.modality)
+    known = statistics_for(capture)
     for recording in whatever_phases(sensor, capture, photons, numbers, seed):
         totals.append(int(recording.totals.sum()))
         for statistic in known:

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,6 +43,7 @@ from .. import plugins
 from ..errors import did_you_mean
 from ..events import Layout
 from ..plugins import Parameter, Plugin, Registry, parameter
+from ..scene import Scene
 
 __all__ = ["STAGES", "Chip", "Conditions", "Effect", "Parameter", "parameter"]
 
@@ -65,6 +66,7 @@ class Conditions:
     """How a recording is made; every hook on rates and times gets it.
 
     exposure, frame_time, frame_period: s; frames: their number; wavelength: m, None where no light falls on the sensor.
+    scene: the image that the light follows, where it is not the same on all pixels; photons/s are then those of white.
     bits: of the readout `counts`, 0 without it; counting: what a count is, the sum of 2^bits - 1 binary `frames`, or a
     `counter` in each frame, which stops at 2^bits - 1.
     """
@@ -76,6 +78,13 @@ class Conditions:
     wavelength: float | None
     bits: int = 0
     counting: str = "frames"
+    scene: Scene | None = None
+
+    def lit(self, photons: np.ndarray) -> tuple[np.ndarray, Conditions]:
+        """(photons/s on each pixel, the same conditions without a scene) of (images, pixels) photons/s of white."""
+        if self.scene is None:
+            return photons, self
+        return photons * self.scene.share, replace(self, scene=None)
 
     @property
     def largest_count(self) -> int:

@@ -168,6 +168,11 @@ def import_files(
     if planned is not None:
         places = planned.layout.positions
     array = pixels.array(files[0], said, shapes, channels, places)
+    for one in ones:
+        shown = one.made.light.scene
+        if shown is not None and shown.shape != array.layout.shape:
+            sizes = f"{_by(shown.shape)} pixels, but {one.path} has {_by(array.layout.shape)}"
+            raise InputError(f"--light: the scene {shown.name} has {sizes}; give an image of the sensor's size")
     if array.channels is not None and array.channels != tuple(range(array.layout.pixels)):
         several = len(array.channels) > 1
         are = "s {} are the pixels, in this order" if several else " {} is the pixel"
@@ -370,7 +375,7 @@ def _described(
         lit = replace(lit, relative_uncertainty=said.relative_uncertainty)
     if found.frames is None:
         exposure = known["exposure"]
-        clock = Conditions(exposure, 1, exposure, exposure, lit.wavelength)
+        clock = Conditions(exposure, 1, exposure, exposure, lit.wavelength, scene=lit.scene)
     else:
         bits = known["bits"] if modality == "counts" else 0
         counter = said.counting == "counter" if said.counting else known.get("counter") == 1
@@ -392,7 +397,7 @@ def _described(
         if time > period * (1 + 1e-12):
             times = units.show(time, "s"), units.show(period, "s")
             raise InputError(f"{path}: a frame of {times[0]} does not fit into the frame period of {times[1]}")
-        clock = Conditions(frames * period, frames, time, period, lit.wavelength, bits, counting)
+        clock = Conditions(frames * period, frames, time, period, lit.wavelength, bits, counting, lit.scene)
     return Capture(safe_name(path.stem, [one.id for one in before]), modality, lit, clock)
 
 

@@ -89,11 +89,21 @@ class Flat(_Light):
     lux: Lux | None = None
 
 
+class Image(_Light):
+    """An image that the light follows: a scene. Without irradiance and lux the level of its white is free."""
+
+    kind: Literal["image"]
+    file: File
+    wavelength: Length | None = None
+    irradiance: Irradiance | None = None
+    lux: Lux | None = None
+
+
 class _Capture(Section):
     id: Name
     file: File | None = None
     mean: Mean | None = None
-    light: Annotated[Dark | Flat, Field(discriminator="kind")]
+    light: Annotated[Dark | Flat | Image, Field(discriminator="kind")]
 
 
 class Stamps(_Capture):
@@ -142,6 +152,7 @@ EXAMPLES = {
     "id": "id: dark",
     "light": "light: {kind: dark}",
     "wavelength": "wavelength: 500 nm",
+    "file": "file: chart.npy",
     "exposure": "exposure: 100 ms",
     "frames": "frames: 1000",
     "frame_time": "frame_time: 10 us",

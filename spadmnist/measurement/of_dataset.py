@@ -1,5 +1,5 @@
-"""A dataset of uniform images as a measurement: every image is a capture of its own, a repetition of the others at its
-light level.
+"""A dataset of uniform light, or of a chart, as a measurement: every image is a capture of its own, a repetition of the
+others at its light level.
 """
 
 from __future__ import annotations
@@ -13,25 +13,29 @@ from .. import config, dataset, recording
 from ..document import Document
 from ..errors import InputError
 from ..events import Layout
-from ..images import Uniform
+from ..images import Chart, Uniform
 from ..readout import Recorded
 from ..recording import MODALITIES, Capture, Light, Recording
+from ..scene import Scene
 from .type import Measurement
 
 
 def of_dataset(root: Path, readout: str | None) -> Measurement:
     """Every image of every level is a capture: `5 mlux`, or `5 mlux #0`, `5 mlux #1`, ... where there are several.
 
+    Of a chart, the capture is of a scene; where each split is another chart, its name stands before the number.
     readout: which one to take; without it the first of `MODALITIES` that was recorded. Raises InputError where the
-    images are not uniform, or the readout was not recorded.
+    images are neither uniform nor grey charts, or the readout was not recorded.
     """
     manifest = dataset.intact_manifest(root)
     experiment = config.build(Document(str(root), manifest["config"]), root)
-    uniform = experiment.source
-    if not isinstance(uniform, Uniform):
+    source = experiment.source
+    if not isinstance(source, Uniform | Chart):
         raise InputError(
-            f"{root}: is a dataset of {uniform.describe()}; only one whose source is uniform is a measurement"
+            f"{root}: is a dataset of {source.describe()}; only one whose source is uniform or a chart is a measurement"
         )
+    if isinstance(source, Chart) and len(manifest["images"]["shape"]) > 2:
+        raise InputError(f"{root}: is a dataset of a chart in colour; only that of a grey one is a measurement")
     if readout is not None and readout not in experiment.readouts:
         raise InputError(f"{root}: {readout} was not recorded; there are {', '.join(experiment.readouts)}")
     chosen = readout or next(name for name in MODALITIES if name in experiment.readouts)
@@ -44,11 +48,22 @@ def of_dataset(root: Path, readout: str | None) -> Measurement:
     if chosen == "tr":
         exposure = conditions.exposure
         conditions = replace(conditions, frames=1, frame_time=exposure, frame_period=exposure)
+    scenes: dict[str, Scene] = {}
+    if isinstance(source, Chart):
+        white = manifest["images"]["white"]
+        for split in stored.splits:
+            chart = stored[stored.levels[0], split].images[0]
+            scenes[split] = Scene(f"{split}.npy", chart if chart.dtype == np.uint8 else chart / float(white))
     captures = []
-    for level, _, i in images:
-        lit = Light(conditions.wavelength, level.value * uniform.grey / 255, level.kind) if uniform.grey else Light()
+    for level, split, i in images:
+        share = source.grey / 255 if isinstance(source, Uniform) else 1.0
+        lit = (
+            Light(conditions.wavelength, level.value * share, level.kind, scene=scenes.get(split)) if share else Light()
+        )
         id = f"{level.text} #{i}" if repeated else level.text
-        captures.append(Capture(id, chosen, lit, replace(conditions, wavelength=lit.wavelength)))
+        if len(scenes) > 1:
+            id = f"{level.text} {split} #{i}"
+        captures.append(Capture(id, chosen, lit, replace(conditions, wavelength=lit.wavelength, scene=lit.scene)))
 
     def read(index: int, layout: Layout, dead_time: float) -> tuple[Recording, list[str]]:
         level, split, i = images[index]

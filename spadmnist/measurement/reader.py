@@ -5,24 +5,25 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import capture_files, config, dataset, document, units
+from .. import capture_files, config, dataset, document, scene, units
 from ..document import Path_
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
 from ..events import MOST_PIXELS, Layout
 from ..recording import Capture, Light, Recording
+from ..scene import Scene
 from ..validated import Reader
-from .entries import EXAMPLES, FILE, SECTIONS, Array, Counts, Dark, Entry, Flat, Frames, Stamps
+from .entries import EXAMPLES, FILE, SECTIONS, Array, Counts, Dark, Entry, Flat, Frames, Image, Stamps
 from .of_dataset import of_dataset
 from .type import Measurement, without_file
 
-_DEFAULT_WAVELENGTH = "555 nm"  # where a level is given in lux, which mean light of this colour
+_DEFAULT_WAVELENGTH = "555 nm"  # of a scene, and where a level is given in lux, which mean light of this colour
 
 
 def is_measurement(path: str | Path) -> bool:
@@ -32,7 +33,7 @@ def is_measurement(path: str | Path) -> bool:
 
 
 def open(path: str | Path, readout: str | None = None, planned: bool = False) -> Measurement:
-    """Open a measurement: its folder, its YAML file, or the folder of a dataset whose source is `uniform`.
+    """Open a measurement: its folder, its YAML file, or the folder of a dataset of uniform light or a chart.
 
     readout: of a dataset, which one to take (`tr`, `str`, `qis` or `counts`), for all of one image show the same
     events; without it the first of them that was recorded. planned: captures that have no file yet will do, whether
@@ -69,7 +70,7 @@ class _Reader(Reader):
         raw = {key: value for key, value in raw.items() if value is not None or key not in SECTIONS}
         parts = self.sections(raw, SECTIONS, {"name": self.base.resolve().name or "measurement"})
         layout = self.layout(parts.get("layout"), raw.get("layout"))
-        captures = self.captures(parts.get("captures", []))
+        captures = self.captures(parts.get("captures", []), layout)
         if self.problems or layout is None:
             raise ConfigError(self.problems)
         return self.checked(parts["name"], layout, captures)
@@ -133,8 +134,8 @@ class _Reader(Reader):
             self.say(path, f"{size} pixels are more than the {MOST_PIXELS:,} that can be held; give fewer")
         return Layout(array.rows, array.columns, np.nan, np.nan)
 
-    def captures(self, raw: list[Any]) -> list[tuple[Capture, Path | None]]:
-        found = [self.capture(("captures", i), one) for i, one in enumerate(raw)]
+    def captures(self, raw: list[Any], layout: Layout | None) -> list[tuple[Capture, Path | None]]:
+        found = [self.capture(("captures", i), one, layout) for i, one in enumerate(raw)]
         for what, key in (("id", "a name"), ("file", "a file")):
             first: dict[Any, int] = {}
             for i, one in enumerate(raw):
@@ -143,7 +144,7 @@ class _Reader(Reader):
                     self.say(("captures", i, what), f"{name} is that of captures[{first[name]}]; give each {key} once")
         return [one for one in found if one is not None]
 
-    def capture(self, path: Path_, raw: Any) -> tuple[Capture, Path | None] | None:
+    def capture(self, path: Path_, raw: Any, layout: Layout | None) -> tuple[Capture, Path | None] | None:
         """A capture and its file, or None after its mistakes were noted."""
         before = len(self.problems)
         entry = self.valid(Entry, raw, path)
@@ -152,12 +153,26 @@ class _Reader(Reader):
         if entry is None:
             return None
         lit = _light(entry.light)
-        conditions = _conditions(entry, lit.wavelength)
+        if isinstance(entry.light, Image):
+            lit = replace(lit, scene=self.scene((*path, "light", "file"), entry.light.file, layout))
+        conditions = replace(_conditions(entry, lit.wavelength), scene=lit.scene)
         self.check_clock(path, entry, conditions)
         if len(self.problems) > before:
             return None
         mean = None if entry.mean is None else float(entry.mean)
         return Capture(entry.id, entry.modality, lit, conditions, mean), entry.file and self.base / entry.file
+
+    def scene(self, path: Path_, name: str, layout: Layout | None) -> Scene | None:
+        """The scene of a file in the folder; None after its mistakes were noted."""
+        try:
+            found = scene.read(self.base / name)
+        except InputError as error:
+            self.say(path, str(error))
+            return None
+        if layout is not None and found.shape != layout.shape:
+            has = f"{_by(found.shape)} pixels, but the layout {_by(layout.shape)}"
+            self.say(path, f"the scene {name} has {has}; give an image of the sensor's size")
+        return found
 
     def check_parts(self, path: Path_, raw: Mapping[str, Any]) -> None:
         """Which entries stand beside each other, whatever they say."""
@@ -171,12 +186,12 @@ class _Reader(Reader):
             if {"mean", "counting"} & set(raw) or coming:
                 self.say(path, self.missing("bits"))
         lit = raw.get("light")
-        if not isinstance(lit, Mapping) or lit.get("kind") != "flat":
+        if not isinstance(lit, Mapping) or lit.get("kind") not in ("flat", "image"):
             return
         has = {key for key in ("wavelength", "irradiance", "lux") if lit.get(key) is not None}
         if {"irradiance", "lux"} <= has:
             self.say((*path, "light"), "has both irradiance and lux; keep one")
-        if not {"wavelength", "lux"} & has:
+        if lit["kind"] == "flat" and not {"wavelength", "lux"} & has:
             self.say((*path, "light"), self.missing("wavelength"))
 
     def check_clock(self, path: Path_, entry: Stamps | Frames | Counts, conditions: Conditions) -> None:
@@ -204,7 +219,7 @@ class _Reader(Reader):
             self.say((*path, "mean"), f"{entry.mean} is not possible; it must be at least 0 and at most {most:g}")
 
 
-def _light(lit: Dark | Flat) -> Light:
+def _light(lit: Dark | Flat | Image) -> Light:
     uncertain = float(lit.relative_uncertainty or 0.0), float(lit.own_uncertainty or 0.0)
     if isinstance(lit, Dark):
         return Light(None, None, "irradiance", *uncertain)

@@ -7,7 +7,7 @@ import fcntl
 import filecmp
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from .. import capture_files, config, disk, document, units
 from ..errors import InputError, SpadError
 from ..events import Layout
 from ..recording import Capture, Recording
+from ..scene import Scene
 from .entries import FILE, FORMAT
 from .type import Measurement
 
@@ -70,6 +71,8 @@ def write(
             raise
         if layout.positions is not None:
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
+        for shown, file in _scenes(done).items():
+            _commit(root, file, shown.file())
         _check_place(root, done, layout)
         _commit(root, FILE, _yaml(name, layout, done).encode())
         _clear(root)
@@ -141,17 +144,27 @@ _POSITIONS = "positions.csv"
 
 def _files(captures: Sequence[Capture]) -> list[str]:
     """A file's name for each capture, made from its id; no two the same, whatever the file system thinks of case."""
+    return _named([capture.id for capture in captures], ".h5")
+
+
+def _named(wanted: Sequence[str], suffix: str) -> list[str]:
     names: list[str] = []
     taken: set[str] = set()
-    for capture in captures:
-        stem = re.sub(r"[^A-Za-z0-9.+-]+", "_", capture.id).strip("_.") or "capture"
-        name, n = f"{stem}.h5", 1
+    for one in wanted:
+        stem = re.sub(r"[^A-Za-z0-9.+-]+", "_", one).strip("_.") or "capture"
+        name, n = f"{stem}{suffix}", 1
         while name.lower() in taken:
             n += 1
-            name = f"{stem}-{n}.h5"
+            name = f"{stem}-{n}{suffix}"
         taken.add(name.lower())
         names.append(name)
     return names
+
+
+def _scenes(captures: Sequence[Capture]) -> dict[Scene, str]:
+    """The scenes that captures are of, each once, and the names of their files."""
+    shown = dict.fromkeys(capture.light.scene for capture in captures if capture.light.scene is not None)
+    return dict(zip(shown, _named([one.name.removesuffix(".npy") for one in shown], ".npy"), strict=True))
 
 
 @contextlib.contextmanager
@@ -177,8 +190,9 @@ def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> Non
         there |= {f"{own.name}/{name}" for name in os.listdir(own)} - {f"{own.name}/{disk.temporary(root).name}"}
     if layout.positions is not None:
         there.discard(_POSITIONS)
-    known = set(_files(captures))
-    strange = sorted(name for name in there if (name not in known if captures else not name.endswith(".h5")))
+    known = {*_files(captures), *_scenes(captures).values()}
+    parts = (".h5", ".npy")
+    strange = sorted(name for name in there if (name not in known if captures else not name.endswith(parts)))
     if strange:
         raise SpadError(f"{root} is not empty (there is {strange[0]}); choose another folder with -o, or remove it")
 
@@ -234,15 +248,18 @@ def _yaml(name: str, layout: Layout, captures: Sequence[Capture]) -> str:
     if layout.positions is not None:
         array = {"positions": _POSITIONS}
     lines = document.dump({"format": FORMAT, "name": name, "layout": array}) + "captures:\n"
+    scenes = _scenes(captures)
     for capture, file in zip(captures, _files(captures), strict=True):
-        entry = document.dump(_entry(capture, file)).splitlines()
+        entry = document.dump(_entry(capture, file, scenes)).splitlines()
         lines += "".join(f"{'    ' if i else '  - '}{line}\n" for i, line in enumerate(entry))
     return lines
 
 
-def _entry(capture: Capture, file: str) -> dict[str, Any]:
+def _entry(capture: Capture, file: str, scenes: Mapping[Scene, str]) -> dict[str, Any]:
     lit, c = capture.light, capture.conditions
     shown: dict[str, Any] = {"kind": "dark" if lit.dark else "flat"}
+    if lit.scene is not None:
+        shown = {"kind": "image", "file": scenes[lit.scene]}
     if lit.wavelength is not None:
         shown["wavelength"] = units.exact(lit.wavelength, "m")
         if lit.level is not None:

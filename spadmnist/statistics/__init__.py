@@ -69,6 +69,7 @@ class Statistic(Plugin, abstract=True):
     registry: ClassVar[Registry] = Registry("statistic")
     modalities: ClassVar[tuple[str, ...]] = ()  # of "tr", "str", "qis", "counts"
     costly: ClassVar[bool] = False  # left out where very many models are looked at for the first time
+    flat: ClassVar[bool] = False  # it sets pixels beside each other as if all saw the same light: not of a scene
     unit: ClassVar[str] = "1"  # of its values
     # whose detections it sets beside each other: a pixel's own, those close by or far apart, all as one; "": it counts
     among: ClassVar[Literal["", "pixel", "neighbours", "far", "array"]] = ""

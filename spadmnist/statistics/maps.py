@@ -253,6 +253,7 @@ class Surface(Statistic):
     """
 
     modalities = _ALL
+    flat = True
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -293,6 +294,7 @@ class Outliers(Statistic):
     """
 
     modalities = _ALL
+    flat = True
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -324,6 +326,7 @@ class Tails(Statistic):
     """
 
     modalities = _ALL
+    flat = True
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -357,6 +360,7 @@ class Spread(Statistic):
     """
 
     modalities = _ALL
+    flat = True
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:

@@ -37,12 +37,12 @@ def test_frames_in_another_order_of_memory() -> None:
 @pytest.mark.parametrize("kind", ["qis", "str", "counts", "counter"])
 def test_what_is_not_kept_makes_no_difference(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = one_of_each()[kind]
-    kept = {s.name: s.reduce(recording) for s in statistics_for(recording.modality)}
+    kept = {s.name: s.reduce(recording) for s in statistics_for(recording.capture)}
     monkeypatch.setattr("spadmnist.statistics._frames._SMALL", 0)
     monkeypatch.setattr("spadmnist.recording._CHUNK", 1)
     again = Recording(**{**recording.__dict__, "_kept": {}})
     assert np.array_equal(frame_sums(again), frame_sums(recording))
-    for statistic in statistics_for(recording.modality):
+    for statistic in statistics_for(recording.capture):
         summary, wanted = statistic.reduce(again), kept[statistic.name]
         assert (summary is None) == (wanted is None)
         assert summary is None or wanted is None or np.array_equal(summary.values, wanted.values), statistic.name
