@@ -20,9 +20,7 @@ from .reconstruct import Settings
 from .sensor import Sensor
 from .streams import Streams
 
-_FROM_FRAMES = (
-    2e9  # expected events of an image from which on its frames are drawn without them, where they stand alone
-)
+_FROM_FRAMES = 2e9  # expected events of an image from which on its frames are drawn without them, if they stand alone
 _MOST_OF_A_ROW = 2e8  # bits of a row of pixels that are drawn so: half of them are drawn at once
 _MOST_BYTES = 4 * 2**30  # of one image on disk
 
@@ -228,16 +226,11 @@ class Experiment:
         pixels = self.sensor.layout.pixels * channels
         photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
         excess = self.sensor.excess(photons, self.conditions, self.readouts)
-        if excess and self._frames_alone and self.causes:
-            raise InputError(
-                f"{self.name}: one image at {brightest.text} would hold {excess}; its frames can be drawn without "
-                "events, and then have no causes: leave out --causes (and causes: true), or lower the light"
-            )
-        if excess and not self._frames_alone:
-            raise InputError(
-                f"{self.name}: one image at {brightest.text} would hold {excess}; "
-                "lower the light, the dark count rate or the exposure"
-            )
+        if excess and not self.from_frames(photons).any():
+            do = "lower the light, the dark count rate or the exposure"
+            if replace(self, causes=False).from_frames(photons).any():
+                do = "its frames can be drawn without events, and then have no causes: leave out --causes (or the causes)"
+            raise InputError(f"{self.name}: one image at {brightest.text} would hold {excess}; {do}")
         candidates, _ = self.sensor.expected(photons, self.conditions)
         events = float(candidates.sum())
         stored = pixels * self.conditions.frames / 8 if set(self.readouts) & {"qis", "str"} else 0

@@ -326,7 +326,7 @@ class Sensor:
         readouts: Collection[str],
         staged: bool = False,
         causes: bool = False,
-        most: float = _EVENTS_OF_A_PART,
+        most: float | None = None,
     ) -> Recorded:
         """Simulate images.
 
@@ -354,7 +354,7 @@ class Sensor:
         if step == 1:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1] if photons.size else 0.0
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + line.layout.pixels))))
-        tied = self.tying(readouts)
+        tied, most = self.tying(readouts), _EVENTS_OF_A_PART if most is None else most
         parts = []
         for i in range(0, max(1, len(photons)), step):
             some = slice(i, i + step)

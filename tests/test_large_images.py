@@ -78,7 +78,7 @@ def exposed(sensor: Sensor, conditions: Conditions, readouts: Collection[str], *
     return sensor.expose(photons, conditions, drawn(2), readouts, staged=True, **how)
 
 
-def parts_of(monkeypatch: pytest.MonkeyPatch, make: Callable[[], Recorded]) -> tuple[Recorded, int]:
+def parts_of(monkeypatch: pytest.MonkeyPatch, make: Callable[[], Any]) -> tuple[Any, int]:
     """(what is made, in how many goes through the line)."""
     goes = 0
     line = Sensor._staged
@@ -260,6 +260,7 @@ def test_frames_that_depend_on_each_other_are_not_drawn_alone() -> None:
     assert "lower the light" in refused(built("    flicker: {amplitude: 0.1}\n", **bright))
     assert "leave out --causes" in refused(built(causes=True, **bright))
     assert "lower the light" in refused(built(lux="1000 lux", readouts="qis, str"))
+    assert "events in a pixel" in refused(built(lux="6400000 lux", shape=(1, 8), readouts="qis"))
 
 
 def test_causes_of_the_papers_bright_capture_are_refused_in_one_sentence(tmp_path: Path) -> None:
@@ -282,7 +283,8 @@ def test_a_capture_of_many_detections_is_simulated_where_nothing_ties_pixels(mon
     (whole,) = twin.model_recordings(sensor, capture, 2e5, drawn(1), images)
     monkeypatch.setattr(spadmnist.sensor, "_MOST_AT_ONCE", 1000.0)
     monkeypatch.setattr(spadmnist.sensor, "_EVENTS_OF_A_PART", 500.0)
-    (parts,) = twin.model_recordings(sensor, capture, 2e5, drawn(1), images)
+    parts, goes = parts_of(monkeypatch, lambda: twin.model_recordings(sensor, capture, 2e5, drawn(1), images)[0])
+    assert goes > 10
     assert len(whole.events) > 5000 and np.array_equal(whole.events.times, parts.events.times)
     tied = Sensor(GRID, SENSORS["crosstalk"], "device", 5).settled()
     with pytest.raises(InputError, match=r"long: would hold 1\.\d+e\+04 events.*crosstalk ties all pixels; shorten it"):
