@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from . import kernels, light, units
+from . import kernels, light, standing, units
 from .effects import Conditions
 from .errors import InputError, did_you_mean
 from .images import Images, check_size
@@ -20,8 +20,8 @@ from .reconstruct import Settings
 from .sensor import Sensor
 from .streams import Streams
 
-_MOST_EVENTS = 2_000_000_000  # of one image
-_MOST_STAGED_EVENTS = 100_000_000  # of one image, where a batch goes through one stage after the other
+_FROM_FRAMES = 2e9  # expected events of an image from which on its frames are drawn without them, if they stand alone
+_MOST_OF_A_ROW = 2e8  # bits of a row of pixels that are drawn so: half of them are drawn at once
 _MOST_BYTES = 4 * 2**30  # of one image on disk
 
 
@@ -162,8 +162,39 @@ class Experiment:
         numbers = (images[:, None] * channels + np.arange(channels)).reshape(-1).astype(np.uint64)
         photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
         streams = self.streams(level, split, numbers)
-        made = self.sensor.expose(photons, self.conditions, streams, self.readouts, causes=self.causes)
-        return made.grouped(channels)
+        large = self.from_frames(photons)
+        if not large.any():
+            made = self.sensor.expose(photons, self.conditions, streams, self.readouts, causes=self.causes)
+            return made.grouped(channels)
+        parts = []
+        for i, one in enumerate(large):
+            own = streams.of(streams.images[i : i + 1])
+            if one:
+                parts.append(standing.recorded(self.sensor, self.conditions, photons[i], own))
+            else:
+                parts.append(self.sensor.expose(photons[i : i + 1], self.conditions, own, self.readouts))
+        return Recorded.join(parts).grouped(channels)
+
+    @cached_property
+    def _frames_alone(self) -> bool:
+        """Is there nothing but binary frames that stand alone?"""
+        c = self.conditions
+        if set(self.readouts) != {"qis"} or self.sensor.layout.columns * c.frames > _MOST_OF_A_ROW:
+            return False
+        half = max(1, c.frames // 2)
+        return standing.tying(self.sensor, c, replace(c, frames=half, exposure=half * c.frame_period)) is None
+
+    def from_frames(self, photons: np.ndarray) -> np.ndarray:
+        """(images,) bool: which images hold so many events that their frames are drawn without them?
+
+        Those whose whole image does, where the sensor is a part of a chip. photons: (images, pixels) photons/s.
+        """
+        if self.causes or not self._frames_alone:
+            return np.zeros(len(photons), bool)
+        chip, window = self.sensor.chip or self.sensor, self.sensor.window
+        light = photons if window is None else window.spread(photons)
+        events = chip.expected(light, self.conditions)[0].sum(axis=1)
+        return np.asarray(events > _FROM_FRAMES)
 
     @cached_property
     def settings(self) -> Settings:
@@ -194,15 +225,14 @@ class Experiment:
         brightest = max(self.levels, key=self.white)
         pixels = self.sensor.layout.pixels * channels
         photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
+        excess = self.sensor.excess(photons, self.conditions, self.readouts)
+        if excess and not self.from_frames(photons).any():
+            do = "lower the light, the dark count rate or the exposure"
+            if replace(self, causes=False).from_frames(photons).any():
+                do = "its frames can be drawn without events, and then have no causes: leave out --causes (or the causes)"
+            raise InputError(f"{self.name}: one image at {brightest.text} would hold {excess}; {do}")
         candidates, _ = self.sensor.expected(photons, self.conditions)
         events = float(candidates.sum())
-        most = _MOST_EVENTS if self.sensor.is_paper_line else _MOST_STAGED_EVENTS
-        if not events <= most:
-            raise InputError(
-                f"{self.name}: one image at {brightest.text} would hold {events:.3g} events "
-                f"({events / pixels:.3g} a pixel), more than the {most:.0e} that can be simulated at once; "
-                "lower the light, the dark count rate or the exposure"
-            )
         stored = pixels * self.conditions.frames / 8 if set(self.readouts) & {"qis", "str"} else 0
         stored += 4 * events * len(set(self.readouts) & {"tr", "str"})
         if "counts" in self.readouts:

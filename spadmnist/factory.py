@@ -47,6 +47,8 @@ POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
+_PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
+_PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 _VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
 
@@ -519,7 +521,7 @@ def most_workers(experiment: Experiment, splits: Mapping[str, Images], processor
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
-    """Bytes: interpreter and libraries, and the streams, scratch and encoded bytes of the largest shard."""
+    """Bytes: interpreter and libraries, what is simulated at once, and the streams and encoded bytes of a shard."""
     most: dict[tuple[str, str], int] = {}
     for shard in shards:
         if shard.level is not None:
@@ -527,12 +529,14 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
             most[key] = max(most.get(key, 0), shard.stop - shard.start)
     # packed bits are held once; stamps and images two to three times, before and after they are put in order
     framed = bool({"str", "qis"} & set(experiment.readouts))
-    streams = bits = 0.0
+    streams = bits = scratch = 0.0
+    each = _PER_EVENT_CAUSED if experiment.causes else _PER_EVENT
     for (level, split), n in most.items():
-        size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])[1]
+        events, size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])
+        scratch = max(scratch, each * experiment.sensor.at_once(events, experiment.readouts))
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
-    return int(_LIBRARIES + 3 * streams + 1.2 * bits)
+    return int(_LIBRARIES + scratch + 3 * streams + 1.2 * bits)
 
 
 def _memory_there() -> int:

@@ -391,10 +391,12 @@ def _room(expected):
 
 
 @_jit
-def arrivals(rates, exposure, images, key):
+def arrivals(rates, exposure, images, key, place):
     """A Poisson process in every row.
 
-    rates: (images, pixels) 1/s; images: (images,) uint64, the numbers that key the draws; key: (3,) uint64.
+    rates: (images, pixels) 1/s; images: (images,) uint64, the numbers that key the draws; key: (3,) uint64; place:
+    (images, 3) where the draws of each image stand (`streams.beginning`), which is moved on: of an image whose pixels
+    are drawn in several calls, with a rate of 0 in those of the other calls, the events are those of one call.
     Returns (times (events,) s, offsets (images * pixels + 1,) int64).
     """
     n, pixels = rates.shape
@@ -412,6 +414,11 @@ def arrivals(rates, exposure, images, key):
         count = -1
         while count < 0:
             _begin_image(images[i], key, key, buffer, places, distances)
+            if place[i, 0] >= 0.0:
+                places[0] = np.uint64(place[i, 0])
+                places[1] = np.uint64(place[i, 1])
+                distances[0] = place[i, 2]
+                _exponentials(places[0], images[i], key[0], key[1], key[2], buffer)
             count = _candidates(
                 rates[i],
                 exposure,
@@ -431,6 +438,9 @@ def arrivals(rates, exposure, images, key):
             )
             if count < 0:
                 times = _grown(times, used, 2 * times.size)
+        place[i, 0] = places[0]
+        place[i, 1] = places[1]
+        place[i, 2] = distances[0]
         for p in range(pixels + 1):
             offsets[row + p] += used
         used += count
@@ -448,11 +458,12 @@ def _grown(array, used, needed):
 
 
 @_jit
-def children(offsets, hazards, images, key):
+def children(offsets, hazards, images, key, place):
     """Which events have a child: each one with probability 1 - exp(-hazard of its pixel).
 
-    offsets: (images * pixels + 1,); hazards: (pixels,). Returns (parent (children,) int64, index of the event;
-    delay (children,) in units of its mean), in the order of the parents.
+    offsets: (images * pixels + 1,); hazards: (pixels,); place: (images, 3) where the draws of each image stand, as in
+    `arrivals`. Returns (parent (children,) int64, index of the event; delay (children,) in units of its mean), in the
+    order of the parents.
     """
     pixels = hazards.size
     parents = np.empty(256, np.int64)
@@ -461,9 +472,12 @@ def children(offsets, hazards, images, key):
     found = 0
     for i in range(images.size):
         block = np.uint64(0)
-        drawn_from = block - np.uint64(BATCH)  # none are drawn yet
         a, _ = _philox(block, images[i], key[0], key[1], key[2])
         left = _exponential(a)
+        if place[i, 0] >= 0.0:
+            block = np.uint64(place[i, 0])
+            left = place[i, 1]
+        drawn_from = block - np.uint64(BATCH)  # none are drawn yet
         for p in range(pixels):
             row = i * pixels + p
             count = offsets[row + 1] - offsets[row]
@@ -492,21 +506,24 @@ def children(offsets, hazards, images, key):
                 )
                 for child in range(before, found):
                     parents[child] += offsets[row]
+        place[i, 0] = block
+        place[i, 1] = left
     return parents[:found].copy(), delays[:found].copy()
 
 
 @_jit
-def uniforms(events, image_offsets, images, key):
+def uniforms(events, image_offsets, images, key, before):
     """A number from (0, 1) for each of some events; it depends on the event's place in its image alone.
 
-    events: ascending indices; image_offsets: (images + 1,). Returns float64 of the size of `events`.
+    events: ascending indices; image_offsets: (images + 1,); before: events of the image that come before these.
+    Returns float64 of the size of `events`.
     """
     out = np.empty(events.size)
     i = 0
     for k in range(events.size):
         while events[k] >= image_offsets[i + 1]:
             i += 1
-        a, _ = _philox(np.uint64(events[k] - image_offsets[i]), images[i], key[0], key[1], key[2])
+        a, _ = _philox(np.uint64(before + events[k] - image_offsets[i]), images[i], key[0], key[1], key[2])
         out[k] = _uniform(a)
     return out
 
@@ -526,16 +543,17 @@ def weigh(total, offsets, rates, factor):
 
 
 @_jit
-def thinned(rates, offsets, drawn, image_offsets, images, key):
+def thinned(rates, offsets, drawn, image_offsets, images, key, before):
     """Which events remain of a Poisson process that was drawn at too high a rate.
 
-    rates: (events,) 1/s, what the rate is at each; drawn: (rows,) 1/s. Returns (events,) bool.
+    rates: (events,) 1/s, what the rate is at each; drawn: (rows,) 1/s; before: events of the image that come before
+    these. Returns (events,) bool.
     """
     kept = np.empty(rates.size, np.bool_)
     pixels = (offsets.size - 1) // max(1, images.size)
     for row in range(offsets.size - 1):
         image = row // pixels
-        begin = image_offsets[image]
+        begin = image_offsets[image] - before
         for i in range(offsets[row], offsets[row + 1]):
             a, _ = _philox(np.uint64(i - begin), images[image], key[0], key[1], key[2])
             kept[i] = _uniform(a) * drawn[row] < rates[i]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from .experiment import Experiment
 from .foreign import visible
 from .images import Images
 
-_PROBE = 64  # images a level
+_PROBE = 64  # images a level, at most
+_EVENTS = 2e7  # expected of them; of a larger image some rows are taken
+_NUMBERS = 2**24  # pixels of the images that expectations are taken over, where pixels differ
 _BESIDES_ENCODING = 1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
 
 
@@ -30,6 +33,7 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
     # compile first, so that the probe times the work alone
     _probe(experiment, experiment.levels[0], next(iter(splits.values())), 1)
     levels = []
+    shared = sum(shard.level is not None for shard in shards)
     for level in experiment.levels:
         row: dict[str, Any] = {"level": level.text, "images": 0, "photons": 0.0, "detections": 0.0}
         size = seconds = 0.0
@@ -43,7 +47,7 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
             size += bytes_ / probed * n
             seconds += took / probed * n
         row["bytes"] = int(size)
-        row["seconds"] = seconds * _BESIDES_ENCODING / jobs
+        row["seconds"] = seconds * _BESIDES_ENCODING / min(jobs, shared)
         levels.append(row)
     total = {key: sum(row[key] for row in levels) for key in ("images", "photons", "detections", "bytes", "seconds")}
     return {"levels": levels, "total": total, "jobs": jobs, "shards": len(shards), "memory_per_worker": memory}
@@ -64,7 +68,7 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
         recorded = _seen(experiment, row)
         total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
         return total, float(counted @ recorded[:, 0])
-    step = max(1, n // 256)
+    step = max(1, n // max(1, min(256, _NUMBERS // pixels[0].size)))
     some = np.ascontiguousarray(pixels[::step])
     photons = experiment.photons(level, some, images.white)
     recorded = _seen(experiment, photons.reshape(-1, experiment.sensor.layout.pixels))
@@ -85,17 +89,47 @@ def _uniform(experiment: Experiment) -> bool:
     )
 
 
-def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tuple[int, float, int]:
-    """(images, seconds to simulate and encode them, bytes)."""
+def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tuple[float, float, int]:
+    """(images, seconds to simulate and encode them, bytes); of a large image a share of it."""
+    events = dataset.expected_per_image(experiment, level, images)[0]
+    fit = int(_EVENTS / max(events, 1.0))
     block = experiment.sensor.block
-    count = min(max(count, block), len(images))
-    pixels = np.ascontiguousarray(images.pixels[:count])
+    count = min(max(min(count, fit), block if block > 1 else 0), len(images))
+    pixels, share = np.ascontiguousarray(images.pixels[: max(1, count)]), float(count)
+    if not count:
+        experiment, pixels, share = _rows(experiment, level, pixels, images.white)
     started = time.perf_counter()
     made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
     columns = dataset.stream_columns(made, pixels.shape[1:])
     columns |= dataset.reconstruction_columns(experiment, made, pixels.shape[1:])
     size = store.encoded_size(columns, experiment.format)
-    return count, time.perf_counter() - started, size
+    return share, time.perf_counter() - started, size
+
+
+def _rows(experiment: Experiment, level: Any, pixels: np.ndarray, white: float) -> tuple[Experiment, np.ndarray, float]:
+    """(the experiment with some rows of the sensor alone, their pixels of one image, share of its events).
+
+    The rows are as bright as the image, as nearly as there are any. All of it, where something ties its pixels together
+    or the paper's line, which is faster than that of a part of a sensor, makes it.
+    """
+    sensor = experiment.sensor
+    photons = experiment.photons(level, pixels, white).reshape(-1, sensor.layout.pixels)
+    events = sensor.expected(photons, experiment.conditions)[0].reshape(-1, *sensor.layout.shape).sum(axis=(0, 2))
+    from_frames = bool(experiment.from_frames(photons).any())
+    # of the bits of a frame those that are fewer are drawn
+    drawn = pixels.size * experiment.conditions.frames / 2 if from_frames else float(events.sum())
+    few = max(1, int(_EVENTS / drawn * len(events)))
+    fused = sensor.is_paper_line and not from_frames
+    if few >= len(events) or fused or sensor.tying(experiment.readouts):
+        return experiment, pixels, 1.0
+    sums = np.convolve(events, np.ones(few), "valid")
+    top = int(np.argmin(np.abs(sums - events.sum() * few / len(events))))
+    rows = slice(top, top + few)
+    return (
+        replace(experiment, sensor=sensor.cropped(rows, slice(None))),
+        np.ascontiguousarray(pixels[..., rows, :]),
+        float(sums[top] / events.sum()),
+    )
 
 
 def text(estimated: Mapping[str, Any], root: Path) -> str:

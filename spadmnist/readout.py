@@ -11,6 +11,8 @@ from . import kernels
 from .errors import SpadError
 from .events import Events
 
+_BYTES_AT_ONCE = 2**24  # of packed bits that are counted together
+
 READOUTS = ("tr", "str", "qis", "counts")
 
 
@@ -60,7 +62,7 @@ class Frames:
     @property
     def detections(self) -> Events:
         """Every bit set as an event of its row: its cause and its parent. The times are empty."""
-        ones = np.bitwise_count(self.bits).sum(axis=1, dtype=np.int64)
+        ones = _ones(self.bits)
         offsets = np.concatenate([[0], np.cumsum(ones)])
         return Events(np.zeros(int(offsets[-1])), offsets, self.pixels, cause=self.cause, parent=self.parent)
 
@@ -151,9 +153,9 @@ class Recorded:
 
     def grouped(self, planes: int) -> Recorded:
         """The same rows with `planes` images taken as one: the channels of a colour image."""
-        if planes == 1:
-            return self
-        pixels = self.pixels * planes
+        return self if planes == 1 else self._regrouped(self.pixels * planes)
+
+    def _regrouped(self, pixels: int) -> Recorded:
         tr = None if self.tr is None else self.tr.regrouped(pixels)
         frames = self.frames
         if frames is not None:
@@ -161,6 +163,11 @@ class Recorded:
             one = frames
             frames = Frames(one.bits, first, one.frames, one.frame_time, pixels, one.cause, one.parent)
         return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited, self.tally)
+
+    @staticmethod
+    def joined_pixels(parts: list[Recorded]) -> Recorded:
+        """One image of its parts, whose pixels follow each other."""
+        return Recorded.join([part._regrouped(1) for part in parts])._regrouped(sum(part.pixels for part in parts))
 
     @staticmethod
     def join(parts: list[Recorded]) -> Recorded:
@@ -186,7 +193,7 @@ def summarised(pixels: int, tr: Events | None, frames: Frames | None, tally: np.
         recorded = Recorded(pixels, tr, counts, span if tr.tick is None else span * tr.tick, tally=tally)
     if frames is None:
         return recorded
-    ones = np.bitwise_count(frames.bits).sum(axis=1, dtype=np.int32)
+    ones = _ones(frames.bits).astype(np.int32)
     waited = None
     if frames.first is not None:
         first = frames.first
@@ -194,6 +201,13 @@ def summarised(pixels: int, tr: Events | None, frames: Frames | None, tally: np.
         total = total if first.tick is None else total * first.tick
         waited = total + (frames.frames - ones) * frames.frame_time
     return Recorded(pixels, recorded.tr, recorded.counts, recorded.span, frames, ones, waited, tally)
+
+
+def _ones(bits: np.ndarray) -> np.ndarray:
+    """(rows,) int64 how many bits of each row are set; some rows at a time, as they may fill the memory."""
+    step = max(1, _BYTES_AT_ONCE // max(1, bits.shape[1]))
+    parts = [np.bitwise_count(bits[i : i + step]).sum(axis=1, dtype=np.int64) for i in range(0, len(bits), step)]
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def counts_type(largest: int) -> type[np.unsignedinteger]:

@@ -7,7 +7,7 @@ beyond the paper's line, `kernels.paper_line` does the same, image by image, in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,9 @@ from .streams import BLOCK, Draws, Streams
 from .window import Window
 
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
+_MOST_AT_ONCE = 1e8  # expected events that are simulated at once: 4 GB of memory, and more with every effect there is
+_MOST_EVENTS = 2e9  # of an image that is simulated part by part
+_EVENTS_OF_A_PART = 4e6  # expected events of an image from which on it is simulated part by part, and of each part
 _GENERATIONS = 10_000
 _CHILDREN = 200  # times the events that they come from: more is a cascade without end
 _NONE = np.zeros(0)
@@ -206,7 +209,12 @@ class Sensor:
     @cached_property
     def block(self) -> int:
         """Images that must be simulated together: 1, or `BLOCK` where an effect does not count its draws."""
-        return 1 if all(e.counted or not _draws(e) for e in self.effects) else BLOCK
+        return BLOCK if self.uncounted else 1
+
+    @cached_property
+    def uncounted(self) -> list[Effect]:
+        """The effects whose hooks take random numbers and do not count them."""
+        return [e for e in self.effects if not e.counted and _draws(e)]
 
     @cached_property
     def dead_times(self) -> np.ndarray:
@@ -329,15 +337,58 @@ class Sensor:
     def _lively(self, window: Window, readouts: Collection[str]) -> np.ndarray:
         """(pixels,) bool: which pixels of this chip must be simulated, lest a window of it lack what they do to it."""
         far = {True: 0.0, False: 0.0}  # in a correlated effect's way, and in any other
+        for effect, reach in self._reaches(readouts):
+            kind = effect.stage == "correlated"
+            far[kind] = max(far[kind], reach)
+        return window.around(self.layout, far[True] * (_HOPS if self.rules == "device" else 1) + far[False])
+
+    def _reaches(self, readouts: Collection[str]) -> Iterator[tuple[Effect, float]]:
+        """Each effect that acts on one of the readouts, and how far (pitches) its events matter."""
+        acting = {"apply": "tr", "limit": "counts"}  # by the hook of a readout effect
         for effect in self.effects:
-            if effect.stage == "readout" and not ("tr" in readouts and hasattr(effect, "apply")):
+            hooks = [hook for hook, readout in acting.items() if readout in readouts and hasattr(effect, hook)]
+            if effect.stage == "readout" and not hooks:
                 continue
             reach = self._call(effect, "influence")
             if not isinstance(reach, (int, float, np.floating)) or not reach >= 0:
                 raise _wrong(effect, f"influence must return pitches, not negative, or inf; it returns {reach!r}")
-            kind = effect.stage == "correlated"
-            far[kind] = max(far[kind], float(reach))
-        return window.around(self.layout, far[True] * (_HOPS if self.rules == "device" else 1) + far[False])
+            yield effect, float(reach)
+
+    def tying(self, readouts: Collection[str]) -> str | None:
+        """What ties the pixels together, so that all of an image must be simulated at once; None where nothing does.
+
+        An effect whose events reach other pixels, or one whose draws are not counted: they are drawn for all pixels in
+        one go. By its name.
+        """
+        if self.chip is not None:
+            return self.chip.tying(readouts)
+        tied = [effect.name for effect, reach in self._reaches(readouts) if reach > 0]
+        return next(iter([*tied, *(e.name for e in self.uncounted)]), None)
+
+    def at_once(self, events: float, readouts: Collection[str]) -> float:
+        """Expected events that are simulated at once, of an image of so many."""
+        return events if self.tying(readouts) else min(events, _EVENTS_OF_A_PART)
+
+    def excess(self, photons: np.ndarray, conditions: Conditions, readouts: Collection[str]) -> str | None:
+        """What is too much to be simulated of such images together, as "3e+09 events, more than ..."; None: nothing.
+
+        photons: (images, pixels) photons/s. Too much is what 4 GB of memory do not hold of what is simulated at once:
+        all pixels where something ties them together, else one. And what takes minutes, part by part.
+        """
+        events = self.drawn(photons, conditions, readouts)
+        shown = f"{events:.3g} events ({events / photons.size:.3g} a pixel), more than"
+        if not events <= _MOST_EVENTS:
+            return f"{shown} the {_MOST_EVENTS:.0e} that can be simulated"
+        if self.is_paper_line or events <= _MOST_AT_ONCE:
+            return None
+        if tied := self.tying(readouts):
+            return (
+                f"{shown} the {_MOST_AT_ONCE:.0e} that can be simulated at once, as they must: {tied} ties all pixels"
+            )
+        pixel = float(self.expected(photons, conditions)[0].max())
+        if pixel > _MOST_AT_ONCE:
+            return f"{pixel:.3g} events in a pixel, more than the {_MOST_AT_ONCE:.0e} that can be simulated at once"
+        return None
 
     # --- simulation ----------------------------------------------------------------------------------------------
 
@@ -349,18 +400,20 @@ class Sensor:
         readouts: Collection[str],
         staged: bool = False,
         causes: bool = False,
+        most: float | None = None,
     ) -> Recorded:
         """Simulate images.
 
         photons: (images, pixels of the layout) photons/s on each pixel's active area (a colour image is one image a
         channel); streams: of the same images; readouts: of `tr`, `str`, `qis`, `counts`. Where `block` is more than 1
         the images are whole blocks. staged: take the staged line even where the fused one would serve. causes: say of
-        every event what made it (`Events.cause`, `Events.parent`); it changes no event.
+        every event what made it (`Events.cause`, `Events.parent`); it changes no event. most: an image of more expected
+        events is simulated part by part where nothing ties its pixels together (`tying`); that changes nothing, either.
 
         Raises EffectError where an effect's own code fails or returns what it must not.
         """
         if not self._settled:
-            return self.settled().expose(photons, conditions, streams, readouts, staged, causes)
+            return self.settled().expose(photons, conditions, streams, readouts, staged, causes, most)
         if photons.ndim != 2 or photons.shape[1] != self.layout.pixels or len(photons) != len(streams.images):
             raise ValueError(
                 f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
@@ -376,13 +429,39 @@ class Sensor:
         if step == 1:
             brightest = float(photons.mean()) * conditions.exposure * photons.shape[1] if photons.size else 0.0
             step = max(1, min(256, int(_EVENTS_AT_ONCE / (brightest + line.layout.pixels))))
+        tied, most = self.tying(readouts), _EVENTS_OF_A_PART if most is None else most
         parts = []
         for i in range(0, max(1, len(photons)), step):
             some = slice(i, i + step)
-            light = photons[some] if self.window is None else self.window.spread(photons[some])
-            own = streams.of(streams.images[some])
-            parts.append(line._staged(light, conditions, own, readouts, causes, self.window))
+            expected = _NONE if tied else self.expected(photons[some], conditions)[0]
+            if tied or expected.sum() <= most:
+                light = photons[some] if self.window is None else self.window.spread(photons[some])
+                own = streams.of(streams.images[some])
+                parts.append(line._staged(light, conditions, own, readouts, causes, self.window))
+                continue
+            for image, wanted in zip(range(i, i + step), expected, strict=False):
+                own = streams.of(streams.images[image : image + 1])
+                parts.append(
+                    self._by_parts(photons[image : image + 1], wanted, most, conditions, own, readouts, causes)
+                )
         return Recorded.join(parts)
+
+    def _by_parts(
+        self,
+        photons: np.ndarray,
+        expected: np.ndarray,
+        most: float,
+        conditions: Conditions,
+        streams: Streams,
+        readouts: Collection[str],
+        causes: bool,
+    ) -> Recorded:
+        """One image, some of its pixels after the other; expected: (pixels,) events, of which a part has `most`."""
+        line, window = self.chip or self, self.window or Window.of(self.layout.shape, slice(None), slice(None))
+        light = photons if self.window is None else self.window.spread(photons)
+        pieces = window.pieces(expected, most)
+        made = [line._staged(light, conditions, streams, readouts, causes, piece) for piece in pieces]
+        return Recorded.joined_pixels(made)
 
     @cached_property
     def is_paper_line(self) -> bool:
@@ -541,8 +620,9 @@ class Sensor:
             drawn = np.zeros_like(rate)
             for kind, part in parts:
                 drawn += part * maxima.get(kind, 1.0)
-        key = streams.key("photons and dark counts")
-        times, offsets = kernels.arrivals(np.ascontiguousarray(drawn), conditions.exposure, streams.images, key)
+        rng = streams.draws("photons and dark counts", 0)
+        drawn = np.ascontiguousarray(drawn)
+        times, offsets = kernels.arrivals(drawn, conditions.exposure, rng.images, rng.key, rng.place)
         events = Events(times, offsets, rate.shape[1], end=conditions.exposure)
         factors: dict[str, np.ndarray] = {}
         if varying:
@@ -553,8 +633,9 @@ class Sensor:
             now = np.zeros(len(times))
             for kind, part in parts:
                 kernels.weigh(now, offsets, part.ravel(), factors.get(kind, _NONE))
-            key = streams.key("thinning")
-            kept = kernels.thinned(now, offsets, drawn.ravel(), events.image_offsets, streams.images, key)
+            rng = streams.draws("thinning", len(events))
+            images = events.image_offsets, rng.images
+            kept = kernels.thinned(now, offsets, drawn.ravel(), *images, rng.key, rng.before)
             events = events.keep(kept)
             factors = {kind: factor[kept] for kind, factor in factors.items()} if causes else {}
         if causes:
@@ -571,7 +652,8 @@ class Sensor:
     def _factor(self, effect: Effect, events: Events, conditions: Conditions, streams: Streams) -> np.ndarray:
         """(events,) what an arrival effect multiplies its part of the rate by."""
         if hasattr(effect, "modulate"):
-            factor = np.asarray(self._call(effect, "modulate", events, conditions, self._rng(effect, streams)))
+            rng = self._rng(effect, streams, events)
+            factor = np.asarray(self._call(effect, "modulate", events, conditions, rng))
         else:
             factor = np.asarray(self._call(effect, "factor", events.times, conditions))
         hook = "modulate" if hasattr(effect, "modulate") else "factor"
@@ -603,8 +685,9 @@ class Sensor:
             if effect.acts_on == "own":
                 part = next(part for kind, part in parts if kind == effect.name)
                 shares.append((effect.cause, effect.name, part))
-        key = streams.key("causes")
-        chance = kernels.uniforms(np.arange(len(events)), events.image_offsets, streams.images, key)
+        rng = streams.draws("causes", len(events))
+        every = np.arange(len(events))
+        chance = kernels.uniforms(every, events.image_offsets, rng.images, rng.key, rng.before)
         running = np.zeros((len(shares) + 1, len(events)))
         for i, (_, kind, part) in enumerate(shares):
             running[i + 1] = running[i]
@@ -634,7 +717,7 @@ class Sensor:
         self, effect: Effect, events: Events, streams: Streams, suffix: str
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(times, rows, parents) of an effect's children; in the parent's own pixel the dead time comes first."""
-        children = self._call(effect, "spawn", events, self._rng(effect, streams, suffix))
+        children = self._call(effect, "spawn", events, self._rng(effect, streams, events, suffix))
         if not isinstance(children, Children):
             raise _wrong(effect, f"spawn must return Children, not {type(children).__name__}")
         parent, delay = np.asarray(children.parent), np.asarray(children.delay, np.float64)
@@ -753,8 +836,8 @@ class Sensor:
         for effect in self._soft:
             longest = float(self._recovered(effect, np.array([1 - 2.0**-53]))[0])
             close = kernels.followers(events.times, events.offsets, self.dead_times + longest)
-            key = streams.key(f"{effect.name}/sensitivity")
-            chance = kernels.uniforms(close, events.image_offsets, streams.images, key)
+            rng = streams.draws(f"{effect.name}/sensitivity", len(events))
+            chance = kernels.uniforms(close, events.image_offsets, rng.images, rng.key, rng.before)
             needed[close] = np.maximum(needed[close], self._recovered(effect, chance))
         return needed
 
@@ -827,9 +910,9 @@ class Sensor:
 
     # --- calling effects ------------------------------------------------------------------------------------------
 
-    def _rng(self, effect: Effect, streams: Streams, suffix: str = "") -> Any:
+    def _rng(self, effect: Effect, streams: Streams, events: Events, suffix: str = "") -> Any:
         name = effect.name + suffix
-        return Draws(streams.key(name), streams.images) if effect.counted else streams.generator(name)
+        return streams.draws(name, len(events)) if effect.counted else streams.generator(name)
 
     def _call(self, effect: Effect, hook: str, *arguments: Any) -> Any:
         method: Callable[..., Any] = getattr(effect, hook)
@@ -842,7 +925,8 @@ class Sensor:
 
     def _apply(self, effect: Effect, events: Events, streams: Streams, suffix: str = "") -> Events:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""
-        return self._checked(effect, self._call(effect, "apply", events, self._rng(effect, streams, suffix)), events)
+        rng = self._rng(effect, streams, events, suffix)
+        return self._checked(effect, self._call(effect, "apply", events, rng), events)
 
     def _checked(self, effect: Effect, after: Any, events: Events) -> Events:
         if not effect.counted:

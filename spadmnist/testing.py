@@ -351,6 +351,8 @@ def _same_stream_same_result(trial: _Trial) -> None:
         together = _expose(sensor, photons, conditions, images)
         where = f"rules {rules}: the recording changes"
         _same(_expose(sensor, photons, conditions, images), together, f"{where} when it is made again")
+        parts = _expose(sensor, photons, conditions, images, most=100.0)
+        _same(parts, together, f"{where} when an image is simulated part by part (rng.before and rng.place tell where)")
         copy = pickle.loads(pickle.dumps(sensor))
         for start in reversed(range(0, len(images), step)):
             part = slice(start, start + step)

@@ -1,7 +1,7 @@
 """The model's twin of a measurement: the same captures, as a sensor would have recorded them.
 
-A capture is one image of uniform light. What is too large for the memory is simulated in parts where that is exact:
-where frames do not depend on each other.
+A capture is one image of uniform light. What is too large for the memory is simulated in stretches of frames where
+that is exact: where frames do not depend on each other.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import kernels, light, recording
-from .effects import Conditions
+from . import kernels, light, recording, standing
 from .errors import InputError
 from .events import Layout
 from .measurement import Measurement, write
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from .factory import Progress
 
 _AT_ONCE = 3e7  # expected events of a capture that is simulated in one go; a larger one in parts, where that is exact
-_MOST_AT_ONCE = 1e8  # where it is not
 _MOST = 2e9  # in parts
 
 
@@ -73,10 +71,10 @@ def model_recordings(
     large = events > _AT_ONCE or (direct and capture.modality == "qis")
     if large and (whole := _in_parts(sensor, capture, events)):
         return [whole(flux[i], streams.of(images[i : i + 1]), told) for i in range(wanted)]
-    if events > _MOST_AT_ONCE:
+    if excess := sensor.excess(brightest, capture.conditions, (capture.modality,)):
         raise InputError(
-            f"{capture.id}: would hold {events:.2g} events, more than the {_MOST_AT_ONCE:.0e} that can be simulated at "
-            "once; shorten it, or lower its light (frames that do not depend on each other may be more)"
+            f"{capture.id}: would hold {excess}; shorten it, or lower its light (frames that do not depend on each "
+            "other may be more)"
         )
     # where an effect draws by blocks of images, from the beginning of the block
     before = int(images[0]) % sensor.block
@@ -101,32 +99,13 @@ def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
     each = c.largest_count if capture.modality == "counts" and c.counting == "frames" else 1
     frames = max(1, int(c.frames // each * _AT_ONCE / events / 2)) * each
     part = replace(c, frames=frames, exposure=frames * c.frame_period)
-    if capture.modality == "tr" or not _frames_stand_alone(sensor, c, part):
+    if capture.modality == "tr" or standing.tying(sensor, c, part):
         return None
     if capture.modality == "qis" and not sensor.at("gate"):
         return lambda flux, streams, told: _by_bits(sensor, capture, flux, streams, told)
     if events > _MOST:
         return None
     return lambda flux, streams, told: _by_stretches(sensor, capture, flux, streams, frames, told)
-
-
-def _frames_stand_alone(sensor: Sensor, conditions: Conditions, part: Conditions) -> bool:
-    """Are frames independent of each other, and alike, so that a stretch of them may be simulated by itself?"""
-    carried = any(e.carried() > 0 for e in sensor.at("dead_time") if hasattr(e, "carried"))
-    if sensor.at("arrival") or sensor.at("correlated") or carried or sensor.block > 1:
-        return False
-    one = np.ones((1, sensor.layout.pixels))
-    if not all(
-        np.array_equal(*rates) for rates in zip(*(sensor.rates(one, c) for c in (conditions, part)), strict=True)
-    ):
-        return False
-    # a gate must open in each frame as in the first
-    n = 4096
-    within = (np.arange(n) * 0.6180339887498949 % 1) * conditions.frame_period
-    frame = np.arange(n) * conditions.frames // n
-    times = frame * conditions.frame_period + within
-    gates: list[Any] = list(sensor.at("gate"))
-    return all(np.array_equal(gate.open(within, part), gate.open(times, conditions)) for gate in gates)
 
 
 def _by_stretches(
@@ -146,27 +125,13 @@ def _by_stretches(
 
 
 def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, told: _Told) -> Recording:
-    """Frames that stand alone and are not stamped: a bit is 1 with probability 1 - exp(-rate * frame time).
-
-    The frames with a detection are those in which a Poisson process has an event; where most have one, those without
-    are drawn in the same way.
-    """
+    """Frames that stand alone and are not stamped."""
     c, (rows, columns) = capture.conditions, sensor.layout.shape
-    mean = sensor.rates(flux[None], c)[0][0] * c.frame_time  # detections of a frame
-    dense = mean > np.log(2)
-    mean[dense] = -np.log1p(-np.exp(-mean[dense]))
     out = np.empty((c.frames, rows, -(-columns // 8)), np.uint8)
-    step = max(1, int(rows * 4e6 / (mean.sum() * c.frames + 1)))
-    for row in range(0, rows, step):
-        some = slice(row * columns, min(row + step, rows) * columns)
-        key = streams.key(f"bits/row {row}")
-        times, offsets = kernels.arrivals(mean[None, some].copy(), float(c.frames), streams.images, key)
-        bits, _ = kernels.frame_readout(times, offsets, c.frames, 1.0, 1.0, np.empty(len(times) + 1))
-        bits[dense[some]] ^= np.uint8(0xFF)
-        if c.frames % 8:
-            bits[:, -1] &= np.uint8(0xFF << (8 - c.frames % 8) & 0xFF)
-        out[:, row : row + step] = kernels.frames_first(bits, c.frames, len(bits) // columns, columns)
-        told(min(step, rows - row) / rows)
+    for row, bits in standing.bits(sensor, c, flux, streams):
+        count = len(bits) // columns
+        out[:, row : row + count] = kernels.frames_first(bits, c.frames, count, columns)
+        told(count / rows)
     return Recording(capture, sensor.layout, None, out, None, sensor.nominal_dead_time)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -64,6 +65,21 @@ class Window:
         """(pixels,) the numbers on the chip of the window's pixels, in their order."""
         number = np.arange(np.prod(self.whole)).reshape(self.whole)
         return number[self.top : self.bottom, self.left : self.right].ravel()
+
+    def pieces(self, weight: np.ndarray, most: float) -> Iterator[Window]:
+        """The same pixels in their order, some at a time, which weigh together at most so much, or are one.
+
+        weight: (pixels,) not negative. Whole rows, or a part of one that is too heavy.
+        """
+        rows, columns = self.shape
+        by_row = weight.reshape(rows, columns).sum(axis=1)
+        for top, bottom in _runs(by_row, most):
+            if bottom - top > 1 or by_row[top] <= most:
+                ends = [(0, columns)]
+            else:
+                ends = list(_runs(weight[top * columns : bottom * columns], most))
+            for left, right in ends:
+                yield Window(top, bottom, left, right, self.shape).within(self)
 
     def within(self, outer: Window) -> Window:
         """The same part of the whole chip, where this one counts from the corner of another window."""
@@ -146,6 +162,17 @@ class Window:
         if declared.per == "pixel" or value.ndim == 2:
             return self.pixels, int(np.prod(self.whole))
         return slice(None), len(value)  # codes that all pixels share
+
+
+def _runs(weight: np.ndarray, most: float) -> Iterator[tuple[int, int]]:
+    """(start, stop) of entries one after the other that weigh at most so much together, or are one."""
+    start, total = 0, 0.0
+    for i, one in enumerate(weight.tolist()):
+        if i > start and total + one > most:
+            yield start, i
+            start, total = i, 0.0
+        total += one
+    yield start, len(weight)
 
 
 def _shown(part: slice) -> str:

@@ -28,6 +28,7 @@ LAYERS = [
     {"effects", "readout", "images", "pictures", "window"},
     {"gather", "grids", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
+    {"standing"},
     {"experiment", "signatures"},
     {"config"},
     {"manifest", "sensor_file"},

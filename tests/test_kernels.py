@@ -21,7 +21,7 @@ from spadmnist.effects.dead_time import DeadTime
 from spadmnist.effects.tdc import Tdc
 from spadmnist.events import Layout
 from spadmnist.sensor import Sensor
-from spadmnist.streams import Streams
+from spadmnist.streams import Streams, beginning
 
 KEY = np.array([0xA4093822, 0x299F31D0, 0x03707344], np.uint64)
 
@@ -208,14 +208,14 @@ def test_streams_are_named_by_what_they_are_for() -> None:
 def test_uniforms() -> None:
     image_offsets = np.array([0, 3, 200_000], np.int64)
     images = np.array([4, 5], np.uint64)
-    u = kernels.uniforms(np.arange(200_000), image_offsets, images, KEY)
+    u = kernels.uniforms(np.arange(200_000), image_offsets, images, KEY, 0)
     assert u.min() > 0 and u.max() < 1
     laws.distribution_is(u, lambda t: t)
-    assert len(kernels.uniforms(np.zeros(0, np.int64), np.zeros(2, np.int64), images[:1], KEY)) == 0
-    second = kernels.uniforms(np.arange(199_997), np.array([0, 199_997]), images[1:], KEY)
+    assert len(kernels.uniforms(np.zeros(0, np.int64), np.zeros(2, np.int64), images[:1], KEY, 0)) == 0
+    second = kernels.uniforms(np.arange(199_997), np.array([0, 199_997]), images[1:], KEY, 0)
     assert np.array_equal(u[3:], second)  # an image alone
     some = np.array([1, 2, 3, 77, 4000])
-    assert np.array_equal(kernels.uniforms(some, image_offsets, images, KEY), u[some])  # an event alone
+    assert np.array_equal(kernels.uniforms(some, image_offsets, images, KEY, 0), u[some])  # an event alone
 
 
 def test_thinned_draws_the_same_for_an_image_alone() -> None:
@@ -224,12 +224,12 @@ def test_thinned_draws_the_same_for_an_image_alone() -> None:
     rates = rng.uniform(0, 2.0, offsets[-1])
     drawn = np.full(8, 2.0)
     images = np.array([9, 11], np.uint64)
-    both = kernels.thinned(rates, offsets, drawn, offsets[::4], images, KEY)
+    both = kernels.thinned(rates, offsets, drawn, offsets[::4], images, KEY, 0)
     cut = offsets[4]
-    alone = kernels.thinned(rates[cut:], offsets[4:] - cut, drawn[4:], offsets[4::4] - cut, images[1:], KEY)
+    alone = kernels.thinned(rates[cut:], offsets[4:] - cut, drawn[4:], offsets[4::4] - cut, images[1:], KEY, 0)
     assert np.array_equal(both[cut:], alone)
     many = kernels.thinned(
-        np.full(100_000, 0.3), np.array([0, 100_000]), np.ones(1), np.array([0, 100_000]), images[:1], KEY
+        np.full(100_000, 0.3), np.array([0, 100_000]), np.ones(1), np.array([0, 100_000]), images[:1], KEY, 0
     )
     laws.share_is(int(many.sum()), 100_000, 0.3)
 
@@ -523,7 +523,7 @@ def plain_arrivals(rates: np.ndarray, exposure: float, image: int, key: np.ndarr
 def test_arrivals_are_one_process_along_the_image(rates: np.ndarray, exposure: float) -> None:
     rates = rates / exposure
     images = np.arange(7, 7 + len(rates), dtype=np.uint64)
-    times, offsets = kernels.arrivals(rates, exposure, images, KEY)
+    times, offsets = kernels.arrivals(rates, exposure, images, KEY, beginning(len(images)))
     plain = [row for i, image in enumerate(images.tolist()) for row in plain_arrivals(rates[i], exposure, image, KEY)]
     assert rows_of(times, offsets) == plain
     assert np.all(times < exposure)
@@ -532,7 +532,7 @@ def test_arrivals_are_one_process_along_the_image(rates: np.ndarray, exposure: f
 def test_arrivals_that_do_not_fit_are_drawn_again() -> None:
     """A kernel that is short of room starts afresh and gives the same events."""
     rates = np.array([[0.0, 500.0, 40.0, 0.0, 3000.0]])
-    times, offsets = kernels.arrivals(rates, 1.0, np.array([3], np.uint64), KEY)
+    times, offsets = kernels.arrivals(rates, 1.0, np.array([3], np.uint64), KEY, beginning(1))
     buffer, places, distances = np.empty(kernels.BATCH + 1), np.empty(3, np.uint64), np.empty(2)
     for size in (kernels.BATCH + 2, 500, 3700, len(times) + 2 * kernels.BATCH + 2):
         kernels._begin_image(np.uint64(3), KEY, KEY, buffer, places, distances)
@@ -596,7 +596,7 @@ def test_children_are_drawn_event_by_event(counts: list[int], probability: float
     hazards = np.array([hazard if p % 3 != 2 else 0.0 for p in range(pixels)])
     offsets = np.concatenate([[0], np.cumsum(counts + counts)]).astype(np.int64)
     images = np.array([1, 2], np.uint64)
-    parents, delays = kernels.children(offsets, hazards, images, KEY)
+    parents, delays = kernels.children(offsets, hazards, images, KEY, beginning(2))
     expected = [
         (int(offsets[i * pixels + row]) + index, delay)
         for i, image in enumerate((1, 2))
@@ -614,7 +614,7 @@ def test_children_share_and_delays() -> None:
     probabilities = np.tile([0.005, 0.3, 0.9, 1.0, 0.0], 10)
     with np.errstate(divide="ignore"):
         hazards = -np.log1p(-probabilities)
-    parents, delays = kernels.children(offsets, hazards, np.arange(200, dtype=np.uint64), KEY)
+    parents, delays = kernels.children(offsets, hazards, np.arange(200, dtype=np.uint64), KEY, beginning(200))
     assert np.all(np.diff(parents) > 0)  # at most one each, in order
     pixel = np.repeat(np.arange(len(counts)) % 50, counts)
     has = np.zeros(len(pixel), bool)

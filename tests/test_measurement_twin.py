@@ -21,6 +21,7 @@ from measured import (
 )
 from scipy import stats
 
+import spadmnist.sensor
 from spadmnist import config, measurement, twin
 from spadmnist.criticism import compare
 from spadmnist.effects.detection import Detection
@@ -156,7 +157,7 @@ def test_frames_that_depend_on_each_other_are_not_cut(monkeypatch: pytest.Monkey
     assert twin._in_parts(device(Flicker(amplitude=0.1, frequency=100.0)), capture, 1e5) is None
     assert twin._in_parts(device(), one("tr"), 1e5) is None
     large(monkeypatch)
-    monkeypatch.setattr(twin, "_MOST_AT_ONCE", 3000.0)
+    monkeypatch.setattr(spadmnist.sensor, "_MOST_EVENTS", 3000.0)
     images = np.zeros(1, np.uint64)
     streams = Streams(1, "x", "model", images)
     refused(lambda: twin.model_recordings(device(), one("tr"), 1e6, streams, images), "would hold", "shorten it")

@@ -23,7 +23,8 @@ An arrival effect acts on the light, or with `acts_on = "dark"` on the dark rate
 `acts_on = "own"` it brings a rate of its own, `added(conditions)`: 1/s, one value or one per pixel, at its largest.
 A timing effect sees TR streams, and the frames' first stamps (STR) with one frame a row, s since its start.
 `rng` is a `numpy.random.Generator` of the effect's own for each fixed block of images, or, with `counted = True` on
-the class, a `spadmnist.streams.Draws` for the counter-based kernels.
+the class, a `spadmnist.streams.Draws` for the counter-based kernels. An image that is too large to be simulated at once
+is simulated part by part, where all effects that draw count their draws and no `influence()` is more than 0.
 
 Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
 it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form

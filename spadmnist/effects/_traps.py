@@ -29,7 +29,7 @@ class Traps(Effect, stage="correlated", abstract=True):
 
     def spawn(self, events: Events, rng: Draws) -> Children:
         """The releases alone: the sensor, which knows the rules, adds the dead time."""
-        parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key)
+        parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key, rng.place)
         return Children(parent, self.lifetime * delay)
 
     def influence(self) -> float:

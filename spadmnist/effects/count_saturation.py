@@ -24,5 +24,9 @@ class CountSaturation(Effect, stage="readout"):
         if self.bits != int(self.bits):
             raise ValueError(f"bits is a whole number, not {self.bits:g}")
 
+    def influence(self) -> float:
+        """Every pixel has a counter of its own."""
+        return 0.0
+
     def limit(self, counts: np.ndarray) -> np.ndarray:
         return np.minimum(counts, min(2 ** int(self.bits) - 1, np.iinfo(counts.dtype).max))

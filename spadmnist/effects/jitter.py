@@ -56,8 +56,8 @@ class Jitter(Effect, stage="timing"):
     def apply(self, events: Events, rng: Draws) -> Events:
         if self.sigma == 0 and self.tail_weight == 0:
             return events
-        weight, images = float(self.tail_weight), rng.images
-        return events.moved(delayed(events.times, events.image_offsets, images, rng.key, self.sigma, weight, self.tail))
+        law = self.sigma, float(self.tail_weight), self.tail
+        return events.moved(delayed(events.times, events.image_offsets, rng.images, rng.key, rng.before, *law))
 
 
 _BATCH = 128  # events at a time: what is in between stays in the cache
@@ -118,10 +118,11 @@ def normals(chance):  # type: ignore[no-untyped-def]
 
 
 @kernels.jit
-def delayed(times, image_offsets, images, key, sigma, weight, tail):  # type: ignore[no-untyped-def]
+def delayed(times, image_offsets, images, key, before, sigma, weight, tail):  # type: ignore[no-untyped-def]
     """The times of an image's j-th event, later by block j of the stream: the first word's normal, the second's tail.
 
     The second word decides both whether there is a tail and, where there is, how long: u / weight is uniform then.
+    before: events of the image that come before these.
     """
     out = np.empty(times.size)
     core = np.empty(_BATCH)
@@ -132,7 +133,7 @@ def delayed(times, image_offsets, images, key, sigma, weight, tail):  # type: ig
             start = np.uint64(image_offsets[i] + first)
             count = np.uint64(min(stop - first, _BATCH))
             for j in range(count):
-                a, b = kernels.philox(np.uint64(first) + j, images[i], key[0], key[1], key[2])
+                a, b = kernels.philox(np.uint64(before + first) + j, images[i], key[0], key[1], key[2])
                 core[j] = kernels.uniform(a)
                 late[j] = kernels.uniform(b)
             # the centre's formula for all, without a branch, then the few others once more

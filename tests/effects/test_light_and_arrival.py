@@ -33,7 +33,7 @@ from spadmnist.errors import EffectError
 from spadmnist.events import Events, Layout
 from spadmnist.plugins import Distribution, MapFile
 from spadmnist.sensor import Sensor
-from spadmnist.streams import Draws, Streams
+from spadmnist.streams import Draws, Streams, beginning
 
 T = 1e-3
 LIT = Conditions(T, 100, T / 100, T / 100, 555e-9)
@@ -650,7 +650,7 @@ def test_a_hook_takes_a_few_nanoseconds_an_event() -> None:
     """The aim is 15; twice that, since other programs share the processor's cache."""
     layout, images = grid(28, 28), 6
     rates = np.full((images, layout.pixels), 1e5)
-    times, offsets = kernels.arrivals(rates, T, np.arange(images, dtype=np.uint64), KEY)
+    times, offsets = kernels.arrivals(rates, T, np.arange(images, dtype=np.uint64), KEY, beginning(images))
     events = Events(times, offsets, layout.pixels, end=T)
     blinks = [blinking(layout), blinking(layout, fraction=1.0)]
     hooks: dict[str, Callable[[], Any]] = {

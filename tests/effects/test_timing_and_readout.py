@@ -30,7 +30,7 @@ from spadmnist.events import Events, Layout
 from spadmnist.plugins import Distribution, MapFile
 from spadmnist.readout import Recorded
 from spadmnist.sensor import Sensor
-from spadmnist.streams import Draws, Streams
+from spadmnist.streams import Draws, Streams, beginning
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "real" / "linospad2_tdc"
 ALL = ("tr", "str", "qis")
@@ -47,7 +47,7 @@ def uniform_light(images: int, pixels: int, rate: float, exposure: float = EXPOS
     """Poisson events; `cause` and `parent` are marks that show where each of them goes."""
     numbers = np.arange(images, dtype=np.uint64)
     key = np.array([seed, 5, 6], np.uint64)
-    times, offsets = kernels.arrivals(np.full((images, pixels), rate), exposure, numbers, key)
+    times, offsets = kernels.arrivals(np.full((images, pixels), rate), exposure, numbers, key, beginning(images))
     n = len(times)
     cause = np.arange(n).astype(np.uint8)
     return Events(times, offsets, pixels, end=exposure, cause=cause, parent=np.arange(n) - 1)
