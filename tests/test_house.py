@@ -38,6 +38,7 @@ LAYERS = [
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
     {"exporters", "fluxes", "torch"},
+    {"experiments"},
     {"cli"},
     {"start"},
     {"__main__"},

@@ -6,6 +6,17 @@ page forbids the browser to fetch or run anything. The same answer gives the sam
 
 from ._comparison import comparison
 from ._diagnosis import diagnosis
+from ._experiment import Drawing, Story, Table, experiment, markdown
 from ._frame import FILES, check_place
 
-__all__ = ["FILES", "check_place", "comparison", "diagnosis"]
+__all__ = [
+    "FILES",
+    "Drawing",
+    "Story",
+    "Table",
+    "check_place",
+    "comparison",
+    "diagnosis",
+    "experiment",
+    "markdown",
+]
