@@ -121,6 +121,18 @@ def read(
     return experiment
 
 
+def shipped(name: str) -> Path:
+    """A config that comes with the program, such as `spad_mnist.yaml`: in a checkout beside the package, else in it.
+
+    Raises InputError where it is not there.
+    """
+    package = Path(__file__).parent
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(f"{package}: {name}, which comes with the program, is not there; install the program again")
+
+
 def problems(raw: Any, name: str) -> list[str]:
     """The mistakes in a config that is written out with nothing left open, a sentence each; name: of its place.
 

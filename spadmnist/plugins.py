@@ -377,10 +377,11 @@ _registries: list[Registry] = []
 
 @dataclass
 class Registry:
-    """The classes of one kind, by name."""
+    """The classes of one kind, by name. verb: the command that lists them."""
 
     kind: str
     classes: dict[str, type[Plugin]] = field(default_factory=dict)
+    verb: str = ""
 
     def __post_init__(self) -> None:
         _registries.append(self)
@@ -395,7 +396,7 @@ class Registry:
         if name not in self.classes:
             raise KeyError(
                 f"{name} is not {'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}."
-                f"{did_you_mean(name, self.classes)} (spadmnist {self.kind}s lists all)"
+                f"{did_you_mean(name, self.classes)} (spadmnist {self.verb or self.kind + 's'} lists all)"
             )
         return self.classes[name]
 
@@ -516,9 +517,7 @@ def discover() -> None:
     if _discovered:
         return
     for place in PLACES:
-        package = importlib.import_module(place)
-        for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
-            importlib.import_module(f"{place}.{module.name}")
+        import_folder(place)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:
             entry.load()
@@ -528,6 +527,13 @@ def discover() -> None:
                 f"{type(error).__name__}: {error}; mend it or uninstall it"
             ) from error
     _discovered = True
+
+
+def import_folder(place: str) -> None:
+    """Import a package and every module in it, or a module: what is defined there is known from then on."""
+    package = importlib.import_module(place)
+    for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+        importlib.import_module(f"{place}.{module.name}")
 
 
 def load_file(path: str | Path) -> None:

@@ -26,7 +26,7 @@ def effect_list() -> str:
     known: list[type[Effect]] = [Effect.registry.find(name) for name in Effect.registry]
     known.sort(key=lambda cls: (stages.index(cls.stage), cls.name))
     rows = [(cls.name, cls.stage, cls.summary()) for cls in known]
-    return _listing(("effect", "stage", "what it is"), rows)
+    return listing(("effect", "stage", "what it is"), rows)
 
 
 def effect_page(name: str) -> str:
@@ -77,7 +77,7 @@ def method_list() -> str:
     known: list[type[Method]] = [Method.registry.find(name) for name in Method.registry]
     known.sort(key=lambda cls: ([READOUTS.index(r) for r in cls.readouts()], cls.name))
     rows = [(cls.name, " ".join(cls.readouts()), cls.unit, cls.summary()) for cls in known]
-    return _listing(("method", "needs", "unit", "what it is"), rows)
+    return listing(("method", "needs", "unit", "what it is"), rows)
 
 
 def method_page(name: str) -> str:
@@ -93,7 +93,7 @@ def statistic_list() -> str:
     known: list[type[Statistic]] = [Statistic.registry.find(name) for name in Statistic.registry]
     known.sort(key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
     rows = [(cls.name, " ".join(cls.modalities), cls.unit, cls.summary()) for cls in known]
-    return _listing(("statistic", "of", "unit", "what it looks at"), rows)
+    return listing(("statistic", "of", "unit", "what it looks at"), rows)
 
 
 def statistic_page(name: str) -> str:
@@ -150,11 +150,11 @@ def _page(
     head = [cls.name, "; ".join(facts), *acts]
     if cls.__module__.partition(".")[0] != __package__:
         head.append(f"file: {visible(source_file(cls))}")
-    blocks = [head, _docstring(cls), mean, _parameters(list(cls.parameters.values())), paste]
+    blocks = [head, docstring(cls), mean, _parameters(list(cls.parameters.values())), paste]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def _docstring(cls: type[Plugin]) -> list[str]:
+def docstring(cls: type[Plugin]) -> list[str]:
     """Its paragraphs, filled anew; a source begins a line of its own."""
     out: list[str] = []
     for number, paragraph in enumerate((inspect.getdoc(cls) or "").split("\n\n")):
@@ -215,7 +215,7 @@ def _yaml(declared: Parameter) -> str:
     return "true" if declared.unit == "bool" else units.example(declared.unit).removesuffix(" %")
 
 
-def _listing(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def listing(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table whose last column is wrapped."""
     left = _aligned([row[:-1] for row in (header, *rows)], pad_last=True)
     indent = len(left[0]) + 2

@@ -134,7 +134,7 @@ def _levels(manifest: Mapping[str, Any], by_split: bool) -> str:
             rows += [(f"  {split}", *_cells(_numbers(splits[split], frames))) for split in _splits(manifest)]
         else:
             rows.append((level["text"], *_cells(_numbers(_summed(list(splits.values())), frames))))
-    return f"{_aligned(_HEADER, rows)}\n\n{_LEGEND}"
+    return f"{aligned(_HEADER, rows)}\n\n{_LEGEND}"
 
 
 def _cells(numbers: Mapping[str, Any]) -> list[str]:
@@ -182,7 +182,7 @@ def _causes(manifest: Mapping[str, Any]) -> str:
         total = sum(facts["causes"].values())
         rows.append([level["text"], *(_percent(_ratio(facts["causes"][name], total)) for name in names)])
     readout = "TR" if "tr" in manifest["config"]["recording"]["readouts"] else "the frames"
-    return f"causes: what made the detections of {readout}\n{_aligned(['level', *names], rows)}"
+    return f"causes: what made the detections of {readout}\n{aligned(['level', *names], rows)}"
 
 
 def _normalisation(manifest: Mapping[str, Any]) -> str:
@@ -193,10 +193,10 @@ def _normalisation(manifest: Mapping[str, Any]) -> str:
     levels = [level["text"] for level in manifest["levels"]]
     rows = [[level, *(_number(medians[level].get(method)) for method in methods)] for level in levels]
     title = f"normalisation: the median of all non-zero pixels of the {_splits(manifest)[0]} split, photons/s"
-    return f"{title}\n{_aligned(['level', *methods], rows)}"
+    return f"{title}\n{aligned(['level', *methods], rows)}"
 
 
-def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """First column to the left, the others to the right; more columns than fit go into a table below."""
     header, rows = list(map(visible, header)), [list(map(visible, row)) for row in rows]
     widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
@@ -718,9 +718,9 @@ def capture_table(measurement: Measurement, looks: Sequence[Look]) -> str:
             odd = [_integer(n[f"{what}_pixels"]) for what in ("empty", "dead", "hot")]
             shortest = n["shortest_interval"]
             seen.append((row[0], *rates, *odd, "-" if shortest is None else units.show(shortest, "s")))
-    blocks = [_facts(facts), _aligned(head, made)]
+    blocks = [_facts(facts), aligned(head, made)]
     if seen:
-        blocks += [_aligned(_LOOK_HEADER, seen), _LOOK_LEGEND]
+        blocks += [aligned(_LOOK_HEADER, seen), _LOOK_LEGEND]
     blocks += [_wrapped(f"{one.capture.id}: {note}.") for one in looks for note in one.numbers["notes"]]
     return "\n\n".join(blocks)
 
@@ -741,7 +741,7 @@ def flux_table(rows: Sequence[Mapping[str, Any]]) -> str:
         clock = (units.show(row[what], "s") for what in ("time", "dead_time"))
         told[row["capture"]] = (_short(row["capture"]), row["modality"], f"{row['pdp']:.4g}", *clock)
     head = ("capture", "method", "mean", "median", "min", "max", "saturated", "unit")
-    blocks = [_aligned(head, made), _aligned(("capture", "modality", "q", "T", "dead time"), list(told.values()))]
+    blocks = [aligned(head, made), aligned(("capture", "modality", "q", "T", "dead time"), list(told.values()))]
     return "\n\n".join([*blocks, _FLUX_LEGEND])
 
 

@@ -4,7 +4,8 @@
     loader = DataLoader(st.Fluxes(part), batch_size=64, shuffle=True, num_workers=2)
 
 An item is (tensor or `Events`, int label); the label is -1 where the images have none. Nothing here holds an open file:
-workers may be forked, spawned or kept. torch is the user's own; this module alone imports it.
+workers may be forked, spawned or kept. torch is the user's own; it is imported here and where LeNet is
+trained (`spadmnist.experiments`), and only when that is asked for.
 """
 
 from __future__ import annotations

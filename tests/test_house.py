@@ -40,6 +40,7 @@ LAYERS = [
     {"importers"},
     {"exporters", "fluxes", "torch"},
     {"library"},
+    {"experiments"},
     {"cli"},
     {"start"},
     {"__main__"},
@@ -132,6 +133,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ),
         ("jinja2", {"pages/_frame.py"}),
         ("click", {"cli.py"}),
+        ("torch", {"torch.py", "experiments/_lenet.py"}),
         ("tqdm", {"cli.py"}),
         ("yaml", {"document.py"}),
         (

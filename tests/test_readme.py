@@ -47,6 +47,10 @@ RULES = {
         "spadmnist generate configs/spad_mnist.yaml -o spad_mnist --limit 2",
         "700,000 images take minutes",
     ),
+    "spadmnist experiment accuracy -o accuracy": (
+        "spadmnist experiment accuracy",
+        "it takes most of an hour; test_experiments.py does a small one, and a quick one on MNIST",
+    ),
     "spadmnist generate configs/spad23.yaml -o lab": (
         "spadmnist generate configs/spad23.yaml -o lab --limit 1",
         "compare and diagnose take a tenth of the time with one capture of ten",

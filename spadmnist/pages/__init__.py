@@ -6,6 +6,19 @@ page forbids the browser to fetch or run anything. The same answer gives the sam
 
 from ._comparison import check_figure, comparison
 from ._diagnosis import diagnosis, trace_figure
+from ._experiment import Drawing, Story, Table, experiment, markdown
 from ._frame import FILES, check_place
 
-__all__ = ["FILES", "check_figure", "check_place", "comparison", "diagnosis", "trace_figure"]
+__all__ = [
+    "FILES",
+    "Drawing",
+    "Story",
+    "Table",
+    "check_figure",
+    "check_place",
+    "comparison",
+    "diagnosis",
+    "experiment",
+    "markdown",
+    "trace_figure",
+]

@@ -15,7 +15,7 @@ from ..foreign import visible_lines
 from ..statistics import Statistic
 
 # kind of page -> its file in the folder
-FILES = {"comparison": "index.html", "diagnosis": "report.html"}
+FILES = {"comparison": "index.html", "diagnosis": "report.html", "experiment": "report.html"}
 
 _TOTALS = {
     "light": "The light level of all lit captures together, against what the measurement states.",
@@ -76,7 +76,8 @@ def check_place(folder: Path, kind: str = "comparison") -> None:
         except OSError:
             ours = False
         if not ours:
-            raise SpadError(f"{page} is there already and is not from a {kind}; it is left alone: choose another -o")
+            what = f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+            raise SpadError(f"{page} is there already and is not from {what}; it is left alone: choose another -o")
 
 
 def _mark(kind: str) -> str:
