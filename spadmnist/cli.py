@@ -1050,7 +1050,7 @@ def _do_experiment(
     from . import experiments
 
     with _terminal() as progress:
-        setting = experiments.Setting(output, quick, images_dir, jobs or _processors(), progress)
+        setting = experiments.Setting(output, quick, images_dir, jobs or processors(), progress)
         done = experiments.run(experiment, setting)
     if as_json:
         answer = {"experiment": experiment.name, "folder": str(output), "made": done.made, "kept": done.kept}
