@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import lzma
 import os
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +44,7 @@ from spadmnist.effects import Conditions
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Events, Layout
 from spadmnist.factory import Progress
-from spadmnist.importers import Said
+from spadmnist.importers import Said, frames
 from spadmnist.importers.captures import import_files
 from spadmnist.recording import Capture, Light, Recording
 
@@ -909,3 +912,49 @@ def test_a_refusal_leaves_nothing_of_its_own(tmp_path: Path) -> None:
     save(files[1], bad)
     assert "on hold 7" in refusal(files, said)
     assert [path.name for path in kept.iterdir()] == ["a.h5"]
+
+
+def packbits(data: bytes) -> bytes:
+    """Every run of one byte as what repeats it, 128 times at most."""
+    return b"".join(
+        bytes([257 - len(run), run[0]]) if len(run) > 1 else bytes([0, run[0]])
+        for k in range(0, len(data), 128)
+        for run in [data[k : k + 128]]
+    )
+
+
+@pytest.mark.parametrize("codec", ["deflate", "lzma", "packbits"])
+def test_a_page_that_unpacks_to_more_than_it_has(codec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever packs it, as far as tifffile unpacks it without being told how much there is."""
+    pytest.importorskip("tifffile")
+    number, pack = {
+        "deflate": (8, zlib.compress),
+        "lzma": (34925, lzma.compress),
+        "packbits": (32773, packbits),
+    }[codec]
+    monkeypatch.setattr(frames, "LARGEST_PIECE", 1 << 16)
+    monkeypatch.setattr(frames, "_COUNTED", 1 << 10)
+    zeros = bytes(64 * 64)
+    cases = {"right": [zeros], "bomb": [bytes(1 << 25)], "streams": [zeros, bytes(1 << 20)]}
+    for name, parts in cases.items():
+        if name == "streams" and codec != "lzma":
+            continue
+        packed = b"".join(map(pack, parts))
+        path = tmp_path / f"{name}.tif"
+        # a page of 64 x 64 bytes in one part: sizes, codec, 0 is black, where the part lies, its rows and bytes
+        tags = {256: 64, 257: 64, 258: 8, 259: number, 262: 1, 273: 8, 277: 1, 278: 64, 279: len(packed)}
+        listed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+        packed += bytes(len(packed) % 2)
+        head = b"II*\0" + struct.pack("<I", 8 + len(packed))
+        path.write_bytes(head + packed + struct.pack("<H", len(tags)) + listed + bytes(4))
+        read = frames.Tif.read(path, Said())
+        assert read.frames is not None
+        tracemalloc.start()
+        if name == "right":
+            assert not read.frames[0:1].any()
+        else:
+            with pytest.raises(InputError, match=r"a page unpacks to more than its 4,096 bytes"):
+                read.frames[0:1]
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most < 1 << 24, name

@@ -10,7 +10,19 @@ import pytest
 from tinylab import bench_of
 
 from spadmnist import pages
-from spadmnist.criticism import answer, blocks, candidates, diagnose, fit, limits, mapping, settling
+from spadmnist.criticism import (
+    advice,
+    answer,
+    blocks,
+    candidates,
+    chance,
+    diagnose,
+    fit,
+    limits,
+    mapping,
+    settling,
+    setups,
+)
 from spadmnist.criticism import course as course_of
 from spadmnist.criticism import search as searching
 from spadmnist.criticism.search import Search
@@ -134,6 +146,51 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
     if told:
         text, page = answer.table(found), pages.diagnosis(found, tmp_path / "page").read_text()
         assert "a cascade does not end" in " ".join(text.split()) and "a cascade does not end" in page
+
+
+FAILING: dict[str, tuple[Any, str, bool]] = {
+    "alternative": (diagnose, "_alternative", True),
+    "placebo": (diagnose, "placebo_of", True),
+    "chance": (chance, "of_best", False),
+    "weighing": (Search, "weigh", False),
+    "advice": (advice, "between", True),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", FAILING)
+def test_an_answer_is_given_whatever_is_raised_beside_the_steps(stage: str, lab, monkeypatch) -> None:
+    """found: is the step that lacks found all the same? What is raised while the best is chosen is laid to that one."""
+    sensor, data = lab(f"    {_AFTER}")
+    place, name, found_it = FAILING[stage]
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise OverflowError("too large")
+
+    monkeypatch.setattr(place, name, fails)
+    usual = candidates.changes
+    some = ("afterpulsing", "crosstalk", "dead_time")
+    monkeypatch.setattr(searching, "changes", lambda model: [c for c in usual(model) if c.effect in some])
+    found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
+    assert [step.change.effect for step in found.steps] == (["afterpulsing"] if found_it else [])
+    assert found.verdict in (("explained", "confused", "partly_explained") if found_it else ("unexplained",))
+    if not found_it:
+        assert {e["effect"] for e in found.untried} >= {"afterpulsing"} and found.untried[0]["where"]
+
+
+def test_a_rival_of_the_set_up_that_has_no_closed_form_is_none(lab, monkeypatch) -> None:
+    bench = bench_of(lab(), 8)
+    state, look = bench.state({}), Search(bench, lambda what: None)
+    usual = Sensor.expected
+
+    def expected(sensor: Sensor, *given: Any) -> Any:
+        if sensor.effect("crosstalk") is not None:
+            raise OverflowError("too large")
+        return usual(sensor, *given)
+
+    monkeypatch.setattr(Sensor, "expected", expected)
+    assert all(rival.change.effect != "crosstalk" for rival in setups.rivals(look, state, 1e6))
+    assert {(e["effect"], e["where"]) for e in look.untried} == {("crosstalk", "explaining the totals")}
 
 
 def test_a_map_that_cannot_be_made_is_none(lab, monkeypatch) -> None:

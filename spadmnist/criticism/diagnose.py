@@ -39,7 +39,7 @@ from .findings import mimicked, nuisances, remainder, traces
 from .fit import RATES, Bench, State, square
 from .ladder import Rung, placebo_of
 from .refining import refine
-from .search import alike, gain_beside
+from .search import Search, alike, gain_beside
 from .tried import Tried, at_end
 
 _QUICK = 32  # recordings of each capture by which `quick` judges
@@ -97,7 +97,7 @@ def _diagnosed(
 ) -> Diagnosis:
     course = begun(bench)
     start, beside = course.state, _Beside(_too_short(short))
-    while len(course.steps) < max_steps and not in_vain(course, not beside.explained) and _another(course, beside):
+    while len(course.steps) < max_steps and not in_vain(course, not beside.explained) and _possible(course, beside):
         pass
     if course.steps:
         with _or_as_before(course, "taking out what is needless"):
@@ -197,6 +197,20 @@ def _measured(course: Course, rungs: Sequence[Rung]) -> float:
 # --- a step ------------------------------------------------------------------------------------------------------
 
 
+def _possible(course: Course, beside: _Beside) -> bool:
+    """As `_another`; none, where the steps so far cannot be simulated as often as that takes."""
+    before = course.kept()
+    try:
+        return _another(course, beside)
+    except UNABLE as error:
+        if not course.steps:
+            raise
+        course.back_to(before)
+        last = course.steps[-1].change
+        course.search.not_tried(last.kind, last.effect, last.parameter, "another step", why(error))
+        return False
+
+
 def _another(course: Course, beside: _Beside) -> bool:
     """Is there a step more, after which another one may come? Takes it."""
     bench, search, failed = course.bench, course.search, course.failed
@@ -244,9 +258,15 @@ def _added(
         try:
             return _best_added(course, beside, failed, least)
         except _NoCandidate as none:
-            course.back_to(before)
             names = none.args[0]
-            beside.tried = [t for t in beside.tried if t.change.name not in names]
+        except UNABLE as error:  # between candidates, and it is not known of which: the one that promises most
+            most = max(beside.tried, key=lambda t: t.gain, default=None)
+            if most is None:
+                raise
+            course.search.exclude(most.change, "choosing the best", why(error))
+            names = {most.change.name}
+        course.back_to(before)
+        beside.tried = [t for t in beside.tried if t.change.name not in names]
 
 
 @contextlib.contextmanager
@@ -304,9 +324,11 @@ def _best_added(course: Course, beside: _Beside, failed: Sequence[checks.Block],
         with _or_as_before(course, "looking for what looks alike"):
             unseen = search.scattered(before, course.values, best, faint)
             refined, second = refined + unseen, second + unseen
-    new[0].alternatives = _alternatives(bench, before, best, refined, second)
+    new[0].alternatives = _alternatives(search, before, best, refined, second)
     named = {s.change.effect for s in course.steps} | {a["effect"] for a in new[0].alternatives}
-    beside.placebo = beside.placebo or placebo_of(bench, before, beside.tried, best, named)
+    if beside.placebo is None:
+        with contextlib.suppress(*UNABLE):  # no answer hangs on it
+            beside.placebo = placebo_of(bench, before, beside.tried, best, named)
     if not failed and course.failed and _few(course):
         with _needed(course, best.changes, "a closer look"):
             course.state = _closer(course)  # as close as the model without it was looked at
@@ -367,7 +389,8 @@ def _or_confused(course: Course, beside: _Beside) -> str:
     near = [(s.change, a["tried"]) for s in course.steps for a in s.alternatives if a.get("confused")]
     if near:
         verdict = "confused"
-        beside.advice += advice.between(course.search, course.state, *near[-1])
+        with _or_as_before(course, "advice"):
+            beside.advice += advice.between(course.search, course.state, *near[-1])
     for step in course.steps:
         unlisted = mimicked(step)
         if unlisted is not None:
@@ -402,7 +425,8 @@ def _by_setup(course: Course, beside: _Beside) -> bool:
     if own < cost + setups.ALIKE:
         found = [{**entry, "confused": True} for entry in found]
         beside.rival = others[0]
-        beside.advice += advice.between_totals(course.search, state, likely[0], others[0])
+        with course.search.if_possible(others[0].change, "advice", wholly=False):
+            beside.advice += advice.between_totals(course.search, state, likely[0], others[0])
     else:
         beside.advice += advice.on_setup(bench, state, found)
         bright = setups.brightest(bench, likely[0])
@@ -428,31 +452,33 @@ def _outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
 
 
 def _alternatives(
-    bench: Bench, state: State, best: Tried, refined: Sequence[Tried], second: Sequence[Tried]
+    search: Search, state: State, best: Tried, refined: Sequence[Tried], second: Sequence[Tried]
 ) -> list[dict[str, Any]]:
     """The other candidates, with the misfit that each leaves: first those that would do as well."""
     out: list[dict[str, Any]] = []
     for one in second:
         if one is best or one.change in best.changes or any(o["tried"].change.name == one.change.name for o in out):
             continue
-        residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
-        judged, left = state, residuals
-        if one.scatters and one.state is not None:
-            judged, left = one.state, one.state.residuals
-        failed = checks.failing(checks.blocks(bench, judged, left))
-        most, gain = gain_beside(best, one), gain_beside(one, best)
-        if one.chips and judged is not state:  # by the law of scatter a few odd pixels may gain little
-            gain = max(gain, square(state.residuals) - square(residuals))
-        near = most - gain < alike(most) or (at_end(best) and gain > _ALMOST * most)
-        as_good = one.residuals is not None and near and not failed
-        out.append(
-            {
-                "change": one.change.kind,
-                "effect": one.change.effect,
-                "parameter": one.change.parameter,
-                "misfit": plain(checks.misfit(state.own, residuals)),
-                "confused": as_good,
-                "tried": one,
-            }
-        )
+        with search.if_possible(one.change, "comparing it with the best", wholly=False):
+            out.append(_alternative(search.bench, state, best, one))
     return sorted(out, key=lambda other: not other["confused"])[:_NAMED]
+
+
+def _alternative(bench: Bench, state: State, best: Tried, one: Tried) -> dict[str, Any]:
+    residuals = one.residuals or bench.residuals(state, one.moved, one.times, noisy=True)
+    judged, left = state, residuals
+    if one.scatters and one.state is not None:
+        judged, left = one.state, one.state.residuals
+    failed = checks.failing(checks.blocks(bench, judged, left))
+    most, gain = gain_beside(best, one), gain_beside(one, best)
+    if one.chips and judged is not state:  # by the law of scatter a few odd pixels may gain little
+        gain = max(gain, square(state.residuals) - square(residuals))
+    near = most - gain < alike(most) or (at_end(best) and gain > _ALMOST * most)
+    return {
+        "change": one.change.kind,
+        "effect": one.change.effect,
+        "parameter": one.change.parameter,
+        "misfit": plain(checks.misfit(state.own, residuals)),
+        "confused": one.residuals is not None and near and not failed,
+        "tried": one,
+    }

@@ -169,15 +169,16 @@ def rivals(search: Search, state: State, cost: float) -> list[Tried]:
         # from each of its places: from the nearest by proportion it may not lead to where it fits
         best: tuple[float, Tried] | None = None
         for tried in templates(change):
-            sensors = state.sensors.changed(tried)
-            one = Tried(change, tried, bench.told(state, sensors), 0.0, 1.0, sensors)
-            one.gain, one.times = search.line_search(state, one.moved, one.signed)
-            if one.gain < EACH:
-                continue
-            one = _settled(search, state, one)
-            left = one.residuals[RATES] if one.residuals else state.residuals[RATES]
-            if best is None or float(left @ left) < best[0]:
-                best = float(left @ left), one
+            with search.if_possible(change, "explaining the totals", wholly=False):
+                sensors = state.sensors.changed(tried)
+                one = Tried(change, tried, bench.told(state, sensors), 0.0, 1.0, sensors)
+                one.gain, one.times = search.line_search(state, one.moved, one.signed)
+                if one.gain < EACH:
+                    continue
+                one = _settled(search, state, one)
+                left = one.residuals[RATES] if one.residuals else state.residuals[RATES]
+                if best is None or float(left @ left) < best[0]:
+                    best = float(left @ left), one
         if best is None:
             continue
         remains, settled = best

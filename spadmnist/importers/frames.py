@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import lzma
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,8 @@ from . import (
 )
 from .stacks import arranged, cut
 
+_COUNTED = 1 << 20  # bytes that are unpacked at a time, to be counted
+_LZMA_MEMORY = 1 << 27  # bytes that LZMA may take to unpack: its largest usual dictionary has half of them
 _FRAMES = tuple(name for name in MODALITIES if name != "tr")
 
 
@@ -202,17 +206,51 @@ class Tif(Format):
 
 
 def _check_page(file: Any, page: Any, path: Path) -> None:
-    """Raise InputError where a part of a page that deflate packs unpacks to more than the page has."""
-    if "DEFLATE" not in page.compression.name:
-        return
+    """Raise InputError where a part of a page unpacks to more than the page has.
+
+    Only what tifffile unpacks by itself asks for that: imagecodecs, which does the rest, is told how much there is.
+    """
+    name = page.compression.name.removeprefix("ADOBE_")
+    gain, unpacked_size = _UNPACKED.get(name, (0, deflated_size))
     for start, size in zip(page.dataoffsets, page.databytecounts, strict=True):
-        if size * DEFLATE_GAIN > LARGEST_PIECE:
+        if size * gain > LARGEST_PIECE:
             file.filehandle.seek(start)
-            if deflated_size(file.filehandle.read(size), page.nbytes) > page.nbytes:
+            if unpacked_size(file.filehandle.read(size), page.nbytes) > page.nbytes:
                 raise InputError(
                     f"{path}: a page unpacks to more than its {page.nbytes:,} bytes; the file is damaged or hostile: "
                     "write it again"
                 )
+
+
+def _lzma_size(raw: bytes, most: int) -> int:
+    """As `deflated_size`, of LZMA, one stream after the other. What is cut short is told where it is read."""
+    size, unpacker = 0, lzma.LZMADecompressor(memlimit=_LZMA_MEMORY)
+    while size <= most:
+        made = len(unpacker.decompress(raw, _COUNTED))
+        size, raw = size + made, b""
+        if unpacker.eof:
+            raw, unpacker = unpacker.unused_data, lzma.LZMADecompressor(memlimit=_LZMA_MEMORY)
+        if not raw and not made:
+            break
+    return size
+
+
+def _packbits_size(raw: bytes, most: int) -> int:
+    """As `deflated_size`, of PackBits: a byte below 128 begins so many bytes and one, one above repeats the next."""
+    at = size = 0
+    while at < len(raw) and size <= most:
+        code = raw[at]
+        size += code + 1 if code < 128 else (257 - code) * (code > 128)
+        at += code + 2 if code < 128 else 1 + (code > 128)
+    return size
+
+
+# By codec: by at most which factor it shrinks anything, and how much a part unpacks to, counted in little memory.
+_UNPACKED: dict[str, tuple[int, Callable[[bytes, int], int]]] = {
+    "DEFLATE": (DEFLATE_GAIN, deflated_size),
+    "LZMA": (1 << 14, _lzma_size),
+    "PACKBITS": (64, _packbits_size),
+}
 
 
 class Raw(Format):
