@@ -55,6 +55,8 @@ sensor:
 """
 _CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photons/s, exposures of one repetition
 _REPETITIONS = 32
+# what share of white each of its pixels sees, where the effect is one of scenes
+_SCENE = np.array([int(bit) for bit in f"{0xC3A5_1E78_5AD2_3C96:064b}"], np.float64)
 
 
 @dataclass
@@ -186,16 +188,20 @@ def _sensor(
 
 
 @lru_cache
-def _reference(without: str) -> dict[str, np.ndarray]:
+def _reference(without: str, scene: bool) -> dict[str, np.ndarray]:
     """The statistics of the contract's sensor without an effect."""
     sensor = _sensor(None, "device", without=without)
-    return _statistics(sensor, "without", 2 * _REPETITIONS, sensor.nominal_dead_time)
+    return _statistics(sensor, "without", 2 * _REPETITIONS, sensor.nominal_dead_time, scene)
 
 
-def _statistics(sensor: Sensor, split: str, repetitions: int, dead_time: float) -> dict[str, np.ndarray]:
+def _statistics(
+    sensor: Sensor, split: str, repetitions: int, dead_time: float, scene: bool = False
+) -> dict[str, np.ndarray]:
+    """scene: is the light that of a scene, and not the same on all pixels?"""
     shots = {}
     for name, (light, each) in _CAPTURES.items():
         photons, conditions = np.full((repetitions * each, sensor.layout.pixels), light), _conditions(light)
+        photons *= _SCENE if scene else 1.0
         recorded = _expose(sensor, photons, conditions, split=f"{split}/{name}", readouts=("tr", "str", "qis"))
         shots[name] = Shots(recorded, sensor, conditions, each, dead_time)
     return signatures.statistics(**shots)
@@ -425,8 +431,9 @@ def _expected_rate(trial: _Trial) -> str | None:
 
 def _moves(trial: _Trial) -> str | None:
     dead_time = _sensor(None, "device", without=trial.kind.name).nominal_dead_time
-    one = _statistics(trial.sensor("device"), "with", _REPETITIONS, dead_time)
-    other = _reference(trial.replaced)
+    scene = trial.kind.of_scene
+    one = _statistics(trial.sensor("device"), "with", _REPETITIONS, dead_time, scene)
+    other = _reference(trial.replaced, scene)
     trial.moved = {name: signatures.significance(one[name], other[name]) for name in BLOCKS}
     found = ", ".join(f"{name} {z:.1f}" for name, z in trial.moved.items() if abs(z) > STAYED) or "nothing"
     moves = trial.kind.moves

@@ -107,8 +107,7 @@ captures:
         ":3: layout.rows: 0 is not possible",
         ":6: captures[0].file: '../dark.h5' leads out of the measurement's folder",
         ":7: captures[0].modality: 'qsi' is not one of tr, str, qis, counts. Did you mean qis?",
-        ":8: captures[0].light.wavelength: belongs to the kind flat or image, and this is dark; take it out, or "
-        "correct kind",
+        ":8: captures[0].light.wavelength: belongs to the kind flat or image, and this is dark; take it out",
         ":10: captures[1].id: dark is that of captures[0]",
         ":13: captures[1].light.irradiance: '5 mlux' is not an irradiance",
         ":13: captures[1].light.relative_uncertainty: 3 is not possible",

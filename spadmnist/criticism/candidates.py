@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from ..effects import Conditions, Effect
 from ..errors import UNABLE, SpadError, why
 from ..plugins import ByWavelength, Parameter
+from ..recording import Capture
 from ..sensor import Sensor
 
 Key = tuple[str, str]  # effect, parameter
@@ -177,15 +178,18 @@ def _numeric(declared: Parameter) -> bool:
     return declared.unit != "bool" and not declared.choices and declared.search is not None
 
 
-def changes(sensor: Sensor) -> list[Change]:
-    """Every candidate, in the order of names."""
+def changes(sensor: Sensor, captures: Iterable[Capture] = ()) -> list[Change]:
+    """Every candidate, in the order of names. captures: of which one must be of a scene for what is `of_scene`."""
+    scenes = any(capture.light.scene is not None for capture in captures)
     out: list[Change] = []
     listed = {effect.name: effect for effect in sensor.effects}
     for name in Effect.registry:
         kind = Effect.registry.find(name)
-        if name not in listed:
+        if name not in listed and (scenes or not kind.of_scene):
             out += _additions(name, kind.parameters)
     for name in sorted(listed):
+        if listed[name].of_scene and not scenes:
+            continue
         out += _settings(listed[name])
         out += _maps(sensor, listed[name])
     return out
@@ -193,7 +197,7 @@ def changes(sensor: Sensor) -> list[Change]:
 
 def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Change]:
     wholes = {k: p for k, p in parameters.items() if _numeric(p) and p.per in ("", "pixel")}
-    phases = tuple((name, k) for k, p in wholes.items() if p.unit == "rad")
+    phases = tuple((name, k) for k, p in wholes.items() if p.phase)
     off = {k: p for k, p in wholes.items() if p.off is not None and (name, k) not in phases}
     idle = {k for k, p in off.items() if p.default == p.off}
     shapes = tuple(
@@ -231,9 +235,9 @@ def _settings(effect: Effect) -> Iterator[Change]:
             yield Change("set", effect.name, name, (), fixed=(((effect.name, name), not value),))
         if not _numeric(declared) or declared.per not in ("", "pixel") or not isinstance(value, (int, float)):
             continue
-        if declared.unit == "rad" or effect.stage in ("light", "detection"):
+        if declared.phase or (effect.stage in ("light", "detection") and not effect.of_scene):
             continue  # a common factor on the light is no matter of the sensor
-        if declared.unit == "Hz" and any(p.unit == "rad" for p in effect.parameters.values()):
+        if declared.unit == "Hz" and any(p.phase for p in effect.parameters.values()):
             continue  # a line that stands elsewhere is another one
         low, high = declared.search  # type: ignore[misc]
         low, high = min(low, value) if value > 0 else low, max(high, value)

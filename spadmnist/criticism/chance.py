@@ -12,7 +12,7 @@ from scipy import stats
 
 from ..errors import SpadError
 from . import mapping
-from .candidates import Change, Key, changes
+from .candidates import Change, Key
 from .fit import FEW, RATES, Bench, Cell, Moved, State, stacked
 from .lines import Line
 from .nulls import scores_of_powers
@@ -51,7 +51,7 @@ def of_any(bench: Bench, state: State, tried: Sequence[Tried], values: dict[Key,
     data, own = _of_traces(bench, state, tried)
     p = _of_least(own, min(data, default=1.0))
     levels = mapping.levels_of(bench, state)
-    maps = [of_map(bench, state, c, values, levels) for c in changes(state.sensors.one) if c.carrier]
+    maps = [of_map(bench, state, c, values, levels) for c in bench.changes(state.sensors.one) if c.carrier]
     swings = [line.p for line in lines]
     return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
 
@@ -62,7 +62,7 @@ def of_best(bench: Bench, state: State, tried: Sequence[Tried], best: Tried, lar
     large: is something plainly wrong, so that it may be more than its trace says?
     """
     if best.chance is not None:
-        others = sum(c.carrier is not None for c in changes(state.sensors.one)) if best.maps else 1
+        others = sum(c.carrier is not None for c in bench.changes(state.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
     directions = [t for t in tried if _sided(best) and _kin(t) == _kin(best)]
     _, own = _of_traces(bench, state, tried if directions else [best, *tried])

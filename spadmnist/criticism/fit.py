@@ -26,7 +26,7 @@ from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Summary
 from . import recordings
-from .candidates import Key, Values, on_chip, with_values
+from .candidates import Change, Key, Values, changes, on_chip, with_values
 from .edges import Shortest
 from .nulls import LEAST_POWER, Null, _standardized, learn, poisson_scores, powers_of
 from .shifts import beyond_noise, difference
@@ -370,6 +370,10 @@ class Bench:
             return recording
         conditions = replace(recording.conditions, exposure=self.exposures[id])
         return replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
+
+    def changes(self, sensor: Sensor) -> list[Change]:
+        """Every candidate to change a sensor by, as these captures can show it."""
+        return changes(sensor, (seen.capture for seen in self.seen.values()))
 
     def halves(self, ids: Collection[str]) -> Bench:
         """Some captures alone, each as two: its first, third, ... block of time and its second, fourth, ... one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,10 +42,11 @@ def fitted(
     Raises InputError where there is no such effect or parameter.
     """
     say = progress or (lambda what: None)
+    every, listed = changes(sensor.settled(), measurement.captures), {e.name for e in sensor.effects}
     wanted = [
-        *(_named(sensor.settled(), "add", name, None) for name in add),
-        *(_named(sensor.settled(), "set", *_halves(name)) for name in free),
-        *(_named(sensor.settled(), "per_pixel", *_halves(name)) for name in per_pixel),
+        *(_named(every, listed, "add", name, None) for name in add),
+        *(_named(every, listed, "set", *_halves(name)) for name in free),
+        *(_named(every, listed, "per_pixel", *_halves(name)) for name in per_pixel),
     ]
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
@@ -193,8 +194,8 @@ def _halves(name: str) -> tuple[str, str]:
     return effect, parameter
 
 
-def _named(sensor: Sensor, kind: str, effect: str, parameter: str | None) -> Change:
-    every, listed = changes(sensor), sensor.effect(effect) is not None
+def _named(every: Sequence[Change], known: Collection[str], kind: str, effect: str, parameter: str | None) -> Change:
+    listed = effect in known
     for change in every:
         if (change.kind, change.effect) == (kind, effect) and (kind == "add" or change.parameter == parameter):
             return change

@@ -8,7 +8,6 @@ from typing import Any
 
 from . import fit
 from .answer import plain
-from .candidates import changes
 from .chance import Likeness, along
 from .fit import Bench, Moved, State
 from .search import Search
@@ -64,7 +63,8 @@ def upper_limits(
             far = max((x for x in limits if x is not None), key=lambda x: abs(x - (dial.off or 0.0)))
             excluded.append({"effect": name, "parameter": dial.parameter, "upper_limit_95": plain(far)})
     looked = {one.change.effect for one in tried}  # what cannot be tried is told where it fails
-    others = {one.effect for one in changes(state.sensors.one) if one.kind == "add"} & looked - shapes.keys()
+    every = search.bench.changes(state.sensors.one)
+    others = {one.effect for one in every if one.kind == "add"} & looked - shapes.keys()
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 

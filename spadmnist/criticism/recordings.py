@@ -76,8 +76,8 @@ def whatever_phases(
 
 
 def swinging(sensor: Sensor) -> list[Key]:
-    """Parameters that are phases: in rad."""
-    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.unit == "rad"]
+    """Parameters that are phases."""
+    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.phase]
 
 
 def still(sensor: Sensor) -> Sensor:

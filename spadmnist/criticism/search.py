@@ -21,7 +21,7 @@ from ..errors import UNABLE, SpadError, why
 from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
-from .candidates import Change, Key, chancy, changes, templates, with_values
+from .candidates import Change, Key, chancy, templates, with_values
 from .chance import LEAST_P, nearest_face, of_map
 from .fit import RATES, Bench, Moved, Sensors, State, likelier, square, stacked
 from .lines import Line, lines
@@ -67,7 +67,7 @@ class Search:
         self._out: set[str] = set()  # those of them that are none any more
         for name in Effect.registry:
             plugged = plugins.is_from_file(Effect.registry.find(name)) and bench.start.effect(name) is None
-            if plugged and all(change.effect != name for change in changes(bench.start)):
+            if plugged and all(change.effect != name for change in bench.changes(bench.start)):
                 nowhere = "none of its parameters says where to look for it; give one off= and search="
                 self.not_tried("add", name, None, "choosing candidates", nowhere)
 
@@ -86,7 +86,7 @@ class Search:
         self.not_tried(change.kind, change.effect, change.parameter, where, why)
 
     def _beside(self, sensor: Sensor) -> list[Change]:
-        return [change for change in changes(sensor) if change.name not in self._out]
+        return [change for change in self.bench.changes(sensor) if change.name not in self._out]
 
     @contextlib.contextmanager
     def if_possible(self, change: Change, where: str, wholly: bool = True) -> Iterator[None]:

@@ -18,7 +18,7 @@ from scipy import stats
 
 from .. import twin
 from .answer import plain
-from .candidates import changes, templates
+from .candidates import templates
 from .compare import FALSE_ALARM
 from .fit import RATES, Bench, Moved, State, square
 from .search import Search
@@ -163,7 +163,7 @@ def rivals(search: Search, state: State, cost: float) -> list[Tried]:
     bench = search.bench
     out: list[Tried] = []
     freedom = len(state.residuals[RATES])
-    for change in changes(state.sensors.one):
+    for change in bench.changes(state.sensors.one):
         if not change.strengths or change.phases or change.carrier:
             continue
         # from each of its places: from the nearest by proportion it may not lead to where it fits

@@ -145,6 +145,8 @@ class Effect(Plugin, abstract=True):
     stage: ClassVar[str]
     after: ClassVar[str | None] = None  # the effect of the same stage that comes before this one
     last: ClassVar[bool] = False  # it comes behind all others of its stage
+    # light stage: it changes the scene that is seen, before all others; light that is the same everywhere stays so
+    of_scene: ClassVar[bool] = False
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
     acts_on: ClassVar[str] = "light"  # arrival stage: "light", "dark" or "own"
     cause: ClassVar[str] = (
@@ -189,7 +191,9 @@ class Effect(Plugin, abstract=True):
 
 
 def in_order(effects: list[Effect]) -> list[Effect]:
-    """By stage; within a stage by name, each behind the one it names in `after`, and at the end what is `last`."""
+    """By stage; within a stage first what is `of_scene`, then by name, each behind the one it names in `after`, and at
+    the end what is `last`.
+    """
     stages = list(STAGES)
     waiting = sorted(effects, key=lambda e: (stages.index(e.stage), e.last, e.name))
     ordered: list[Effect] = []
@@ -198,7 +202,7 @@ def in_order(effects: list[Effect]) -> list[Effect]:
         ready = [e for e in waiting if e.after not in names - {e.name}] or waiting
         ordered.append(ready[0])
         waiting.remove(ready[0])
-    return sorted(ordered, key=lambda e: (stages.index(e.stage), e.last))
+    return sorted(ordered, key=lambda e: (stages.index(e.stage), not e.of_scene, e.last))
 
 
 def __getattr__(name: str) -> Any:
