@@ -229,7 +229,7 @@ class Experiment:
         if excess and not self.from_frames(photons).any():
             do = "lower the light, the dark count rate or the exposure"
             if replace(self, causes=False).from_frames(photons).any():
-                do = "its frames can be drawn without events, but then have no causes: leave out --causes"
+                do = "its frames can be drawn without events, and have no causes then: leave out --causes"
             raise InputError(f"{self.name}: one image at {brightest.text} would hold {excess}; {do}")
         candidates, _ = self.sensor.expected(photons, self.conditions)
         events = float(candidates.sum())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -165,9 +166,19 @@ class Recorded:
         return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited, self.tally)
 
     @staticmethod
-    def joined_pixels(parts: list[Recorded]) -> Recorded:
-        """One image of its parts, whose pixels follow each other."""
-        return Recorded.join([part._regrouped(1) for part in parts])._regrouped(sum(part.pixels for part in parts))
+    def joined_pixels(parts: Iterable[Recorded], pixels: int) -> Recorded:
+        """One image of its parts, whose pixels follow each other; pixels: their number. Packed bits are held once."""
+        bits, row, rest = np.zeros((0, 0), np.uint8), 0, []
+        for part in parts:
+            if part.frames is not None and part.frames.cause is None:
+                found = part.frames.bits
+                bits = bits if len(bits) else np.empty((pixels, found.shape[1]), np.uint8)
+                bits[row : row + len(found)] = found
+                row += len(found)
+                part = replace(part, frames=replace(part.frames, bits=np.zeros((len(found), 0), np.uint8)))
+            rest.append(part._regrouped(1))
+        whole = Recorded.join(rest)._regrouped(pixels)
+        return whole if whole.frames is None or not row else replace(whole, frames=replace(whole.frames, bits=bits))
 
     @staticmethod
     def join(parts: list[Recorded]) -> Recorded:

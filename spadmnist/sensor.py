@@ -460,8 +460,8 @@ class Sensor:
         line, window = self.chip or self, self.window or Window.of(self.layout.shape, slice(None), slice(None))
         light = photons if self.window is None else self.window.spread(photons)
         pieces = window.pieces(expected, most)
-        made = [line._staged(light, conditions, streams, readouts, causes, piece) for piece in pieces]
-        return Recorded.joined_pixels(made)
+        made = (line._staged(light, conditions, streams, readouts, causes, piece) for piece in pieces)
+        return Recorded.joined_pixels(made, photons.shape[1])
 
     @cached_property
     def is_paper_line(self) -> bool:
