@@ -201,6 +201,58 @@ def reading(images_dir: Path | None, folder: Path) -> list[Row]:
     return rows
 
 
+def learning(images_dir: Path | None, folder: Path, quick: bool) -> list[Row]:
+    """Training data for PyTorch on one core: read, simulated, and beside the network that learns from them."""
+    try:
+        import torch
+    except ImportError:
+        return [("training data for PyTorch", "", "not measured: PyTorch is not installed")]
+    import pickle
+
+    from torch.utils.data import DataLoader
+
+    import spadmnist.torch as st
+    from spadmnist.experiments import _lenet
+
+    torch.set_num_threads(1)
+    images = 2_000 if quick else 10_000
+    rows: list[Row] = []
+    opened = None
+    for level, wanted in (("2560 mlux", ">= 4,500 images/s"), ("80 mlux", ">= 50,000 images/s")):
+        one, splits, _ = experiment_at(level, images_dir, limit=images)
+        root = folder / f"learning-{level.split()[0]}"
+        factory.generate(one, splits, root, 2)
+        part = spadmnist.open(root)[level, "train"]
+        opened = opened or part
+        took = min(seconds(lambda part=part: sum(1 for _ in st.stream(part))) for _ in range(3))
+        rows.append((f"TR events, shuffled stream, {level}, one core", wanted, f"{len(part) / took:,.0f} images/s"))
+    assert opened is not None
+    fluxes = st.Fluxes(opened)
+    batches = DataLoader(fluxes, batch_size=64, shuffle=True)  # type: ignore[var-annotated, arg-type]
+    read = min(seconds(lambda: sum(1 for _ in batches)) for _ in range(3)) / len(fluxes)
+    rows.append(("fluxes, shuffled, batches of 64, one core", ">= 50,000 images/s", f"{1 / read:,.0f} images/s"))
+    data = _lenet.Labelled(opened.reconstruction["counts"].normalised[:], opened.labels[:])
+    learned = seconds(lambda: _lenet.train(data, 1, 1)) / len(data.labels)
+    rows.append(("an epoch of fluxes: reading against LeNet", "<= 10 %", f"{read / learned:.1%}"))
+    originals = [(opened.images[i], int(opened.labels[i])) for i in range(1000)]
+    sensor = spadmnist.read_sensor(ROOT / "configs" / "spad_mnist.yaml")
+    clock = {"exposure": "1 ms", "frames": 100, "frame_time": "10 us", "frame_period": "10 us"}
+    rates = []
+    for readout in ("tr", "str", "qis", "counts"):
+        made = st.Simulated(originals, sensor, recording=clock, lux="2560 mlux", returns=readout)
+        loader = DataLoader(made, batch_size=64, collate_fn=list)  # type: ignore[var-annotated, arg-type]
+        best = math.inf
+        for epoch in range(3):
+            made.set_epoch(epoch)
+            best = min(best, seconds(lambda loader=loader: sum(len(batch) for batch in loader)))
+        rates.append(f"{readout} {len(originals) / best:,.0f}")
+    what = "simulated afresh while training, 2560 mlux, one core, images/s"
+    rows.append((what, ">= 5,000 of each readout", ", ".join(rates)))
+    sent = max(len(pickle.dumps(one)) for one in (fluxes, st.stream(opened)))
+    rows.append(("what a spawned worker is sent", "< 100 kB", f"{sent / 1e3:.0f} kB"))
+    return rows
+
+
 REDUCE = """\
 import sys
 from spadmnist import config, measurement
@@ -386,6 +438,7 @@ def main() -> None:
         rows += whole_runs(arguments.images_dir, folder, arguments.quick)
         rows += reading(arguments.images_dir, folder)
         rows += effects(rounds)
+        rows += learning(arguments.images_dir, folder, arguments.quick)
         rows += criticism(folder, arguments.quick)
         run([sys.executable, "-m", "spadmnist.cli", "--help"])
         starts = [run([sys.executable, "-m", "spadmnist.cli", "--help"])[0] for _ in range(rounds)]
