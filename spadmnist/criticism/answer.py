@@ -128,13 +128,15 @@ class Diagnosis:
     untried: list[dict[str, Any]] = field(default_factory=list)  # candidates that cannot be simulated
     # ("effect.parameter" of fitted numbers, their covariance in SI): of a fit
     covariance: tuple[list[str], np.ndarray] = field(default_factory=lambda: ([], np.zeros((0, 0))), repr=False)
+    asked: str = "diagnosis"  # or "fit"
     unwritten: str = ""  # why there is no next sensor file where one was asked for
 
     def as_data(self) -> dict[str, Any]:
-        """As `formats`: spadmnist-diagnosis/1."""
+        """As `formats`: spadmnist-diagnosis/1, or spadmnist-fit/1."""
         return {
-            "format": "spadmnist-diagnosis/1",
+            "format": f"spadmnist-{self.asked}/1",
             "verdict": self.verdict,
+            "finished": True,  # nothing ends a search but that it has come to its end
             **({"crop": self.crop} if self.crop else {}),
             "misfit": {"before": plain(self.before), "after": plain(self.after)},
             "misfit_null_95": plain(self.null_95),

@@ -88,6 +88,7 @@ def fitted(
             bench.dark,
             str(bench.start.window) if bench.start.window else None,
             covariance=_covariance(course, exact),
+            asked="fit",
         )
 
 
