@@ -201,7 +201,7 @@ class _Curves:
         facts = {
             "network": _lenet.WORDS,
             "training": f"{one['train']:,} images, {one['epochs']} epochs, batches of {_lenet.BATCH}, Adam with a "
-            f"learning rate of {_lenet.RATE:g}, seed {one['seed']}; the network after the last epoch is taken",
+            f"learning rate of {_lenet.RATE:g}, seed {one['seed']}; tested with the mean of the last epoch's weights",
             "test": f"{one['n']:,} images that no network was trained on",
             "errors": "one binomial standard deviation of the test images; another seed moves an accuracy as well",
             "dataset": f"{CONFIG}, manifest sealed {one['digest'][:16]}",
