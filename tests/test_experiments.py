@@ -349,12 +349,83 @@ def test_wrong_words(words: list[str], says: str, tmp_path: Path) -> None:
 
 # --- the accuracies themselves ------------------------------------------------------------------------------------
 
+COUNTING = ("counts", "passive_free_running", "str_flux", "qis_counts", "qis_linear")
+# per cent, of all methods that count; how far they may lie apart
+ACCURACIES = {"5 mlux": (50, 64, 4), "80 mlux": (94, 97.8, 1.5), "2560 mlux": (95, 98.4, 1.5)}
+# of the inputs at 2560 mlux: fluxes over their median, and frames, of which there are 100
+LARGEST = {
+    **dict.fromkeys(("counts", "passive_free_running", "str_flux"), (2.5, 5)),
+    **{"qis_counts": (80, 100), "qis_linear": (150, 531), "clipped": (20, 20), "inter_photon": (1e4, 1e9)},
+}
+
+
+def judge(results: Sequence[Mapping[str, Any]]) -> None:
+    """Is each method, at each level, as it is wherever it works?
+
+    A network is the same for the same sums; other processors add in another order, which moves an accuracy by about
+    its binomial error (0.5 at 57 %, 0.2 at 96 %): the bounds lie six of them and more to either side.
+    """
+    found = {(one["method"] if one["clip"] is None else "clipped", one["level"]): one for one in results}
+    assert len(found) == len(results) == 22
+    assert len({one["inputs"] for one in results}) == len(results), "two networks were given the same"
+    assert 95 < 100 * found["mnist", None]["accuracy"] < 98.4
+    for level, (low, high, apart) in ACCURACIES.items():
+        counting = {method: 100 * found[method, level]["accuracy"] for method in COUNTING}
+        assert low < min(counting.values()) and max(counting.values()) < high, (level, counting)
+        assert max(counting.values()) - min(counting.values()) < apart, (level, counting)
+        plain, clipped = (100 * found[method, level]["accuracy"] for method in ("inter_photon", "clipped"))
+        assert plain < clipped < min(counting.values()), (level, plain, clipped, counting)
+    for method, (least, most) in LARGEST.items():
+        assert least <= found[method, "2560 mlux"]["largest"] <= most, (method, found[method, "2560 mlux"]["largest"])
+
 
 @with_torch
 @pytest.mark.slow
 @pytest.mark.skipif(not MNIST.is_dir(), reason=f"MNIST's four files are not in {MNIST}")
 def test_a_quick_run_on_mnist(tmp_path: Path) -> None:
-    """The bounds are about what one run gave, five binomial errors and the scatter of ten seeds to either side."""
     words = ["--quick", "--images-dir", MNIST, "--json"]
     done = command("experiment", "accuracy", "-o", tmp_path / "out", *words, timeout=3600)
     assert done.returncode == 0, done.stderr
+    judge(json.loads(done.stdout)["results"])
+
+
+@with_torch
+def test_training_leaves_threads_and_random_numbers_as_they_were() -> None:
+    import torch
+
+    rng = np.random.Generator(np.random.SFC64(1))
+    data = accuracy.Labelled(rng.random((100, 28, 28), np.float32), np.arange(100) % 10)
+    torch.manual_seed(5)
+    threads, before = torch.get_num_threads(), torch.random.get_rng_state()
+    first = accuracy._lenet.train(data, 1, 2)
+    torch.manual_seed(6)
+    second = accuracy._lenet.train(data, 1, 2)
+    torch.manual_seed(5)
+    assert torch.get_num_threads() == threads and torch.equal(torch.random.get_rng_state(), before)
+    pairs = zip(first.parameters(), second.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+    other = accuracy._lenet.train(data, 1, 3)
+    assert not torch.equal(next(iter(first.parameters())), next(iter(other.parameters())))
+
+
+@with_torch
+def test_the_weights_are_the_mean_of_the_last_epoch() -> None:
+    """Of two steps: the first is what an epoch of half as many images ends with."""
+    import torch
+
+    rng = np.random.Generator(np.random.SFC64(1))
+    images, labels = rng.random((128, 28, 28), np.float32), np.arange(128) % 10
+    order = torch.randperm(128, generator=torch.Generator().manual_seed(4)).numpy()
+    train = accuracy._lenet.train
+    both = train(accuracy.Labelled(images, labels), 1, 4)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            torch,
+            "_foreach_lerp_",
+            lambda means, weights, share: [a.copy_(b) for a, b in zip(means, weights, strict=True)],
+        )
+        last = train(accuracy.Labelled(images, labels), 1, 4)
+        patch.setattr(torch, "randperm", lambda n, generator: torch.arange(n))
+        first = train(accuracy.Labelled(images[order[:64]], labels[order[:64]]), 1, 4)
+    for a, b, mean in zip(first.parameters(), last.parameters(), both.parameters(), strict=True):
+        assert torch.allclose(mean, (a + b) / 2, atol=1e-6) and not torch.equal(a, b)

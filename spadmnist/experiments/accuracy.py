@@ -201,7 +201,7 @@ class _Curves:
         facts = {
             "network": _lenet.WORDS,
             "training": f"{one['train']:,} images, {one['epochs']} epochs, batches of {_lenet.BATCH}, Adam with a "
-            f"learning rate of {_lenet.RATE:g}, seed {one['seed']}; the network after the last epoch is taken",
+            f"learning rate of {_lenet.RATE:g}, seed {one['seed']}; tested with the mean of the last epoch's weights",
             "test": f"{one['n']:,} images that no network was trained on",
             "errors": "one binomial standard deviation of the test images; another seed moves an accuracy as well",
             "dataset": f"{CONFIG}, manifest sealed {one['digest'][:16]}",
@@ -222,11 +222,20 @@ class _Curves:
         return "LeNet reads " + ", ".join(words)
 
     def _lead(self) -> list[str]:
-        quick = self.results[0]["epochs"] < _lenet.EPOCHS
-        return [
-            "A network of its own for each reconstruction and light level.",
-            *(["These are quick results: fewer levels, images and epochs than the paper has."] if quick else []),
-        ]
+        said = ["A network of its own for each reconstruction and light level."]
+        if self.results[0]["epochs"] < _lenet.EPOCHS:
+            said.append("These are quick results: fewer levels, images and epochs than the paper has.")
+        plain = self.curves.get(CLIPPED, {})
+        for curve in self.curves.values():
+            both = [level for level in self.levels if level in plain and level in curve and curve[level]["clip"]]
+            if both:
+                level = max(both, key=lambda x: abs(curve[x]["accuracy"] - plain[x]["accuracy"]))
+                said.append(
+                    f"Where the inputs of {CLIPPED} end at {curve[level]['clip']:g} instead of "
+                    f"{plain[level]['largest']:.2g}, its accuracy at {level} is {_percent(curve[level])} instead of "
+                    f"{_percent(plain[level])}: of all levels there it makes the largest difference."
+                )
+        return said
 
     def _table(self) -> Table:
         header = ["accuracy, %", *self.levels]
@@ -291,7 +300,7 @@ class _Curves:
             rows.append([level, "-" if plain is None else f"{plain['largest']:.2g}", *cells])
         note = (
             f"Two detections close together make {CLIPPED} estimate a flux as large as their interval is short: inputs "
-            "far beyond 1, the median, which a network must first learn to bear. Where they end, it need not."
+            "far beyond 1, the median. A network must first learn to bear them, unless they are clipped."
         )
         return [Table(f"What clipping the inputs of {CLIPPED} does: accuracy, %", header, rows, note)]
 
