@@ -198,6 +198,8 @@ def test_what_ties_pixels_together_is_what_an_effect_declares() -> None:
     assert tying(of("count_saturation"), *ALL) is None
     assert tying(of("source_noise"), *ALL) is None  # the same light for all pixels, whatever they detect
     assert tying(Stranger(), "tr") == "stranger"
+    said = Sensor(GRID, [Stranger()], "device").settled().excess(np.full((1, 120), 1e9), SUMMED, ("tr",))
+    assert said is not None and said.endswith("as they must: stranger draws for all pixels in one go")
 
 
 # --- how large an image may be --------------------------------------------------------------------------------------
