@@ -166,6 +166,8 @@ class Experiment:
         if not large.any():
             made = self.sensor.expose(photons, self.conditions, streams, self.readouts, causes=self.causes)
             return made.grouped(channels)
+        if self.causes:
+            raise self._no_causes(level)
         parts = []
         for i, one in enumerate(large):
             own = streams.of(streams.images[i : i + 1])
@@ -174,6 +176,12 @@ class Experiment:
             else:
                 parts.append(self.sensor.expose(photons[i : i + 1], self.conditions, own, self.readouts))
         return Recorded.join(parts).grouped(channels)
+
+    def _no_causes(self, level: Level) -> InputError:
+        return InputError(
+            f"{self.name}: an image at {level.text} would hold more than {_FROM_FRAMES:.0e} events; its frames are "
+            "drawn without them, and have no causes: leave out --causes, or lower the light or the exposure"
+        )
 
     @cached_property
     def _frames_alone(self) -> bool:
@@ -189,7 +197,7 @@ class Experiment:
 
         Those whose whole image does, where the sensor is a part of a chip. photons: (images, pixels) photons/s.
         """
-        if self.causes or not self._frames_alone:
+        if not self._frames_alone:
             return np.zeros(len(photons), bool)
         chip, window = self.sensor.chip or self.sensor, self.sensor.window
         light = photons if window is None else window.spread(photons)
@@ -227,10 +235,12 @@ class Experiment:
         photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
         excess = self.sensor.excess(photons, self.conditions, self.readouts)
         if excess and not self.from_frames(photons).any():
-            do = "lower the light, the dark count rate or the exposure"
-            if replace(self, causes=False).from_frames(photons).any():
-                do = "its frames can be drawn without events, and have no causes then: leave out --causes"
-            raise InputError(f"{self.name}: one image at {brightest.text} would hold {excess}; {do}")
+            raise InputError(
+                f"{self.name}: one image at {brightest.text} would hold {excess}; lower the light, the dark count "
+                "rate or the exposure"
+            )
+        if excess and self.causes:
+            raise self._no_causes(brightest)
         candidates, _ = self.sensor.expected(photons, self.conditions)
         events = float(candidates.sum())
         stored = pixels * self.conditions.frames / 8 if set(self.readouts) & {"qis", "str"} else 0

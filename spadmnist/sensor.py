@@ -382,9 +382,8 @@ class Sensor:
         if self.is_paper_line or events <= _MOST_AT_ONCE:
             return None
         if tied := self.tying(readouts):
-            return (
-                f"{shown} the {_MOST_AT_ONCE:.0e} that can be simulated at once, as they must: {tied} ties all pixels"
-            )
+            how = "draws for all pixels in one go" if tied in [e.name for e in self.uncounted] else "ties all pixels"
+            return f"{shown} the {_MOST_AT_ONCE:.0e} that can be simulated at once, as they must: {tied} {how}"
         pixel = float(self.expected(photons, conditions)[0].max())
         if pixel > _MOST_AT_ONCE:
             return f"{pixel:.3g} events in a pixel, more than the {_MOST_AT_ONCE:.0e} that can be simulated at once"

@@ -198,6 +198,8 @@ def test_what_ties_pixels_together_is_what_an_effect_declares() -> None:
     assert tying(of("count_saturation"), *ALL) is None
     assert tying(of("source_noise"), *ALL) is None  # the same light for all pixels, whatever they detect
     assert tying(Stranger(), "tr") == "stranger"
+    said = Sensor(GRID, [Stranger()], "device").settled().excess(np.full((1, 120), 1e9), SUMMED, ("tr",))
+    assert said is not None and said.endswith("as they must: stranger draws for all pixels in one go")
 
 
 # --- how large an image may be --------------------------------------------------------------------------------------
@@ -231,7 +233,7 @@ def refused(made: Experiment, grey: float = 0.5) -> str:
     with pytest.raises(InputError) as told:
         made.check_volume(grey, 1)
     said = str(told.value)
-    assert said.startswith("lab.yaml: one image at ") and "\n" not in said
+    assert said.startswith(("lab.yaml: one image at ", "lab.yaml: an image at ")) and "\n" not in said
     return said
 
 
@@ -272,7 +274,8 @@ def test_causes_of_the_papers_bright_capture_are_refused_in_one_sentence(tmp_pat
     done = commands.run("generate", "bright.yaml", "-o", "out", "--causes", cwd=tmp_path)
     said = " ".join(done.stderr.split())
     assert done.returncode == 2 and "Traceback" not in said and not (tmp_path / "out").exists()
-    assert "would hold 9.5" in said and "leave out --causes" in said
+    assert "an image at 906.5 nW/cm^2 would hold more than 2e+09 events; its frames are drawn without them" in said
+    assert "leave out --causes" in said
 
 
 def test_a_capture_of_many_detections_is_simulated_where_nothing_ties_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -386,6 +389,8 @@ def test_which_images_are_drawn_so_depends_on_each_alone(monkeypatch: pytest.Mon
     after = made.simulate_block(made.levels[0], "train", pixels, 255.0, 0)
     _same(after.images(1, 2), before.images(1, 2), "the dark one")
     assert not np.array_equal(after.images(0, 1).frames.bits, before.images(0, 1).frames.bits)
+    with pytest.raises(InputError, match="leave out --causes"):  # which change no drawn value
+        replace(made, causes=True).simulate_block(made.levels[0], "train", pixels, 255.0, 0)
     for i in range(3):
         alone = made.simulate(made.levels[0], "train", Images(pixels, None, 255.0), i, i + 1)
         _same(alone, after.images(i, i + 1), f"image {i}")
