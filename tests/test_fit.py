@@ -389,12 +389,12 @@ def test_lazy_pixels_have_an_interval():
     logs[:16] = np.log(0.5) + 0.1 * rng.standard_normal(16)
     pulled = logs * 0.97  # to the others, as a prior does it
     one = mapping.Map(("detection", "relative"), 1.0, np.arange(400), pulled, error, logs, error, 0.01)
-    told = course._map_values(one)["low_ratio"]
+    told = course.map_values(one)["low_ratio"]
     assert told.low < 0.5 < told.high
     assert (told.high - told.low) / 2 == pytest.approx(1.96 * 0.5 * 0.1 / 4, rel=0.5)
     assert told.value == pytest.approx(np.exp(logs[:16]).mean() / np.exp(np.median(logs)), rel=2e-3)
     logs[:16] = pulled[:16] = 0.0
-    assert course._map_values(one)["low_ratio"].low is None
+    assert course.map_values(one)["low_ratio"].low is None
 
 
 def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after():

@@ -119,7 +119,7 @@ def counter(frames: int) -> Capture:
 def test_a_counter_has_more_than_one_detection_in_a_frame() -> None:
     """Poisson's scatter, not that of frames which are full."""
     seen = SimpleNamespace(capture=counter(100), counts=np.full(4, 500.0), waited=None)
-    line = mapping._Line(SimpleNamespace(seen={"flat": seen}), "flat", 1.0)  # type: ignore[arg-type]
+    line = mapping.Line(SimpleNamespace(seen={"flat": seen}), "flat", 1.0)  # type: ignore[arg-type]
     assert line.variance(np.array([500.0]), 0.0)[0] == pytest.approx(500.0)
     assert not line.saturated(np.full(4, 500.0))
     expected = np.array([450.0, 500.0, 550.0])

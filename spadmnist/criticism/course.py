@@ -225,7 +225,7 @@ def _written(course: Course, settled: Settled | None, maps: Mapping[Key, mapping
                 course.values[dial.key] = dial.value(u)
     for step in course.steps:
         if step.change.carrier and step.change.carrier in maps:
-            step.values = _map_values(maps[step.change.carrier])
+            step.values = map_values(maps[step.change.carrier])
         for (effect, name), (low, high) in step.intervals.items():
             unit = next(d.unit for d in step.change.dials if d.key == (effect, name))
             own = step.values.get(name) if any(d.key == (effect, name) for d in step.dials) else None
@@ -386,7 +386,8 @@ def _model(course: Course) -> tuple[Sensors, dict[Key, mapping.Map]]:
     return sensors.changed({}, search.phases, chips), maps
 
 
-def _map_values(map_: mapping.Map) -> dict[str, Value]:
+def map_values(map_: mapping.Map) -> dict[str, Value]:
+    """What is said of a map in the answer, with intervals of 95 %."""
     told = {name: Value(number, None, None) for name, number in mapping.summary(map_).items()}
     sigma, noise = told["sigma"].value, float(np.median(map_.raw_error))
     # of a variance, which is what remains of the differences without the noise

@@ -82,10 +82,10 @@ class Seen:
     half_of: tuple[Capture, bool] | None = None
 
     @classmethod
-    def of(cls, recording: Recording) -> Seen:
-        """What is looked at of a recording."""
+    def of(cls, recording: Recording, reduced: bool = True) -> Seen:
+        """What is looked at of a recording. reduced: its statistics, too."""
         summaries = {}
-        for statistic in recordings.statistics_for(recording.capture):
+        for statistic in recordings.statistics_for(recording.capture) if reduced else ():
             summary = recordings.reduced(statistic, recording)
             if summary is not None:
                 summaries[statistic.name] = summary.apart()
@@ -348,20 +348,23 @@ class Bench:
         replicates: int,
         say: Callable[[str], None] = lambda what: None,
         exposures: Mapping[str, float] | None = None,
+        reduced: bool = True,
     ):
-        """exposures: s, of captures that were not as long as the measurement states."""
+        """exposures: s, of captures that were not as long as the measurement states. reduced: with all statistics of
+        the captures, without which nothing but their counts can be compared.
+        """
         measurement.check_sensor(sensor)
         self.start = sensor.settled()
         self.seed, self.parallel, self.replicates, self.say = seed, parallel, replicates, say
         self.dead = self.start.nominal_dead_time
-        self.measurement, self.exposures = measurement, dict(exposures or {})
+        self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, Seen] = {}
         self.simulations = 0
         for capture in measurement.captures:
             if capture.mean is not None:
                 self.seen[capture.id] = Seen(capture, capture.mean * sensor.layout.pixels, None, {})
             else:
-                self.seen[capture.id] = Seen.of(self.recording(capture.id))
+                self.seen[capture.id] = Seen.of(self.recording(capture.id), reduced)
 
     def recording(self, id: str) -> Recording:
         """The data of a capture, as long as they are."""
@@ -387,7 +390,7 @@ class Bench:
             parts = [whole.every_other(second) for second in (False, True)]
             for name, part, second in zip(halves_of(id), parts, (False, True), strict=True):
                 if part is not None:
-                    seen = Seen.of(part)
+                    seen = Seen.of(part, self.reduced)
                     other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
         return other
 

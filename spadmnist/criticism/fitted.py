@@ -14,7 +14,7 @@ from ..errors import InputError, did_you_mean
 from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import blocks, fit, likelihood, mapping, recordings, settling
+from . import blocks, counted, fit, likelihood, mapping, recordings, settling
 from .answer import Diagnosis, Step, Value, title
 from .candidates import Change, Key, changes
 from .chance import LEAST_P, of_map
@@ -38,7 +38,8 @@ def fitted(
 ) -> Diagnosis:
     """Settle what the caller names: whole effects (`add`), "effect.parameter" (`free`), and maps (`per_pixel`).
 
-    By the exact likelihood where all that is asked for and all that the sensor has is in it, otherwise by simulation.
+    A map of the dark by the pixels' counts, where captures without light tell it (`counted`); else by the exact
+    likelihood where all that is asked for and all that the sensor has is in it; otherwise by simulation.
     Raises InputError where there is no such effect or parameter.
     """
     say = progress or (lambda what: None)
@@ -51,6 +52,13 @@ def fitted(
     if not wanted:
         raise InputError("nothing is to be settled; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
     with pool(jobs) as parallel:
+        if counted.may_settle(sensor.settled(), wanted):
+            bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say, reduced=False)
+            answer = counted.settled(bench, measurement, wanted[0])
+            if not isinstance(answer, str):
+                say("by the counts in the dark alone; compare sets all else beside the new model")
+                return answer
+            say(f"not by counts in the dark alone, for there is {answer}")
         bench = Bench(sensor, measurement, seed, parallel, recordings.REPLICATES, say)
         course = begun(bench)
         start, wrong = course.state, bool(course.failed)

@@ -130,7 +130,7 @@ def groups_of(sensor: Sensor, per: str) -> np.ndarray:
     return pixels
 
 
-class _Line:
+class Line:
     """Expected detections of each pixel in one capture, for maps: of first stamps in the time that it waited."""
 
     def __init__(self, bench: Bench, id: str, level: float):
@@ -200,7 +200,7 @@ def settle_maps(
         return others
     start = with_values(bench.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
     lines = [
-        _Line(bench, id, levels[id]) for id, s in bench.seen.items() if s.counts is not None and (not use or id in use)
+        Line(bench, id, levels[id]) for id, s in bench.seen.items() if s.counts is not None and (not use or id in use)
     ]
     bases, groups, bounds = [], [], []
     for change in wanted:
@@ -324,7 +324,7 @@ def settle_maps(
     return out
 
 
-def _of_few_counts(map_: Map, lines: Sequence[_Line], model: Callable[[float], Sensor]) -> Map:
+def _of_few_counts(map_: Map, lines: Sequence[Line], model: Callable[[float], Sensor]) -> Map:
     """A map of pixels that say little each: all together tell the law of their values, without a form for it.
 
     model: with this logarithm in all pixels.
@@ -377,7 +377,7 @@ def _odd(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _begun(
-    lines: Sequence[_Line],
+    lines: Sequence[Line],
     model: Callable[[Sequence[np.ndarray]], Sensor],
     groups: Sequence[np.ndarray],
     none: Sequence[np.ndarray],
@@ -420,7 +420,7 @@ def expected(bench: Bench, id: str, state: Any, values: Mapping[Key, Any]) -> np
 
     Of first stamps in the time that each pixel waited, so that there, too, the light is what they are in proportion to.
     """
-    return _Line(bench, id, state.rates[id].level).expected(with_values(state.sensors.usual(id), values))
+    return Line(bench, id, state.rates[id].level).expected(with_values(state.sensors.usual(id), values))
 
 
 def levels_of(bench: Bench, state: Any) -> dict[str, float]:
@@ -529,7 +529,7 @@ def information(bench: Bench, values: Values, change: Change, levels: dict[str, 
         if seen.counts is None:
             out[id] = np.zeros(pixels)
             continue
-        line = _Line(bench, id, levels[id])
+        line = Line(bench, id, levels[id])
         a, b = line.expected(start), line.expected(other)
         slope = (b - a) / 0.02
         out[id] = slope**2 / line.variance(np.maximum(a, 0.5), bench.dead)
