@@ -105,6 +105,7 @@ class Comparison:
             "format": "spadmnist-comparison/1",
             "verdict": self.verdict,
             "misfit": _plain(self.misfit),
+            "misfit_in_sample": _plain(self.misfit),  # no capture is left out
             "misfit_null_95": _plain(self.misfit_null_95),
             "false_alarm_rate": self.false_alarm_rate,
             "replicates": self.replicates,
