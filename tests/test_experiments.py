@@ -351,7 +351,7 @@ def test_wrong_words(words: list[str], says: str, tmp_path: Path) -> None:
 
 COUNTING = ("counts", "passive_free_running", "str_flux", "qis_counts", "qis_linear")
 # per cent, of all methods that count; how far they may lie apart
-ACCURACIES = {"5 mlux": (50, 64, 4), "80 mlux": (94, 97.8, 1.5), "2560 mlux": (95, 98.4, 1.5)}
+ACCURACIES = {"5 mlux": (50, 64, 4), "80 mlux": (94, 97.8, 1.5), "2560 mlux": (95, 99, 1.5)}
 # of the inputs at 2560 mlux: fluxes over their median, and frames, of which there are 100
 LARGEST = {
     **dict.fromkeys(("counts", "passive_free_running", "str_flux"), (2.5, 5)),
