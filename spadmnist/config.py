@@ -10,6 +10,7 @@ import contextlib
 import csv
 import errno
 import io
+import itertools
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PlainValidator
 
 from . import disk, document, plugins, reconstruct, units
 from .document import Document, Path_
@@ -32,14 +33,42 @@ from .readout import READOUTS, no_detection, unsigned_for
 from .reconstruct import Method
 from .section import LATER, Section
 from .sensor import Sensor
-from .validated import Area, Irradiance, Length, Lux, Reader, Share, Time, brief
+from .validated import Area, Irradiance, Lux, Reader, Share, Time, brief
+
+_CHANNELS = ("red", "green", "blue")  # of colour images, in their order
+
+
+def _of_light(raw: object) -> units.Quantity | list[units.Quantity]:
+    """A wavelength, or one for each channel of colour images: a list of three, or red, green and blue."""
+    if isinstance(raw, Mapping):
+        if set(raw) != set(_CHANNELS):
+            written = "{red: 620 nm, green: 540 nm, blue: 460 nm}"
+            raise ValueError(f"{brief(dict(raw))} is not possible; give red, green and blue, as in {written}")
+        raw = [raw[name] for name in _CHANNELS]
+    if not isinstance(raw, list):
+        return _one_length(raw)
+    if len(raw) != len(_CHANNELS):
+        raise ValueError(f"{brief(raw)} is not possible; give one wavelength, or one for each of red, green and blue")
+    return [_one_length(one) for one in raw]
+
+
+def _one_length(raw: object) -> units.Quantity:
+    value = units.parse(raw, "m")
+    if not value > 0:
+        raise ValueError(f"{value} is not possible; it must be more than 0")
+    return value
 
 
 class _Scene(Section):
     images: ImageSource
-    wavelength: Length = Field(default="555 nm")  # type: ignore[assignment]
+    wavelength: Annotated[Any, PlainValidator(_of_light)] = Field(default="555 nm")
     lux: list[Lux] | None = Field(default=None, min_length=1)
     irradiance: list[Irradiance] | None = Field(default=None, min_length=1)
+
+    @property
+    def wavelengths(self) -> tuple[units.Quantity, ...]:
+        """One, or one for each channel."""
+        return tuple(self.wavelength) if isinstance(self.wavelength, list) else (self.wavelength,)
 
 
 class _Recording(Section):
@@ -167,7 +196,7 @@ def read_sensor(path: str | Path) -> Sensor:
                 reader.problems.append(f"{source.place((key,))} is not an entry of a sensor file or of a config.{hint}")
     elif not isinstance(raw, Mapping) or not {"layout", "effects"} & set(raw):
         raise ConfigError([f"{source.name}: describes no sensor; it begins with sensor: and has layout and effects"])
-    described = reader.sensor(raw, None) if isinstance(raw, str) else reader.described(raw, place, None)
+    described = reader.sensor(raw, ()) if isinstance(raw, str) else reader.described(raw, place, ())
     if reader.problems or described is None or described.settled is None:
         raise ConfigError(reader.problems)
     return described.settled
@@ -204,10 +233,10 @@ def build(
     levels = reader.levels(scene) if scene else ()
     conditions = reader.conditions(recording, scene) if recording else None
     methods = reader.methods(parts.get("reconstruct"), recording) if recording else ()
-    wavelength = float(scene.wavelength) if scene else None
-    described = reader.sensor(raw["sensor"], wavelength) if "sensor" in raw else None
+    wavelengths = tuple(map(float, scene.wavelengths)) if scene else ()
+    described = reader.sensor(raw["sensor"], wavelengths) if "sensor" in raw else None
     if described and conditions and scene and recording:
-        described.check_clock(conditions, recording.readouts)
+        described.check_clock(conditions, recording.readouts, wavelengths)
     if reader.problems or not (described and described.settled and conditions and scene and recording):
         raise ConfigError(reader.problems)
     return Experiment(
@@ -225,6 +254,7 @@ def build(
         limit=parts["limit"],
         causes=parts["causes"],
         notes=_notes(scene, source),
+        wavelengths=wavelengths if len(wavelengths) > 1 else (),
     )
 
 
@@ -232,7 +262,7 @@ def of_sensor(
     sensor: Sensor, recording: Mapping[str, Any], lux: Sequence[Any], wavelength: Any, methods: Sequence[str], seed: int
 ) -> Experiment:
     """An Experiment without images of its own. recording: as in a config; lux: levels, in lux or as "5 mlux";
-    wavelength alike; methods: reconstructions.
+    wavelength alike, or one for each channel; methods: reconstructions.
 
     Raises ConfigError with every mistake.
     """
@@ -242,7 +272,9 @@ def of_sensor(
 
     scene = {
         "images": {"source": "uniform"},
-        "wavelength": plain(wavelength, "m"),
+        "wavelength": [plain(x, "m") for x in wavelength]
+        if isinstance(wavelength, list | tuple)
+        else plain(wavelength, "m"),
         "lux": [plain(x, "lux") for x in lux],
     }
     raw = {"scene": scene, "recording": dict(recording), "reconstruct": list(methods)}
@@ -254,19 +286,23 @@ def of_sensor(
     if found[1]:
         reader.methods(list(methods), found[1])
     if conditions and found[0] and found[1] and not reader.problems:
-        _Described(sensor, sensor, cast(Any, None), {}, reader, ("sensor",)).check_clock(conditions, found[1].readouts)
+        _Described(sensor, sensor, cast(Any, None), {}, reader, ("sensor",)).check_clock(
+            conditions, found[1].readouts, [float(x) for x in found[0].wavelengths]
+        )
     if reader.problems or not (conditions and found[0] and found[1]):
         raise ConfigError(reader.problems)
     readouts = tuple(r for r in READOUTS if r in found[1].readouts)
     made = (seed, known, found[0].images, conditions, readouts, tuple(methods), sensor, "zarr")
-    return Experiment("Simulated", {}, Path(), *made)
+    several = tuple(map(float, found[0].wavelengths)) if len(found[0].wavelengths) > 1 else ()
+    return Experiment("Simulated", {}, Path(), *made, wavelengths=several)
 
 
 def _notes(scene: _Scene, source: Document) -> tuple[str, ...]:
-    if scene.lux and abs(scene.wavelength - 555e-9) > 0.5e-9:
+    other = next((one for one in scene.wavelengths if abs(one - 555e-9) > 0.5e-9), None)
+    if scene.lux and other is not None:
         return (
             f"{source.place(('scene', 'wavelength'))}: lux is turned into power with 683 lm/W, which holds at 555 nm, "
-            f"not at {scene.wavelength}; give irradiance where the light is not green",
+            f"not at {other}; give irradiance where the light is not green",
         )
     return ()
 
@@ -321,7 +357,7 @@ class _Reader(Reader):
                 f"the exposure is frames x frame_period, here {frames} x {units.show(period, 's')} = "
                 f"{units.show(frames * period, 's')}, but {r.exposure} is written; correct one of them",
             )
-        wavelength = float(scene.wavelength) if scene else None
+        wavelength = float(scene.wavelengths[0]) if scene else None
         bits, counting = self.counting(r, frames)
         return Conditions(float(r.exposure), frames, frame_time, period, wavelength, bits, counting)
 
@@ -367,10 +403,10 @@ class _Reader(Reader):
 
     # --- sensor ---------------------------------------------------------------------------------------------------
 
-    def sensor(self, raw: Any, wavelength: float | None) -> _Described | None:
+    def sensor(self, raw: Any, wavelengths: Sequence[float]) -> _Described | None:
         """The sensor, from the mapping itself or from the file that it names."""
         if not isinstance(raw, str):
-            return self.described(raw, ("sensor",), wavelength)
+            return self.described(raw, ("sensor",), wavelengths)
         try:
             found = document.read(self.base / raw)
         except ConfigError as error:
@@ -381,16 +417,16 @@ class _Reader(Reader):
             return None
         inner = _Reader(found, (self.base / raw).resolve().parent, self.problems)
         if not (isinstance(found.value, Mapping) and "sensor" in found.value):
-            return inner.described(found.value, (), wavelength)
+            return inner.described(found.value, (), wavelengths)
         for key in found.value:
             if key != "sensor":
                 inner.problems.append(f"{found.place((key,))} is not an entry of a sensor file; it holds sensor: alone")
-        return inner.described(found.value["sensor"], ("sensor",), wavelength)
+        return inner.described(found.value["sensor"], ("sensor",), wavelengths)
 
-    def described(self, raw: Any, path: Path_, wavelength: float | None) -> _Described | None:
+    def described(self, raw: Any, path: Path_, wavelengths: Sequence[float]) -> _Described | None:
         """The sensor at `path` with all maps and distributions settled; None after its mistakes were noted.
 
-        wavelength: of the scene, m, where it is known: tables are looked up there.
+        wavelengths: of the scene, m, where they are known: tables are looked up there.
         """
         if not isinstance(raw, Mapping):
             self.say(path, f"{brief(raw)} is neither a sensor file's name nor a sensor")
@@ -403,7 +439,7 @@ class _Reader(Reader):
             effect = self.effect(name, values, (*path, "effects", name))
             if effect is not None:
                 effects.append(effect)
-                self.check_tables(effect, wavelength, (*path, "effects", name))
+                self.check_tables(effect, wavelengths, (*path, "effects", name))
         layout = self.layout(model.layout, (*path, "layout")) if model is not None and whole else None
         if model is None or layout is None:
             return None
@@ -475,10 +511,10 @@ class _Reader(Reader):
                 self.say(path, f"{kind.name} needs {key} ({declared.about})")
         return kind(**read) if len(self.problems) == before else None
 
-    def check_tables(self, effect: Effect, wavelength: float | None, path: Path_) -> None:
-        for key in effect.parameters:
+    def check_tables(self, effect: Effect, wavelengths: Sequence[float], path: Path_) -> None:
+        for key, wavelength in itertools.product(effect.parameters, wavelengths):
             value = getattr(effect, key)
-            if wavelength is not None and isinstance(value, plugins.ByWavelength):
+            if isinstance(value, plugins.ByWavelength):
                 try:
                     value.at(wavelength)
                 except InputError as error:
@@ -528,11 +564,11 @@ class _Described:
     reader: _Reader
     path: Path_
 
-    def check_clock(self, conditions: Conditions, readouts: list[Any]) -> None:
+    def check_clock(self, conditions: Conditions, readouts: list[Any], wavelengths: Sequence[float]) -> None:
         """What can only be said of sensor and recording together."""
         # a table that does not reach the wavelength has been told already
         with contextlib.suppress(InputError):
-            if self.settled and self.settled.nominal_pdp(conditions.wavelength) <= 0:
+            if self.settled and min(map(self.settled.nominal_pdp, wavelengths)) <= 0:
                 pdp = (*self.path, "effects", "detection", "pdp")
                 self.reader.say(pdp, "is 0, so that no flux can be estimated; it must be more than 0")
         try:

@@ -156,7 +156,9 @@ def expected_per_image(experiment: Experiment, level: Level, images: Images) -> 
     grey = float(shown.mean(dtype=np.float64)) / images.white
     pixels = images.pixels[0].size
     photons = np.full((1, pixels), experiment.white(level) * grey)
-    photons = photons.reshape(-1, experiment.sensor.layout.pixels)
+    if experiment.wavelengths:
+        photons = experiment.photons(level, np.full((1, *images.pixels.shape[1:]), grey), 1.0)
+    photons = experiment.seen(photons.reshape(-1, experiment.sensor.layout.pixels))
     candidates, recorded = experiment.sensor.expected(photons, experiment.conditions)
     frames = experiment.conditions.frames
     stamped = np.minimum(candidates, frames)
@@ -349,7 +351,7 @@ def reconstruction_columns(
     columns = {}
     for name in experiment.methods if names is None else names:
         method = reconstruct.find(name)
-        values, saturated = method.image(recorded, experiment.settings)
+        values, saturated = experiment.image(method, recorded)
         columns[f"reconstruction/{name}"] = Column(
             values.reshape(-1, *shape),
             dims,
@@ -960,7 +962,7 @@ class _Simulated:
         return made.tr if what == "tr" else made.frames
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
-        values, _ = reconstruct.find(method).image(self._make(start, stop), self._experiment.settings)
+        values, _ = self._experiment.image(reconstruct.find(method), self._make(start, stop))
         return values.reshape(-1, *self._splits[self._split].pixels.shape[1:])
 
     @cached_property
@@ -974,8 +976,8 @@ class _Simulated:
         def chunks() -> Iterator[dict[str, np.ndarray]]:
             for start in range(0, wanted, 256):
                 made = self._experiment.simulate(self._level, split, images, start, min(start + 256, wanted))
-                settings = self._experiment.settings
-                yield {name: m.image(made, settings)[0] for name, m in methods.items() if m.normalised}
+                image = self._experiment.image
+                yield {name: image(m, made)[0] for name, m in methods.items() if m.normalised}
 
         return medians_of_nonzero(chunks)
 

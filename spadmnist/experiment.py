@@ -16,7 +16,7 @@ from .effects import Conditions
 from .errors import InputError, did_you_mean
 from .images import Images, check_size
 from .readout import Recorded
-from .reconstruct import Settings
+from .reconstruct import Method, Settings
 from .sensor import Sensor
 from .streams import Streams
 
@@ -68,7 +68,8 @@ class Experiment:
 
     resolved: the config with all defaults filled in and the sensor in place, as text and numbers: what a manifest
     keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split;
-    causes: say of every detection what made it.
+    causes: say of every detection what made it; wavelengths: m, of each channel of colour images, where they differ
+    (the first is that of `conditions`).
     """
 
     name: str
@@ -85,26 +86,52 @@ class Experiment:
     limit: int | None = None
     causes: bool = False
     notes: tuple[str, ...] = ()
-    _photons: dict[str, float] = field(default_factory=dict, repr=False, compare=False)
+    wavelengths: tuple[float, ...] = ()
+    _photons: dict[tuple[str, int], float] = field(default_factory=dict, repr=False, compare=False)
 
     # --- light ---------------------------------------------------------------------------------------------------
 
-    def white(self, level: Level) -> float:
-        """Photons/s on the active area of a white pixel."""
-        if level.text not in self._photons:
+    def white(self, level: Level, channel: int = 0) -> float:
+        """Photons/s on the active area of a white pixel, in a channel of colour images."""
+        if (level.text, channel) not in self._photons:
             convert = light.photons_from_lux if level.kind == "lux" else light.photons_from_irradiance
-            assert self.conditions.wavelength is not None
+            wavelength = self.wavelengths[channel] if self.wavelengths else self.conditions.wavelength
+            assert wavelength is not None
             area = self.sensor.layout.active_area
-            self._photons[level.text] = convert(level.value, area, self.conditions.wavelength)
-        return self._photons[level.text]
+            self._photons[level.text, channel] = convert(level.value, area, wavelength)
+        return self._photons[level.text, channel]
 
     def photons(self, level: Level, pixels: np.ndarray, white: float) -> np.ndarray:
         """(images, channels * rows * columns) photons/s from grey levels: linear, white at the level."""
         flat = pixels.reshape(len(pixels), -1)
+        if self.wavelengths:
+            each = flat.reshape(len(flat), len(self.wavelengths), -1) / white
+            whites = np.array([self.white(level, channel) for channel in range(len(self.wavelengths))])
+            return (each * whites[:, None]).reshape(flat.shape)
         if flat.dtype == np.uint8:
             # a table is the same arithmetic, once for each of the 256 grey levels
             return kernels.lookup(np.arange(256) / white * self.white(level), flat.ravel()).reshape(flat.shape)
         return flat / white * self.white(level)
+
+    def seen(self, photons: np.ndarray) -> np.ndarray:
+        """(channel images, pixels) photons/s at the first channel's wavelength that are detected as often as these.
+
+        Detection thins light, so that photons of another wavelength count as many as are detected of them.
+        """
+        if not self.wavelengths:
+            return photons
+        return (photons.reshape(-1, len(self.wavelengths), photons.shape[1]) * self._worth).reshape(photons.shape)
+
+    @cached_property
+    def _worth(self) -> np.ndarray:
+        """(channels, pixels) detections that a photon of each channel's wavelength makes, beside the first one's."""
+        found = []
+        for wavelength in self.wavelengths:
+            rate = np.ones((1, self.sensor.layout.pixels))
+            for effect in self.sensor.at("detection"):
+                rate = effect.apply(rate, replace(self.conditions, wavelength=wavelength))  # type: ignore[attr-defined]
+            found.append(rate[0])
+        return np.stack(found) / np.where(found[0] > 0, found[0], 1.0)
 
     def level(self, text: str) -> Level:
         """The level written as `text`, or of the same value. Raises KeyError with a sentence."""
@@ -125,7 +152,19 @@ class Experiment:
         limit = None if self.limit is None else -(-self.limit // self.sensor.block) * self.sensor.block
         splits = self.source.load(self.sensor.layout.shape, images_dir, self.base, limit)
         check_size(splits, self.sensor.layout.shape, "sensor.layout")
+        for images in splits.values():
+            self._check_channels(images.pixels)
         return splits
+
+    def _check_channels(self, pixels: np.ndarray) -> None:
+        """Raise InputError where images have not the channels that there are wavelengths of."""
+        channels = pixels.shape[1] if pixels.ndim == 4 else 1
+        if self.wavelengths and channels != len(self.wavelengths):
+            held = "grey" if pixels.ndim == 3 else f"of {channels} channels"
+            raise InputError(
+                f"scene.wavelength: has {len(self.wavelengths)} wavelengths, one for each channel, but the images are "
+                f"{held}; give one wavelength, or images in colour"
+            )
 
     def wanted(self, images: Images) -> int:
         """How many of a split's images belong to the dataset."""
@@ -158,9 +197,10 @@ class Experiment:
     ) -> Recorded:
         """As `simulate`, for images whose indices are `images`: any, or one whole block where the sensor has blocks."""
         channels = pixels[0].size // self.sensor.layout.pixels
+        self._check_channels(pixels)
         # each channel is an image of its own to the sensor
         numbers = (images[:, None] * channels + np.arange(channels)).reshape(-1).astype(np.uint64)
-        photons = self.photons(level, pixels, white).reshape(len(numbers), -1)
+        photons = self.seen(self.photons(level, pixels, white).reshape(len(numbers), -1))
         streams = self.streams(level, split, numbers)
         large = self.from_frames(photons)
         if not large.any():
@@ -204,9 +244,22 @@ class Experiment:
         events = chip.expected(light, self.conditions)[0].sum(axis=1)
         return np.asarray(events > _FROM_FRAMES)
 
+    def image(self, method: Method, recorded: Recorded) -> tuple[np.ndarray, int]:
+        """As `Method.image`, of images in colour each channel with the PDP at its own wavelength."""
+        if not self.wavelengths:
+            return method.image(recorded, self.settings)
+        planes = len(self.wavelengths)
+        values, saturated = [], 0
+        for channel, wavelength in enumerate(self.wavelengths):
+            settings = replace(self.settings, pdp=self.sensor.nominal_pdp(wavelength))
+            one, bounded = method.image(recorded.plane(channel, planes), settings)
+            values.append(one.reshape(-1, recorded.pixels // planes))
+            saturated += bounded
+        return np.stack(values, axis=1).ravel(), saturated
+
     @cached_property
     def settings(self) -> Settings:
-        """What the reconstructions are told."""
+        """What the reconstructions are told, at the wavelength of the conditions."""
         c = self.conditions
         return Settings(
             self.sensor.nominal_pdp(c.wavelength),
@@ -233,6 +286,9 @@ class Experiment:
         brightest = max(self.levels, key=self.white)
         pixels = self.sensor.layout.pixels * channels
         photons = np.full((channels, self.sensor.layout.pixels), self.white(brightest) * mean_grey)
+        if self.wavelengths:
+            even = np.full((1, channels, *self.sensor.layout.shape), mean_grey)
+            photons = self.seen(self.photons(brightest, even, 1.0).reshape(channels, -1))
         excess = self.sensor.excess(photons, self.conditions, self.readouts)
         if excess and not self.from_frames(photons).any():
             raise InputError(

@@ -703,10 +703,11 @@ def _warm(experiment: Experiment, progress: Progress) -> None:
     if experiment.sensor.block > 1:
         return  # a user's effect is run for the images that are wanted, and for no others
     with compiling(lambda: progress.notice("Compiling the simulation for this machine, once: about 20 s.")):
-        pixels = np.zeros((1, *experiment.sensor.layout.shape), np.uint8)
-        made = experiment.simulate_block(experiment.levels[0], "warm", pixels, 255, 0)
-        dataset.stream_columns(made, experiment.sensor.layout.shape)
-        dataset.reconstruction_columns(experiment, made, experiment.sensor.layout.shape)
+        channels = (len(experiment.wavelengths),) if experiment.wavelengths else ()
+        shape = (*channels, *experiment.sensor.layout.shape)
+        made = experiment.simulate_block(experiment.levels[0], "warm", np.zeros((1, *shape), np.uint8), 255, 0)
+        dataset.stream_columns(made, shape)
+        dataset.reconstruction_columns(experiment, made, shape)
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------

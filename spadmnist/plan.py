@@ -56,7 +56,7 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
 def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tuple[float, float]:
     """(photons, recorded detections) expected of the first `n` images."""
     pixels = images.pixels[:n]
-    if pixels.dtype == np.uint8 and _uniform(experiment):
+    if pixels.dtype == np.uint8 and _uniform(experiment) and not experiment.wavelengths:
         # every pixel obeys the same law: the histogram of grey levels says it all
         counted = (
             np.bincount(pixels[0].ravel(), minlength=256) * n
@@ -78,7 +78,7 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
 
 def _seen(experiment: Experiment, photons: np.ndarray) -> np.ndarray:
     """Expected entries of the stream per pixel: TR detections or, without TR, frames with a detection."""
-    candidates, recorded = experiment.sensor.expected(photons, experiment.conditions)
+    candidates, recorded = experiment.sensor.expected(experiment.seen(photons), experiment.conditions)
     frames = experiment.conditions.frames
     return recorded if "tr" in experiment.readouts else -frames * np.expm1(-candidates / frames)
 

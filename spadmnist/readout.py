@@ -165,6 +165,18 @@ class Recorded:
             frames = Frames(one.bits, first, one.frames, one.frame_time, pixels, one.cause, one.parent)
         return Recorded(pixels, tr, self.counts, self.span, frames, self.ones, self.waited, self.tally)
 
+    def plane(self, number: int, planes: int) -> Recorded:
+        """One channel of images that are grouped of `planes`: what reconstructions need of its rows, no streams."""
+
+        def cut(column: np.ndarray | None) -> np.ndarray | None:
+            if column is None:
+                return None
+            rows = column.reshape(-1, planes, self.pixels // planes, *column.shape[1:])[:, number]
+            return rows.reshape(-1, *column.shape[1:])
+
+        counts, span, ones, waited, tally = map(cut, (self.counts, self.span, self.ones, self.waited, self.tally))
+        return Recorded(self.pixels // planes, None, counts, span, None, ones, waited, tally)
+
     @staticmethod
     def joined_pixels(parts: Iterable[Recorded], pixels: int) -> Recorded:
         """One image of its parts, whose pixels follow each other; pixels: their number. Packed bits are held once."""

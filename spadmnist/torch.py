@@ -529,7 +529,7 @@ class Simulated(Dataset[Any]):
         labels = [shown[int(i)][2] for i in wanted]
         channels = pixels.shape[1:-2]
         if self.returns in reconstruct.Method.registry:
-            values, _ = reconstruct.find(self.returns).image(made, self.experiment.settings)
+            values, _ = self.experiment.image(reconstruct.find(self.returns), made)
             images = values.reshape(len(numbers), *(channels or (1,)), *layout.shape)[wanted] / np.float32(self.scale)
             return list(zip(torch.from_numpy(images).unbind(), labels, strict=True))
         if self.returns == "tr":
