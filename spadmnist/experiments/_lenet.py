@@ -59,7 +59,7 @@ def network(side: tuple[int, int]) -> torch.nn.Module:
 
 @dataclass(frozen=True)
 class Labelled:
-    """images: (n, rows, columns) float32; labels: (n,), 0 to 9."""
+    """images: (n, rows, columns), float32, or uint8 where there are too many; labels: (n,), 0 to 9."""
 
     images: np.ndarray
     labels: np.ndarray
@@ -85,7 +85,7 @@ def train(
         for epoch in range(1, epochs + 1):
             for step, chosen in enumerate(torch.randperm(len(labels), generator=order).split(BATCH), 1):
                 adam.zero_grad()
-                loss(net(images[chosen]), labels[chosen]).backward()
+                loss(net(images[chosen].float()), labels[chosen]).backward()
                 adam.step()
                 with torch.no_grad():
                     torch._foreach_lerp_(means, weights, 1 / step)
@@ -99,7 +99,7 @@ def accuracy(net: torch.nn.Module, data: Labelled) -> float:
     with _alone(0) as torch, torch.no_grad():
         images, labels = _tensors(data)
         pairs = zip(images.split(_TESTED), labels.split(_TESTED), strict=True)
-        right = sum(int((net(some).argmax(1) == true).sum()) for some, true in pairs)
+        right = sum(int((net(some.float()).argmax(1) == true).sum()) for some, true in pairs)
     return right / len(data.labels)
 
 
