@@ -51,6 +51,10 @@ RULES = {
         "spadmnist experiment accuracy",
         "it takes most of an hour; test_experiments.py does a small one, and a quick one on MNIST",
     ),
+    "spadmnist experiment captures -o captures": (
+        "spadmnist experiment captures",
+        "it takes some ten minutes; test_experiment_captures.py does a small one, and a quick one on MNIST",
+    ),
     "spadmnist generate configs/spad23.yaml -o lab": (
         "spadmnist generate configs/spad23.yaml -o lab --limit 1",
         "compare and diagnose take a tenth of the time with one capture of ten",
