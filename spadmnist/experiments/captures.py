@@ -583,7 +583,7 @@ def _drawing(pictures: Sequence[Mapping[str, Any]], real: bool) -> Drawing:
             axes.imshow(
                 tiles.lay(digits / largest, corners, (int(whole[0]), int(whole[1]))), cmap="gray", vmin=0, vmax=1
             )
-            axes.set_ylabel(one["name"], rotation=0, ha="right", va="center")
+            axes.set_title(one["name"], loc="left", fontsize=9)
             axes.set_xticks([])
             axes.set_yticks([])
 
@@ -593,4 +593,4 @@ def _drawing(pictures: Sequence[Mapping[str, Any]], real: bool) -> Drawing:
     )
     if not real:
         note += " The captured ones are those of the imitation, with all imperfections."
-    return Drawing("digits", "Digits", words, (7.5, 0.85 * len(pictures)), draw, note)
+    return Drawing("digits", "Digits", words, (7.5, 1.1 * len(pictures)), draw, note)
