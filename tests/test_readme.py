@@ -25,7 +25,9 @@ import h5py
 import pytest
 
 import spadmnist
+from spadmnist import experiments
 from spadmnist.cli import cli
+from spadmnist.experiments import PaperExperiment
 from spadmnist.testing import check_effect
 
 ROOT = Path(__file__).parents[1]
@@ -50,6 +52,10 @@ RULES = {
     "spadmnist experiment accuracy -o accuracy": (
         "spadmnist experiment accuracy",
         "it takes most of an hour; test_experiments.py does a small one, and a quick one on MNIST",
+    ),
+    "spadmnist experiment captures -o captures": (
+        "spadmnist experiment captures",
+        "it takes some ten minutes; test_experiment_captures.py does a small one, and a quick one on MNIST",
     ),
     "spadmnist generate configs/spad23.yaml -o lab": (
         "spadmnist generate configs/spad23.yaml -o lab --limit 1",
@@ -276,6 +282,8 @@ IN_LINE = [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", TEXT)]
 
 def test_every_verb_and_option_in_a_line_is_there() -> None:
     every = {name for verb in cli.commands.values() for p in verb.params for name in (*p.opts, *p.secondary_opts)}
+    declared = map(PaperExperiment.registry.find, PaperExperiment.registry)
+    every |= {experiments.word(key) for experiment in declared for key in experiment.options}
     seen = 0
     for code in IN_LINE:
         words = shlex.split(code) if code.count('"') % 2 == 0 else code.split()

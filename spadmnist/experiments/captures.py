@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from .. import config, dataset, factory, fluxes, measurement, tiles, twin
+from .. import config, dataset, factory, fluxes, measurement, plugins, tiles, twin
 from ..effects import Conditions, Effect
 from ..errors import InputError
 from ..experiment import Experiment
@@ -152,7 +152,7 @@ class Captures(PaperExperiment):
                         "error": one["error"],
                         "n": one["n"],
                         "captures": len(one["each"]),
-                        "paper": None if paper is None else paper[result["network"]] / 100,
+                        "paper": None if paper is None else round(paper[result["network"]] / 100, 3),
                         "train": result["train"],
                         "epochs": result["epochs"],
                         "seed": result["seed"],
@@ -244,8 +244,10 @@ class _Bench:
         whole, lazy = Distribution("normal", (1.0, 0.0)), Distribution("normal", LAZY_PDP)
         values: dict[str, dict[str, Any]] = {
             "hot pixels": {_RATE: hot},
-            "PDP spread": {"detection.pdp": Distribution("normal", (pdp, SPREAD * pdp))},
-            "lazy pixels": {"detection.relative": Distribution("mixture", parts=((1 - LAZY, whole), (LAZY, lazy)))},
+            f"PDP spread, {100 * SPREAD:g} %": {"detection.pdp": Distribution("normal", (pdp, SPREAD * pdp))},
+            f"lazy pixels, {100 * LAZY:g} %": {
+                "detection.relative": Distribution("mixture", parts=((1 - LAZY, whole), (LAZY, lazy)))
+            },
         }
         plain = real.with_values({_RATE: float(np.median(hot))})
         out = {SIMULATED: plain} | {name: plain.with_values(one) for name, one in values.items()}
@@ -253,8 +255,12 @@ class _Bench:
         out["the whole chip"] = every
         for cls in map(Effect.registry.find, Effect.registry):
             if getattr(cls, "of_scene", False):  # what a print does, as its file says that prints are
-                out[cls.name.replace("_", " ")] = plain.with_effect(cls())
-                every = every.with_effect(cls())
+                effect = cls()
+                said = [
+                    f"{name} {plugins.described(one, getattr(effect, name))}" for name, one in cls.parameters.items()
+                ]
+                out[f"{cls.name.replace('_', ' ')}, {', '.join(said)}"] = plain.with_effect(effect)
+                every = every.with_effect(effect)
         return out | {TOGETHER: every}
 
     @property
@@ -527,7 +533,8 @@ class _Told:
         ]
         worst = max(one["error"] for one in self.found.values())
         note = (
-            f"One imperfection at a time beside none ({SIMULATED}). The binomial error is at most {100 * worst:.1f} %."
+            f"One imperfection at a time beside none ({SIMULATED}). Digits are cut out where the chart has them: a "
+            f"print that hangs askew is not turned back. The binomial error is at most {100 * worst:.1f} %."
         )
         return Table("Accuracy by imperfection", header, [*rows, ["paper, real captures", *cells]], note)
 
@@ -576,7 +583,7 @@ def _drawing(pictures: Sequence[Mapping[str, Any]], real: bool) -> Drawing:
             axes.imshow(
                 tiles.lay(digits / largest, corners, (int(whole[0]), int(whole[1]))), cmap="gray", vmin=0, vmax=1
             )
-            axes.set_ylabel(one["name"], rotation=0, ha="right", va="center")
+            axes.set_title(one["name"], loc="left", fontsize=9)
             axes.set_xticks([])
             axes.set_yticks([])
 
@@ -586,4 +593,4 @@ def _drawing(pictures: Sequence[Mapping[str, Any]], real: bool) -> Drawing:
     )
     if not real:
         note += " The captured ones are those of the imitation, with all imperfections."
-    return Drawing("digits", "Digits", words, (7.5, 0.85 * len(pictures)), draw, note)
+    return Drawing("digits", "Digits", words, (7.5, 1.1 * len(pictures)), draw, note)
