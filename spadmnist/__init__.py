@@ -77,12 +77,12 @@ __all__ = sorted([*_PUBLIC, *_MODULES])
 
 
 def __getattr__(name: str) -> "Any":
+    if name not in _PUBLIC and name not in _MODULES:
+        raise AttributeError(f"module 'spadmnist' has no attribute {name!r}")
     from importlib import import_module
 
     if name in _MODULES:
         return import_module(f".{name}", __name__)
-    if name not in _PUBLIC:
-        raise AttributeError(f"module 'spadmnist' has no attribute {name!r}")
     return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
 
 

@@ -987,7 +987,7 @@ _OWN = "spadmnist.options"  # where a context keeps the options of an experiment
 @click.option(
     "--output",
     "-o",
-    type=click.Path(path_type=Path),
+    type=_Place(),
     metavar="OUT",
     help="Folder of the data, the results and the page.",
 )

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from . import dataset, disk, pictures, reconstruct, units
+from . import disk, pictures, reconstruct, units
 from .errors import InputError, SpadError
 from .factory import Progress
 from .importers.captures import safe_name
@@ -243,9 +243,7 @@ def check_place(folder: Path) -> None:
     """Raise SpadError with a sentence where no images may be put, so that it can be said before the work is done."""
     if folder.exists() and not folder.is_dir():
         raise SpadError(f"{folder} is a file, but images need a folder; choose another name with -o")
-    for above in (folder.resolve(), *folder.resolve().parents):
-        if (above / dataset.MANIFEST).is_file():
-            raise SpadError(f"{folder} lies in the dataset {above}, which holds nothing but its own; choose another -o")
+    disk.check_outside(folder)
 
 
 def write(found: Fluxes, folder: Path) -> Path:

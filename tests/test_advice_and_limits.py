@@ -237,14 +237,14 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     best, near, third = (Tried(c, {}, Moved({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
 
     def told(**other: Any) -> list[tuple[str, bool]]:
-        found = diagnose._alternatives(bench, state, best, [], [best, replace(near, **other)])
+        found = diagnose._alternatives(quiet(bench), state, best, [], [best, replace(near, **other)])
         return [(a["effect"], a["confused"]) for a in found]
 
     assert told(gain=93.0) == [("slow_afterpulsing", True)]
     assert told(gain=88.0) == [("slow_afterpulsing", False)]
     assert told(residuals=foul) == [("slow_afterpulsing", False)]
     assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
-    many = diagnose._alternatives(bench, state, best, [], [best, near, near, third])
+    many = diagnose._alternatives(quiet(bench), state, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
     # where chance makes pixels odd, by that model's own scatter
     own = with_residuals(state, {})
@@ -264,7 +264,10 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
         assert told(gain=78.0) == told(gain=99.0, residuals=foul) == [("slow_afterpulsing", False)]
     # another value and a map of it are two things
     two = [replace(near, change=change_of(bench, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")]
-    assert [a["change"] for a in diagnose._alternatives(bench, state, best, [], [best, *two])] == ["set", "per_pixel"]
+    assert [a["change"] for a in diagnose._alternatives(quiet(bench), state, best, [], [best, *two])] == [
+        "set",
+        "per_pixel",
+    ]
 
 
 BLURRED = "jitter: {sigma: 1 ns, tail: 0 s}", "add jitter", {("jitter", "sigma"): 1e-9}

@@ -95,9 +95,9 @@ def test_candidates_come_from_the_registry(tmp_path):
     assert not names & {"set detection.pdp", "add dead_time"}
     for name in Effect.registry:
         if name not in {e.name for e in sensor.effects}:
-            declared = Effect.registry.find(name).parameters.values()
-            can = [p for p in declared if p.off is not None and p.search is not None]
-            assert bool(can) == (f"add {name}" in names), name
+            kind = Effect.registry.find(name)
+            can = [p for p in kind.parameters.values() if p.off is not None and p.search is not None]
+            assert bool(can and not kind.of_scene) == (f"add {name}" in names), name
 
 
 def test_the_next_sensor_is_the_users_own_file(tmp_path):

@@ -420,15 +420,16 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after():
 
 def test_what_cannot_be_settled_is_told_with_what_can(made):
     sensor, *_ = made
+    known = candidates.changes(sensor.settled()), {e.name for e in sensor.effects}
     with pytest.raises(
         InputError, match=r"dead_time\.durations cannot be settled here; .*Did you mean dead_time\.duration\?"
     ):
-        fitted._named(sensor.settled(), "set", "dead_time", "durations")
+        fitted._named(*known, "set", "dead_time", "durations")
     with pytest.raises(InputError, match=r"crosstalks cannot be settled here; .*Did you mean crosstalk\?"):
-        fitted._named(sensor.settled(), "add", "crosstalks", None)
+        fitted._named(*known, "add", "crosstalks", None)
     with pytest.raises(
         InputError, match=r"--add dead_time: the sensor lists it already; .*--free dead_time\.PARAMETER"
     ):
-        fitted._named(sensor.settled(), "add", "dead_time", None)
+        fitted._named(*known, "add", "dead_time", None)
     with pytest.raises(InputError, match=r"--free crosstalk\.probability: .* --add crosstalk adds it"):
-        fitted._named(sensor.settled(), "set", "crosstalk", "probability")
+        fitted._named(*known, "set", "crosstalk", "probability")

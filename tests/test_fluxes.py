@@ -332,7 +332,7 @@ def test_places_that_cannot_be(lab: measurement.Measurement, tmp_path: Path) -> 
         fluxes.check_place(tmp_path / "file")
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "manifest.json").write_text("{}")
-    with pytest.raises(SpadError, match="lies in the dataset"):
+    with pytest.raises(SpadError, match="lies inside the dataset"):
         fluxes.check_place(tmp_path / "data" / "out")
 
 

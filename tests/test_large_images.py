@@ -265,9 +265,15 @@ def test_frames_that_depend_on_each_other_are_not_drawn_alone() -> None:
     assert "events in a pixel" in refused(built(lux="6400000 lux", shape=(1, 8), readouts="qis"))
 
 
-def test_causes_of_the_papers_bright_capture_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def bright_text() -> str:
+    """The config of the paper's dim capture in its bright light, its sensor written out in it."""
     text = (CONFIGS / "spad512.yaml").read_text().replace("115.62 nW/cm^2", "906.5 nW/cm^2")
-    text = text.replace("exposure: 10 ms", "exposure: 100 ms").replace(" 1 us ", " 10 us ")
+    lines = [line for line in text.splitlines() if not line.startswith("sensor:")]
+    return "\n".join([*lines, (CONFIGS / "spad512_sensor.yaml").read_text()])
+
+
+def test_causes_of_the_papers_bright_capture_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    text = bright_text().replace("exposure: 10 ms", "exposure: 100 ms").replace(" 1 us ", " 10 us ")
     (tmp_path / "bright.yaml").write_text(text)
     made = config.read(tmp_path / "bright.yaml")
     factory.check_volume(made, made.load_images())
@@ -367,8 +373,12 @@ def test_frames_drawn_without_events_follow_the_sensors_law(
 def test_frames_drawn_without_events_have_the_papers_bright_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     """9,740 of 10,000 frames of 10 us: 906.5 nW/cm^2 at 500 nm on 36 um^2, PDP 44.4 %; binomial counts."""
     directly(monkeypatch)
-    text = (CONFIGS / "spad512.yaml").read_text().replace("115.62 nW/cm^2", "906.5 nW/cm^2")
-    text = text.replace("exposure: 10 ms", "exposure: 100 ms").replace(" 1 us ", " 10 us ").replace(" 512 ", " 24 ")
+    text = (
+        bright_text()
+        .replace("exposure: 10 ms", "exposure: 100 ms")
+        .replace(" 1 us ", " 10 us ")
+        .replace(" 512 ", " 24 ")
+    )
     made = config.build(document.parse(text, "bright.yaml"), Path())
     assert made.sensor.layout.shape == (24, 24) and made.conditions.frames == 10_000
     found = made.simulate(made.levels[0], "train", made.load_images()["train"], 0, 1)

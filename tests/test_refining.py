@@ -34,7 +34,7 @@ def test_a_scan_tries_weaker_edges_beside_one_that_drowns_all_else(lab, monkeypa
     def looked_at(self: Search, state: Any, tries: Any, only: Any = ()) -> list[Tried]:
         return [Tried(one, values, Moved({}, {}, {"size": values[SERVICE]}), 1.0, 1.0) for one, values in tries]
 
-    monkeypatch.setattr(search, "changes", lambda sensor: [change])
+    monkeypatch.setattr(bench, "changes", lambda sensor: [change])
     monkeypatch.setattr(Search, "begun", lambda self, state, change: [first])
     monkeypatch.setattr(Search, "only_rates", lambda self, state: False)
     monkeypatch.setattr(Search, "_looked_at", looked_at)
@@ -193,7 +193,7 @@ def test_a_look_at_all_captures_is_one_at_those_that_were_left_out(lab, monkeypa
     bench = bench_of(lab())
     state, look = bench.state({}), quiet(bench)
     change = change_of(bench, "add crosstalk")
-    monkeypatch.setattr(search, "changes", lambda sensor: [change])
+    monkeypatch.setattr(bench, "changes", lambda sensor: [change])
     monkeypatch.setattr(Search, "begun", lambda self, state, change: [{CROSSTALK: 0.05}])
     flat, dark = ("flat", "neighbours"), ("dark", "neighbours")
     size = len(state.residuals[flat])

@@ -337,7 +337,7 @@ def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) 
         for name, gain in zip(names, (100.0, 50.0, 40.0, 30.0, 20.0, 99.0), strict=True)
     )
     monkeypatch.setattr(diagnose.checks, "failing", lambda *_: [])
-    found = diagnose._alternatives(bench, state, best, [best], others)
+    found = diagnose._alternatives(quiet(bench), state, best, [best], others)
     assert [(a["effect"], a["confused"]) for a in found] == [
         ("blinking_dark_counts", True),
         *((name, False) for name in names[1:4]),

@@ -28,7 +28,7 @@ class PrintTilt(Effect, stage="light"):
         "rad",
         "angle by which the scene is turned",
         symbol="a",
-        bounds=(-math.pi, math.pi),
+        bounds=(-1, 1),
         off=0.0,
         search=(-0.2, 0.2),
     )

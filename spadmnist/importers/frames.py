@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lzma
 import math
+import weakref
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -155,6 +156,7 @@ class Tif(Format):
         try:
             with heard("tifffile"):
                 file = tifffile.TiffFile(path)
+                weakref.finalize(file, file.filehandle.close)
                 first, count = file.pages[0], len(file.pages)
                 shape, dtype = tuple(map(int, first.shape)), first.dtype
                 of_imagej = file.imagej_metadata or {}

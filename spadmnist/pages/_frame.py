@@ -9,7 +9,7 @@ from typing import Any
 
 import jinja2
 
-from .. import dataset, disk, units
+from .. import disk, units
 from ..errors import SpadError
 from ..foreign import visible_lines
 from ..statistics import Statistic
@@ -66,9 +66,7 @@ def check_place(folder: Path, kind: str = "comparison") -> None:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise SpadError(f"{folder} is a file, but a report is a folder; choose another name with -o")
-    for above in (folder.resolve(), *folder.resolve().parents):
-        if (above / dataset.MANIFEST).is_file():
-            raise SpadError(f"{folder} lies in the dataset {above}, which holds nothing but its own; choose another -o")
+    disk.check_outside(folder)
     page = folder / FILES[kind]
     if page.is_symlink() or page.exists():
         try:
