@@ -24,7 +24,7 @@ from spadmnist.criticism import (
     setups,
 )
 from spadmnist.criticism import course as course_of
-from spadmnist.criticism import search as searching
+from spadmnist.criticism.fit import Bench
 from spadmnist.criticism.search import Search
 from spadmnist.errors import SpadError
 from spadmnist.sensor import Sensor
@@ -126,10 +126,9 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
     place, name, stays = STAGES[stage]
     broken.at(monkeypatch, place, name, stays)
     some = [c for c in candidates.changes(sensor) if c.effect in ("afterpulsing", "crosstalk", "dead_time")]
+    names = {change.effect for change in some}
     monkeypatch.setattr(
-        searching,
-        "changes",
-        lambda model: [c for c in candidates.changes(model) if c.effect in {x.effect for x in some}],
+        Bench, "changes", lambda self, model: [c for c in candidates.changes(model) if c.effect in names]
     )
     found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
     told = [e for e in found.untried if e["effect"] == "afterpulsing"]
@@ -170,7 +169,7 @@ def test_an_answer_is_given_whatever_is_raised_beside_the_steps(stage: str, lab,
     monkeypatch.setattr(place, name, fails)
     usual = candidates.changes
     some = ("afterpulsing", "crosstalk", "dead_time")
-    monkeypatch.setattr(searching, "changes", lambda model: [c for c in usual(model) if c.effect in some])
+    monkeypatch.setattr(Bench, "changes", lambda self, model: [c for c in usual(model) if c.effect in some])
     found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
     assert [step.change.effect for step in found.steps] == (["afterpulsing"] if found_it else [])
     assert found.verdict in (("explained", "confused", "partly_explained") if found_it else ("unexplained",))

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from .. import config, dataset, factory, fluxes, measurement, plugins, tiles, twin
 from ..effects import Conditions, Effect
@@ -25,12 +24,11 @@ from ..images import Images
 from ..light import photons_from_lux
 from ..measurement import Measurement
 from ..pages import Drawing, Story, Table
-from ..plugins import Distribution
 from ..recording import Capture, Light
 from ..scene import Scene
 from ..sensor import Sensor
 from ..tiles import Tiles
-from . import PaperExperiment, Plan, Setting, Task, _lenet, option
+from . import PaperExperiment, Plan, Setting, Task, _chip, _lenet, option
 from ._lenet import Labelled
 
 DATASET, CHART = "spad_mnist.yaml", "spad512_chart.yaml"
@@ -48,11 +46,6 @@ PAPER = {
     0.65: {BRIGHTEST: 91.8, ALL: 91.8},
 }
 SIMULATED, TOGETHER, REAL = "as simulated", "all together", "captured"  # names of rows
-# The chip of the imitation, beside the dark counts of its config. The paper gives no numbers for "pixel-wise PDP
-# variation" and "lazy pixels"; these make histograms like its own (scripts/paper_failure.py).
-SPREAD = 0.04  # standard deviation of the PDP, relative
-LAZY, LAZY_PDP = 0.02, (0.55, 0.14)  # share of lazy pixels; mean and standard deviation of the PDP left to them
-_RATE = "dark_counts.rate"
 _DARK_FRAMES = 1000  # of the capture in the dark: 10 ms, as the paper's
 _ALIKE = 1.15  # captures whose light differs by less than this factor are of one level; the paper's differ by 1.3
 _SHOWN = 8  # digits in the picture
@@ -241,15 +234,8 @@ class _Bench:
         real, clock = self.chart.sensor, self.chart.conditions
         pdp = real.nominal_pdp(clock.wavelength)
         hot = real.rates(np.zeros((1, real.layout.pixels)), clock)[0][0]
-        whole, lazy = Distribution("normal", (1.0, 0.0)), Distribution("normal", LAZY_PDP)
-        values: dict[str, dict[str, Any]] = {
-            "hot pixels": {_RATE: hot},
-            f"PDP spread, {100 * SPREAD:g} %": {"detection.pdp": Distribution("normal", (pdp, SPREAD * pdp))},
-            f"lazy pixels, {100 * LAZY:g} %": {
-                "detection.relative": Distribution("mixture", parts=((1 - LAZY, whole), (LAZY, lazy)))
-            },
-        }
-        plain = real.with_values({_RATE: float(np.median(hot))})
+        values: dict[str, dict[str, Any]] = {"hot pixels": {_chip.RATE: hot}, **_chip.imperfections(pdp)}
+        plain = real.with_values({_chip.RATE: float(np.median(hot))})
         out = {SIMULATED: plain} | {name: plain.with_values(one) for name, one in values.items()}
         every = plain.with_values({key: value for one in values.values() for key, value in one.items()})
         out["the whole chip"] = every
@@ -289,7 +275,7 @@ class _Bench:
         images = fluxes.of_measurement(lab, [METHOD]).images
         dark = [_rates(image) for image in images if image.capture.light.dark]
         if dark:
-            model = model.with_values({_RATE: np.mean(dark, axis=0)})
+            model = model.with_values({_chip.RATE: np.mean(dark, axis=0)})
         lit = [image for image in images if image.capture.light.scene is not None]
         if not lit:
             raise InputError(f"{lab.source}: has no QIS capture of a scene; write light: {{kind: image, file: ...}}")
@@ -349,19 +335,10 @@ def effective_light(image: Flux, sensor: Sensor, place: str) -> float:
     white = np.full((1, sensor.layout.pixels), _photons_of_a_lux(image.capture, sensor))
     every, lit = sensor.rates(white, c)  # 1/s; the light's part is in proportion to the light
 
-    def excess(lux: float) -> float:
-        return float(-np.expm1(-(every + (lux - 1) * lit) * c.frame_time).mean()) * c.frames - mean
+    def mean_at(lux: float) -> float:
+        return float(-np.expm1(-(every + (lux - 1) * lit) * c.frame_time).mean()) * c.frames
 
-    most = 1.0
-    while excess(most) < 0 and most < 1e9:
-        most *= 10
-    if excess(0.0) >= 0 or excess(most) < 0:
-        raise InputError(
-            f"{place}: its mean count is {mean:.4g}, the sensor has {excess(0.0) + mean:.4g} in the dark and "
-            f"{excess(most) + mean:.4g} in the brightest light, so its light cannot be told; correct the capture, or "
-            "add one in the dark"
-        )
-    return float(brentq(excess, 0.0, most, xtol=1e-9))
+    return _chip.light_of_mean(mean_at, mean, place)
 
 
 def _photons_of_a_lux(capture: Capture, sensor: Sensor) -> float:
