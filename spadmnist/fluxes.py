@@ -243,7 +243,7 @@ def check_place(folder: Path) -> None:
     """Raise SpadError with a sentence where no images may be put, so that it can be said before the work is done."""
     if folder.exists() and not folder.is_dir():
         raise SpadError(f"{folder} is a file, but images need a folder; choose another name with -o")
-    disk.check_outside(folder)
+    disk.check_outside(folder / SHEET)
 
 
 def write(found: Fluxes, folder: Path) -> Path:

@@ -322,7 +322,7 @@ def test_verdicts(lab):
 def test_the_same_seed_gives_the_same_answer(lab, monkeypatch):
     kinds = ("add afterpulsing", "add crosstalk")
     few = [c for c in candidates.changes(lab()[0].settled()) if c.name in kinds]
-    monkeypatch.setattr(search, "changes", lambda sensor: few)
+    monkeypatch.setattr(fit.Bench, "changes", lambda self, sensor: few)
     made = lab("    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n")
     one, same = (diagnose.diagnose(*made, quick=True, jobs=1, max_steps=1) for _ in range(2))
     assert [step.change.name for step in one.steps] == ["add afterpulsing"]

@@ -331,7 +331,7 @@ def test_places_that_cannot_be(lab: measurement.Measurement, tmp_path: Path) -> 
     with pytest.raises(SpadError, match="is a file, but images need a folder"):
         fluxes.check_place(tmp_path / "file")
     (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "manifest.json").write_text("{}")
+    (tmp_path / "data" / "manifest.json").write_text('{"format": "spadmnist-dataset/1"}')
     with pytest.raises(SpadError, match="lies inside the dataset"):
         fluxes.check_place(tmp_path / "data" / "out")
 

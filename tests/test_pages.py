@@ -522,7 +522,7 @@ def test_where_no_page_may_be_put(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SpadError, match="is a file, but a report is a folder"):
         pages.check_place(tmp_path / "file")
-    (tmp_path / "manifest.json").write_text("{}")
+    (tmp_path / "manifest.json").write_text('{"format": "spadmnist-dataset/1"}')
     with pytest.raises(SpadError, match="lies inside the dataset"):
         pages.comparison(adequate(), tmp_path / "report")
     assert not (tmp_path / "report").exists()

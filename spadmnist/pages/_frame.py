@@ -66,8 +66,8 @@ def check_place(folder: Path, kind: str = "comparison") -> None:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise SpadError(f"{folder} is a file, but a report is a folder; choose another name with -o")
-    disk.check_outside(folder)
     page = folder / FILES[kind]
+    disk.check_outside(page)
     if page.is_symlink() or page.exists():
         try:
             ours = _mark(kind).encode() in disk.read_file(page, 64 << 20)[:2000]
