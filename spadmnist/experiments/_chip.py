@@ -20,8 +20,10 @@ def imperfections(pdp: float) -> dict[str, dict[str, Distribution]]:
     """Values for `Sensor.with_values` by imperfection, of a sensor whose nominal PDP is `pdp`."""
     whole, lazy = Distribution("normal", (1.0, 0.0)), Distribution("normal", LAZY_PDP)
     return {
-        "PDP spread": {"detection.pdp": Distribution("normal", (pdp, SPREAD * pdp))},
-        "lazy pixels": {"detection.relative": Distribution("mixture", parts=((1 - LAZY, whole), (LAZY, lazy)))},
+        f"PDP spread, {100 * SPREAD:g} %": {"detection.pdp": Distribution("normal", (pdp, SPREAD * pdp))},
+        f"lazy pixels, {100 * LAZY:g} %": {
+            "detection.relative": Distribution("mixture", parts=((1 - LAZY, whole), (LAZY, lazy)))
+        },
     }
 
 
