@@ -804,6 +804,7 @@ def _rate_map(axes: Any, measurement: Measurement, one: Look) -> None:
     below, median, above = np.quantile(rates, [0.16, 0.5, 0.84])
     spread = max(float(above - below) / 2, 1 / one.numbers["live"])
     low, high = max(float(rates.min()), median - 4 * spread), min(float(rates.max()), median + 4 * spread)
+    high = max(high, low + spread)  # where all pixels are alike, as without any detection
     scale, unit = _scaled(float(high))
     name = pictures.words(_short(one.capture.id))
     axes.set_title(f"{name}: {one.numbers['light']}, {_recorded(one.numbers)}", loc="left")
@@ -892,7 +893,7 @@ def _course_plot(axes: Any, one: Look) -> None:
     axes.plot(time * factor, means, color="tab:blue", linewidth=0.9)
     what = "counts" if one.capture.modality == "counts" else "ones"
     axes.margins(y=0.2)
-    axes.set(xlabel=f"time, {unit}", ylabel=f"{what} of a frame")
+    axes.set(xlabel=f"time, {unit}", ylabel=f"{what} of a frame", ylim=(max(0.0, axes.get_ylim()[0]), None))
     axes.legend(frameon=False, fontsize=7, loc="upper right")
 
 
