@@ -850,6 +850,8 @@ def _rate_histogram(axes: Any, one: Look) -> None:
     more = f" ({beyond:,} beyond)" if beyond else ""
     axes.margins(y=0.3)  # room for the legend
     axes.set(xlabel=f"detections of a pixel, {unit}{more}", ylabel="pixels")
+    if low == 0:  # half of the bar of no detections lies below
+        axes.set_xlim(left=0)
     axes.legend(frameon=False, fontsize=7, loc="upper right")
 
 
