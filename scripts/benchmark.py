@@ -202,7 +202,7 @@ def reading(images_dir: Path | None, folder: Path) -> list[Row]:
 
 
 def learning(images_dir: Path | None, folder: Path, quick: bool) -> list[Row]:
-    """Training data for PyTorch on one core: read, simulated, and beside the network that learns from them."""
+    """Training data for PyTorch on one core: read, simulated, and the share that reading has of an epoch of LeNet."""
     try:
         import torch
     except ImportError:
