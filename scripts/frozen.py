@@ -2,7 +2,7 @@
 
     python scripts/frozen.py make small -o out      # the cases, from one seed; the open ones from ../shared/challenge
     python scripts/frozen.py ask out                # compare and diagnose; again: what is missing
-    python scripts/frozen.py changed out            # against scripts/frozen/small.json; status 1 if a gate is not passed
+    python scripts/frozen.py changed out            # against scripts/frozen/small.json; 1: a gate is not passed
     python scripts/frozen.py keep out               # these answers are the frozen ones from now on
 
 `small` (about 12 minutes on two cores): the open cases, 12 short ones of the challenge, 20 nulls by `compare`.
