@@ -256,15 +256,15 @@ def learning(images_dir: Path | None, folder: Path, quick: bool) -> list[Row]:
 REDUCE = """\
 import sys
 from spadmnist import config, measurement
-from spadmnist.criticism.recordings import statistics_for
+from spadmnist.inference.replicates import statistics_for
 data = measurement.open(sys.argv[2])
 recording = data.recording("flat", config.read_sensor(sys.argv[1]))
-for statistic in statistics_for("qis"):
+for statistic in statistics_for(recording.capture):
     statistic.reduce(recording)
 """
 
 
-def criticism(folder: Path, quick: bool) -> list[Row]:
+def inference(folder: Path, quick: bool) -> list[Row]:
     """Measurements: comparing one with a model, and reading a very large one."""
     rows: list[Row] = []
     cases = ROOT.parent / "shared" / "challenge"
@@ -439,7 +439,7 @@ def main() -> None:
         rows += reading(arguments.images_dir, folder)
         rows += effects(rounds)
         rows += learning(arguments.images_dir, folder, arguments.quick)
-        rows += criticism(folder, arguments.quick)
+        rows += inference(folder, arguments.quick)
         run([sys.executable, "-m", "spadmnist.cli", "--help"])
         starts = [run([sys.executable, "-m", "spadmnist.cli", "--help"])[0] for _ in range(rounds)]
         rows.append(("`spadmnist --help`", "< 0.1 s", f"{statistics.median(starts):.3f} s"))

@@ -25,9 +25,9 @@ from .foreign import quoted, short, visible, visible_lines
 from .workers import processors, safe_path
 
 if TYPE_CHECKING:
-    from .criticism.answer import Diagnosis
     from .experiments import PaperExperiment
     from .factory import Progress
+    from .inference.results import Diagnosis
     from .sensor import Sensor
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -759,8 +759,8 @@ def compare(
     """
     from . import measurement as measurements
     from . import units
-    from .criticism import compare as criticism
     from .errors import InputError
+    from .inference import comparison, next_step
 
     _load(plugin_files)
     smallest = None
@@ -782,16 +782,17 @@ def compare(
         done = [0.0]
 
         def told(what: str, share: float) -> None:
-            progress.advance(100 * share - done[0], what)
-            done[0] = 100 * share
+            progress.advance(max(100 * share - done[0], 0), what)  # what is periodic is simulated once more
+            done[0] = max(100 * share, done[0])
 
-        found = criticism.compare(model, data, seed, smallest, jobs or processors(), progress=told)
+        found = comparison.compare(model, data, seed, smallest, jobs or processors(), progress=told)
         progress.stop()
-    _write_answer(json_file, criticism.canonical(found))
+    _write_answer(json_file, comparison.canonical(found))
     if output is not None:
         page = pages.comparison(found, output)
         _say(f"Report: {page}")
-    _print_lines(criticism.table(found))
+    _print_lines(comparison.table(found))
+    _print_lines(f"\nNext: {next_step.after_comparison(found, quoted(sensor), quoted(measurement))}")
     if found.verdict != "adequate":
         sys.exit(1)
 
@@ -804,8 +805,15 @@ def compare(
     metavar="FOLDER",
     help="Folder for the report, an HTML page, and for the next sensor.yaml with its maps.",
 )
-@click.option("--max-steps", type=click.IntRange(1, 12), default=4, metavar="N", help="At most so many.  [default: 4]")
+@click.option(
+    "--max-steps", type=click.IntRange(1, 12), default=12, metavar="N", help="At most so many.  [default: 12]"
+)
 @click.option("--quick", is_flag=True, help="Fewer simulations: a first answer.")
+@click.option(
+    "--within",
+    metavar="TIME",
+    help="Budget of work, as time of two idle cores: 3 min; none, for no end.  [default: 10 min; with --quick 3 min]",
+)
 @_beside
 def diagnose(
     sensor: Path,
@@ -814,6 +822,7 @@ def diagnose(
     output: Path | None,
     max_steps: int,
     quick: bool,
+    within: str | None,
     seed: int,
     jobs: int | None,
     crop: str | None,
@@ -822,7 +831,7 @@ def diagnose(
     """Find out which effect the model SENSOR lacks beside MEASUREMENT, add it, and watch the error fall.
 
     Every registered effect is tried, those of --plugin files too, every listed number at another value, every
-    per-pixel parameter as a map.
+    per-pixel parameter as a map. After each step the answer so far is written, so that Ctrl-C leaves it.
 
     \b
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
@@ -830,9 +839,10 @@ def diagnose(
     """
     from . import measurement as measurements
     from . import sensor_file
-    from .criticism import answer
-    from .criticism import diagnose as criticism
+    from .inference import model_selection, next_step, results
+    from .inference.budget import seconds_of
 
+    seconds = seconds_of(within, quick)
     _load(plugin_files)
     model, data = _model(sensor, crop), measurements.open(measurement)
     if output is not None:
@@ -841,23 +851,34 @@ def diagnose(
         pages.check_place(output, "diagnosis")
         sensor_file.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
     _check_answer(json_file)
-    found = criticism.diagnose(model, data, seed, max_steps, quick, jobs or processors(), progress=_say)
+
+    def keep(so_far: Diagnosis) -> None:
+        """What is found so far, should the rest be interrupted."""
+        if output is not None:
+            _write_next(so_far, sensor, output / "sensor.yaml", model)
+            pages.diagnosis(so_far, output)
+        _write_answer(json_file, results.canonical(so_far))
+
+    found = model_selection.diagnose(
+        model, data, seed, max_steps, quick, jobs or processors(), progress=_say, within=seconds, keep=keep
+    )
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
             last.callback(lambda: _say(f"Report: {pages.diagnosis(found, output)}"))
-        last.callback(lambda: _print_lines(answer.table(found)))
-        last.callback(lambda: _write_answer(json_file, answer.canonical(found)))
+        what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement))
+        last.callback(lambda: _print_lines(f"{results.table(found)}\n\nNext: {what}"))
+        last.callback(lambda: _write_answer(json_file, results.canonical(found)))
     if found.unwritten:
         sys.exit(2)
 
 
-@cli.command(short_help="Settle parameters of a model.")
+@cli.command(short_help="Fit parameters of a model.")
 @click.option("--output", "-o", type=_Place(), metavar="NEXT.yaml", required=True, help="New file.")
-@click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and settle it.")
-@click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a parameter.")
-@click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Settle a map.")
+@click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and fit it.")
+@click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Fit a parameter.")
+@click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Fit a map.")
 @_beside
 def fit(
     sensor: Path,
@@ -872,7 +893,7 @@ def fit(
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
-    """Settle parameters of the model SENSOR against MEASUREMENT, with 95 % intervals.
+    """Fit parameters of the model SENSOR against MEASUREMENT, with 95 % intervals.
 
     \b
     spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml
@@ -880,17 +901,17 @@ def fit(
     """
     from . import measurement as measurements
     from . import sensor_file
-    from .criticism import answer
-    from .criticism import fitted as criticism
+    from .inference import named_fit, next_step, results
 
     _load(plugin_files)
     model, data = _model(sensor, crop), measurements.open(measurement)
     sensor_file.check_place(sensor, output)
     _check_answer(json_file)
-    found = criticism.fitted(model, data, added, freed, mapped, seed, jobs or processors(), progress=_say)
+    found = named_fit.fit_named(model, data, added, freed, mapped, seed, jobs or processors(), progress=_say)
     _write_next(found, sensor, output, model)
-    _write_answer(json_file, answer.canonical(found))
-    _print_lines(answer.table(found))
+    _write_answer(json_file, results.canonical(found))
+    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement))
+    _print_lines(f"{results.table(found)}\n\nNext: {what}")
     if found.unwritten:
         sys.exit(2)
 
@@ -898,11 +919,11 @@ def fit(
 def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:
     """Write the next sensor file. Where that fails the answer says why, and stays."""
     from . import sensor_file
-    from .criticism import answer
+    from .inference import results
 
     try:
         with _writing(out):
-            found.file = str(sensor_file.write(source, out, found.values, answer.notes(found), model.window))
+            found.file = str(sensor_file.write(source, out, found.values, results.notes(found), model.window))
     except Exception as error:  # whatever it is, hours of work are not lost for it
         if os.environ.get("SPADMNIST_DEBUG"):
             raise

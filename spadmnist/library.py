@@ -24,12 +24,11 @@ import numpy as np
 from . import measurement as measurements
 from . import pages, sensor_file, twin
 from .config import read_sensor
-from .criticism import answer, candidates, fitted
-from .criticism import compare as comparing
-from .criticism import diagnose as diagnosing
-from .criticism.answer import Value
 from .errors import InputError
 from .foreign import html_table
+from .inference import candidates, comparison, model_selection, named_fit, results
+from .inference.budget import seconds_of
+from .inference.results import Value
 from .measurement import Measurement
 from .plugins import check_values, discover, load_file
 from .recording import Capture
@@ -96,7 +95,7 @@ def compare(
         raise InputError(f"tolerance is {tolerance!r}; it is a share of more than 0 and less than 1, 0.005 for 0.5 %")
     model, data = _model(sensor, plugins), _data(measurement)
     said = None if progress is None else lambda what, share: progress(f"{what}: {share:.0%}")
-    found = comparing.compare(model, data, seed, tolerance, jobs or processors(), progress=said)
+    found = comparison.compare(model, data, seed, tolerance, jobs or processors(), progress=said)
     return Comparison(**vars(found))
 
 
@@ -106,7 +105,8 @@ def diagnose(
     seed: int = 0,
     *,
     quick: bool = False,
-    max_steps: int = 4,
+    max_steps: int = 12,
+    within: str | float | None = None,
     jobs: int | None = None,
     plugins: Sequence[PathLike] = (),
     progress: Progress | None = None,
@@ -116,6 +116,7 @@ def diagnose(
     Args:
         sensor, measurement, seed, jobs, plugins, progress: as of `compare`.
         quick: fewer simulations, a first answer. max_steps: at most so many steps, 1 to 12.
+        within: budget of work as time of two idle cores, "3 min" or s; "none": without end; None: 10 min, quick 3 min.
 
     Raises:
         InputError: where sensor and measurement do not belong together.
@@ -123,7 +124,8 @@ def diagnose(
     if isinstance(max_steps, bool) or max_steps not in range(1, 13):
         raise InputError(f"max_steps is {max_steps!r}; it is a whole number from 1 to 12")
     model, data = _model(sensor, plugins), _data(measurement)
-    found = diagnosing.diagnose(model, data, seed, max_steps, quick, jobs or processors(), progress)
+    seconds = seconds_of(within, quick)
+    found = model_selection.diagnose(model, data, seed, max_steps, quick, jobs or processors(), progress, seconds)
     return Diagnosis(found, model, _file(sensor))
 
 
@@ -154,14 +156,16 @@ def fit(
         if isinstance(given, str):
             raise InputError(f"{name} is {given!r}; it is a list of names: {name}=[{given!r}]")
     model, data = _model(sensor, plugins), _data(measurement)
-    found = fitted.fitted(model, data, tuple(add), tuple(free), tuple(per_pixel), seed, jobs or processors(), progress)
+    found = named_fit.fit_named(
+        model, data, tuple(add), tuple(free), tuple(per_pixel), seed, jobs or processors(), progress
+    )
     return Fit(found, model, _file(sensor))
 
 
 # ---- results ----------------------------------------------------------------------------------------------
 
 
-class Comparison(comparing.Comparison):
+class Comparison(comparison.Comparison):
     """The result of `compare`. verdict: `"adequate"` or `"fails"`; misfit: the mean squared standardised residual, 1
     for a right model; checks, failing: of every statistic and capture, the clearest first in `failing`.
     """
@@ -186,7 +190,7 @@ class Comparison(comparing.Comparison):
         return pages.comparison(self, Path(folder))
 
     def __repr__(self) -> str:
-        return comparing.table(self)
+        return comparison.table(self)
 
     def _repr_html_(self) -> str:
         fails = {False: "fails", True: ""}
@@ -201,7 +205,7 @@ class Comparison(comparing.Comparison):
 class _Found:
     """What `diagnose` and `fit` share: steps and the model that they make."""
 
-    def __init__(self, found: answer.Diagnosis, start: Sensor, source: Path | None):
+    def __init__(self, found: results.Diagnosis, start: Sensor, source: Path | None):
         self.found = found
         self.start = start
         self._source = source
@@ -212,7 +216,7 @@ class _Found:
         return self.found.verdict
 
     @property
-    def steps(self) -> list[answer.Step]:
+    def steps(self) -> list[results.Step]:
         """The accepted changes, in order: `change`, `values`, `misfit`, `significance`, `alternatives`."""
         return self.found.steps
 
@@ -238,7 +242,7 @@ class _Found:
     def to_frame(self) -> Any:
         """A pandas DataFrame, a row a fitted value. Raises InputError where pandas is not installed."""
         rows = [
-            {"change": s.change.kind, "effect": s.change.effect, "parameter": name, "value": v.value}
+            {"change": s.candidate.kind, "effect": s.candidate.effect, "parameter": name, "value": v.value}
             | {"low": v.low, "high": v.high, "unit": v.unit, "significance": s.significance}
             for s in self.steps
             for name, v in s.values.items()
@@ -257,7 +261,7 @@ class _Found:
         place = Path(folder)
         pages.check_place(place, "diagnosis")
         out, ours = place / "sensor.yaml", (place / pages.FILES["diagnosis"]).exists()
-        notes = answer.notes(self.found)
+        notes = results.notes(self.found)
         if self._source is not None:
             sensor_file.check_place(self._source, out, ours)
             made = sensor_file.write(self._source, out, self.found.values, notes, self.start.window)
@@ -269,15 +273,15 @@ class _Found:
         return place
 
     def __repr__(self) -> str:
-        return answer.table(self.found)
+        return results.table(self.found)
 
     def _repr_html_(self) -> str:
         rows = [
-            (answer.title(s.change), name, answer.shown(v), f"{s.significance:.1f}", f"{s.misfit:.4g}")
+            (results.title(s.candidate), name, results.shown(v), f"{s.significance:.1f}", f"{s.misfit:.4g}")
             for s in self.steps
             for name, v in (s.values.items() or [("", Value(1.0, None, None))])
         ]
-        title = f"{self.verdict.replace('_', ' ')}: {answer.sentence(self.found)}"
+        title = f"{self.verdict.replace('_', ' ')}: {results.sentence(self.found)}"
         return html_table(title, ("step", "parameter", "value (95 %)", "sigma", "misfit"), rows)
 
 
@@ -286,8 +290,8 @@ class Diagnosis(_Found):
 
     @property
     def finished(self) -> bool:
-        """Was everything tried?"""
-        return True
+        """False where the budget of work ended the search: the verdict is then that of the steps so far."""
+        return self.found.finished
 
     @property
     def not_tried(self) -> list[dict[str, Any]]:
@@ -335,8 +339,8 @@ class Fit(_Found):
         for step in self.steps:
             for name, value in step.values.items():
                 if value.low is not None and value.high is not None:
-                    key = f"{step.change.parameter}.{name}" if step.change.kind == "per_pixel" else name
-                    out[f"{step.change.effect}.{key}"] = (value.low, value.high)
+                    key = f"{step.candidate.parameter}.{name}" if step.candidate.kind == "per_pixel" else name
+                    out[f"{step.candidate.effect}.{key}"] = (value.low, value.high)
         return out
 
     @property

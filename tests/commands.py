@@ -24,7 +24,7 @@ _SECONDS = 120.0
 _SERVER = """
 import json, os, sys
 import h5py, joblib, numpy, scipy.special, scipy.stats, yaml, zarr
-import spadmnist.cli, spadmnist.criticism.diagnose, spadmnist.factory, spadmnist.verify
+import spadmnist.cli, spadmnist.inference.model_selection, spadmnist.factory, spadmnist.verify
 from spadmnist import kernels
 
 kernels.row_sums(numpy.zeros(1), numpy.zeros(2, numpy.int64))  # what compiled code needs at first

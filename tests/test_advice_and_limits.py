@@ -11,27 +11,35 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
-from spadmnist.criticism import advice, candidates, chance, compare, diagnose, fit, limits, search
-from spadmnist.criticism import course as course_of
-from spadmnist.criticism.answer import Step, canonical
-from spadmnist.criticism.candidates import Key
-from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.showing import captures_showing
-from spadmnist.criticism.tried import Tried
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.comparison import compare
+from spadmnist.inference.coordinates import Key
+from spadmnist.inference.elimination import drop_mimics, drop_needless, in_vain
+from spadmnist.inference.evaluation import Evaluation, evaluate, square
+from spadmnist.inference.experiment_design import _apart, between
+from spadmnist.inference.map_trials import unseen_maps
+from spadmnist.inference.model_path import begin
+from spadmnist.inference.model_selection import _alternatives, _Notes, _verdict, diagnose
+from spadmnist.inference.replicates import TOTALS, Replicates
+from spadmnist.inference.results import Step, canonical
+from spadmnist.inference.score_test import ScoreTest, p_of_best, score_test
+from spadmnist.inference.signature import Signature, captures_showing, residuals_at, signatures, template_of
+from spadmnist.inference.trial import Trial, tie
+from spadmnist.inference.upper_limits import upper_limits
 
 # --- which capture would tell ------------------------------------------------------------------------------------
 
 
-def advised(bench: Bench, found: str, values: dict[Key, Any]) -> tuple[dict[str, Any], float]:
+def advised(replicates: Replicates, found: str, values: dict[Key, Any]) -> tuple[dict[str, Any], float]:
     """(the advice on the sensor as it is against one with these values, the square of what tells them now)."""
-    state, look = bench.state({}), quiet(bench)
-    other = state.sensors.changed(values)
-    (moved,) = bench.moved(state, [other])
-    assert isinstance(moved, Moved)
-    residuals = bench.residuals(state, moved)
-    rival = Tried(change_of(bench, "add afterpulsing"), values, moved, 0.0, 1.0, other, residuals=residuals)
-    (told,) = advice.between(look, state, change_of(bench, found), rival)
-    return told, fit.square(residuals) - fit.square(state.residuals)
+    evaluation, look = evaluate(replicates, {}), quiet(replicates)
+    other = evaluation.sensors.changed(values)
+    (signature,) = signatures(replicates, evaluation, [other])
+    assert isinstance(signature, Signature)
+    residuals = residuals_at(replicates, evaluation, signature)
+    rival = Trial(change_of(replicates, "add afterpulsing"), values, signature, 0.0, 1.0, other, residuals=residuals)
+    (told,) = between(look, evaluation, change_of(replicates, found), rival)
+    return told, square(residuals) - square(evaluation.residuals)
 
 
 @pytest.mark.slow
@@ -51,11 +59,11 @@ def test_dead_times_are_told_by_a_brighter_flat_field(lab):
 
     They show in some statistics at once, so that all together tell more than their number.
     """
-    bench = bench_of(lab())
-    told, now = advised(bench, "set dead_time.duration", {DURATION: 60e-9})
+    replicates = bench_of(lab())
+    told, now = advised(replicates, "set dead_time.duration", {DURATION: 60e-9})
     assert told["capture"] == "a flat field 4 times as bright as flat"
     assert now > 0 and told["significance_now"] == pytest.approx(math.sqrt(now), rel=1e-4)
-    alive = bench.seen["flat"].total / (4 * 20e-3)
+    alive = replicates.seen["flat"].total / (4 * 20e-3)
     rate = 4 * alive / (1 - alive * 50e-9)
     missing = 4 * rate**2 / (1 + rate * 50e-9) * 20e-3 * 10e-9
     assert 0.9 * missing < told["significance_then"] ** 2 - now < 2.0 * missing
@@ -64,19 +72,19 @@ def test_dead_times_are_told_by_a_brighter_flat_field(lab):
 # --- what would have been seen -----------------------------------------------------------------------------------
 
 
-def limit_of(bench: Bench, name: str) -> tuple[float, list[float]]:
+def limit_of(replicates: Replicates, name: str) -> tuple[float, list[float]]:
     """(upper limit of an effect, standard deviations of each of its shapes' traces that the data have)."""
-    state, look = bench.state({}), quiet(bench)
-    change = change_of(bench, f"add {name}")
-    tried = look.looked_at(state, change, look.begun(state, change))
-    assert tried and all(isinstance(t, Tried) for t in tried)
-    swings = change_of(bench, "add flicker")
-    line = Tried(swings, look.begun(state, swings)[0], Moved({}, {}, {}), 0.0, 1.0)
-    found, hidden, others = limits.upper_limits(look, state, [*tried, line])
+    evaluation, look = evaluate(replicates, {}), quiet(replicates)
+    candidate = change_of(replicates, f"add {name}")
+    tried = look.looked_at(evaluation, candidate, look.begun(evaluation, candidate))
+    assert tried and all(isinstance(t, Trial) for t in tried)
+    swings = change_of(replicates, "add flicker")
+    line = Trial(swings, look.begun(evaluation, swings)[0], Signature({}, {}, {}), 0.0, 1.0)
+    found, hidden, others = upper_limits(look, evaluation, [*tried, line])
     assert others == [{"effect": "flicker"}]  # of what was not tried nothing is said
     assert [e["effect"] for e in [*found, *hidden]] == [name]
     limit = found[0]["upper_limit_95"] if found else math.inf
-    return limit, [chance.along(bench, state, t.moved).data for t in tried]
+    return limit, [score_test(replicates, evaluation, t.signature).data for t in tried]
 
 
 def test_what_would_have_been_seen_is_seen(lab):
@@ -84,16 +92,16 @@ def test_what_would_have_been_seen_is_seen(lab):
     usual, along = limit_of(bench_of(lab()), "crosstalk")
     assert 0 < usual < 0.05 and max(along) < 3  # of six shapes of a trace
     for seed in (1, 2):
-        bench = bench_of(lab(f"    crosstalk: {{probability: {2 * usual}}}\n", seed=seed))
-        limit, along = limit_of(bench, "crosstalk")
+        replicates = bench_of(lab(f"    crosstalk: {{probability: {2 * usual}}}\n", seed=seed))
+        limit, along = limit_of(replicates, "crosstalk")
         assert max(along) > 4 and limit > usual
 
 
 def test_the_limit_of_a_drift_is_what_a_ramp_of_so_many_detections_tells(lab):
     """A strong drift is told by its square, a weak one by its sign: to root(12 / n), and 1.6 times that is excluded."""
-    bench = bench_of(lab(light=800, side=4))
-    limit, _ = limit_of(bench, "source_drift")
-    error = math.sqrt(12 / bench.seen["flat"].total)
+    replicates = bench_of(lab(light=800, side=4))
+    limit, _ = limit_of(replicates, "source_drift")
+    error = math.sqrt(12 / replicates.seen["flat"].total)
     assert 1.2 * error < limit < 5 * error
 
 
@@ -101,23 +109,23 @@ def test_the_limit_of_a_drift_is_what_a_ramp_of_so_many_detections_tells(lab):
 
 
 def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
-    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
-    taken(course, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, settle=False)
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    course_of.drop_needless(course)
-    assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
-    assert [c.name for c in course.search.accepted] == ["add crosstalk"]
-    assert course.ladder[-1].model == "- afterpulsing"
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
+    taken(path, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    drop_needless(path)
+    assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
+    assert [c.name for c in path.scan.accepted] == ["add crosstalk"]
+    assert path.ladder[-1].model == "- afterpulsing"
 
 
 def test_a_step_that_is_needed_stays(lab):
-    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
-    taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    values, rungs = dict(course.values), len(course.ladder)
-    course_of.drop_needless(course)
-    assert names(course) == ["add afterpulsing", "add crosstalk"] and course.values == values
-    assert len(course.ladder) == rungs
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    values, rungs = dict(path.values), len(path.ladder)
+    drop_needless(path)
+    assert names(path) == ["add afterpulsing", "add crosstalk"] and path.values == values
+    assert len(path.ladder) == rungs
 
 
 STEADY = (
@@ -127,102 +135,102 @@ STEADY = (
 
 @pytest.mark.parametrize(("extra", "stays"), [("", False), pytest.param(STEADY, True, marks=pytest.mark.slow)])
 def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, stays: bool):
-    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n" + extra, side=4)))
-    change = change_of(course.bench, "per_pixel dark_counts.rate")
-    course.search.accepted.append(change)
-    course.steps.append(Step(change, {}, 0.0, 9.0, ""))
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    assert not course.failed
-    course_of.drop_needless(course)
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n" + extra, side=4)))
+    candidate = change_of(path.replicates, "per_pixel dark_counts.rate")
+    path.scan.accepted.append(candidate)
+    path.steps.append(Step(candidate, {}, 0.0, 9.0, ""))
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    assert not path.failed
+    drop_needless(path)
     wanted = ["per_pixel dark_counts.rate", "add crosstalk"]
-    assert names(course) == (wanted if stays else wanted[1:]) and not course.failed
-    assert [c.name for c in course.search.accepted] == names(course)
-    assert (course.ladder[-1].model == "- dark_counts.rate per pixel") is not stays
+    assert names(path) == (wanted if stays else wanted[1:]) and not path.failed
+    assert [c.name for c in path.scan.accepted] == names(path)
+    assert (path.ladder[-1].model == "- dark_counts.rate per pixel") is not stays
 
 
-def with_residuals(state: fit.State, sizes: dict[str, float]) -> fit.State:
-    """The state with residuals as large as that in the cells of these statistics of the flat field, 0 elsewhere."""
-    own = {cell: np.full(len(z), sizes.get(cell[1], 0.0)) for cell, z in state.residuals.items()}
-    return replace(state, residuals=own, exact=[])
+def with_residuals(evaluation: Evaluation, sizes: dict[str, float]) -> Evaluation:
+    """It with residuals as large as that in the cells of these statistics of the flat field, 0 elsewhere."""
+    own = {cell: np.full(len(z), sizes.get(cell[1], 0.0)) for cell, z in evaluation.residuals.items()}
+    return replace(evaluation, residuals=own, exact=[])
 
 
 def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     """A step's own cells must be in order; another one that explains its own stays, whatever remains elsewhere."""
-    course = course_of.begun(bench_of(lab()))
-    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 10.0})
-    end = with_residuals(course.state, {"intervals": 9.0})
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    taken(course, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
-    course.state, course.settled = end, None
-    for step, name in zip(course.steps, ("neighbours", "intervals"), strict=True):
+    path = begin(bench_of(lab()))
+    start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 10.0})
+    end = with_residuals(path.evaluation, {"intervals": 9.0})
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
+    path.evaluation, path.fit = end, None
+    for step, name in zip(path.steps, ("neighbours", "intervals"), strict=True):
         step.before = dict(start.residuals)
         step.template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
-    monkeypatch.setattr(course_of, "settle_all", lambda course, settled=None: None)
-    assert course.failed
-    course_of.drop_mimics(course, start, True)
-    assert names(course) == ["add crosstalk"] and set(course.values) == {CROSSTALK}
+    monkeypatch.setattr("spadmnist.inference.elimination.fit_all", lambda path, fit=None: None)
+    assert path.failed
+    drop_mimics(path, start, True)
+    assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
     # what is left is kept if it explains nearly all, whatever its own cells have
     foul = with_residuals(end, {"neighbours": 5.0})
-    course.state = foul
-    course_of.drop_mimics(course, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}), True)
-    assert names(course) == ["add crosstalk"]
+    path.evaluation = foul
+    drop_mimics(path, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}), True)
+    assert names(path) == ["add crosstalk"]
     # and nothing is left of steps that made all of it worse
-    course.state = with_residuals(end, {"intervals": 30.0})
-    course_of.drop_mimics(course, start, True)
-    assert not course.steps and not course.values and course.state is start
+    path.evaluation = with_residuals(end, {"intervals": 30.0})
+    drop_mimics(path, start, True)
+    assert not path.steps and not path.values and path.evaluation is start
 
 
 def test_two_steps_that_only_look_alike_are_the_last(lab):
     """One may be half of two effects; and a step that explains its own is no reason to stop."""
-    course = course_of.begun(bench_of(lab()))
-    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 10.0})
-    end = with_residuals(course.state, {"neighbours": 9.0, "intervals": 9.0})
-    for change, values in (("add crosstalk", {CROSSTALK: 0.03}), ("add afterpulsing", {PROBABILITY: 0.05})):
-        assert not course_of.in_vain(course, True)
-        taken(course, change, values, settle=False)
-        course.state = end
-        course.steps[-1].before = dict(start.residuals)
-        name = "neighbours" if change == "add crosstalk" else "intervals"
-        course.steps[-1].template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
-    assert course.failed and course_of.in_vain(course, True)
-    course.state = with_residuals(course.state, {"intervals": 9.0})
-    assert course.failed and not course_of.in_vain(course, True)
+    path = begin(bench_of(lab()))
+    start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 10.0})
+    end = with_residuals(path.evaluation, {"neighbours": 9.0, "intervals": 9.0})
+    for candidate, values in (("add crosstalk", {CROSSTALK: 0.03}), ("add afterpulsing", {PROBABILITY: 0.05})):
+        assert not in_vain(path, True)
+        taken(path, candidate, values, settle=False)
+        path.evaluation = end
+        path.steps[-1].before = dict(start.residuals)
+        name = "neighbours" if candidate == "add crosstalk" else "intervals"
+        path.steps[-1].template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
+    assert path.failed and in_vain(path, True)
+    path.evaluation = with_residuals(path.evaluation, {"intervals": 9.0})
+    assert path.failed and not in_vain(path, True)
 
 
 @pytest.mark.parametrize("totals", [True, False])
 def test_totals_that_the_set_up_explains_take_no_step_away(lab, totals):
     """Where nothing but totals fails; and what swings takes its phases with it when it goes."""
-    course = course_of.begun(bench_of(lab()))
-    start = with_residuals(course.state, {"neighbours": 10.0, "intervals": 20.0})
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    step = course.steps[0]
+    path = begin(bench_of(lab()))
+    start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 20.0})
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    step = path.steps[0]
     step.before = dict(start.residuals)
-    step.template = {c: np.full(len(z), 5.0 * (c == fit.RATES)) for c, z in start.residuals.items()}
+    step.template = {c: np.full(len(z), 5.0 * (c == TOTALS)) for c, z in start.residuals.items()}
     step.template["flat", "neighbours"][:] = 1.0
-    course.state = with_residuals(course.state, {"intervals": 15.0})
-    course.state.residuals[fit.RATES][:] = 20.0
-    course.search.phases = {("flat", ("flicker", "phase")): 1.0}
-    assert course.failed
-    course_of.drop_mimics(course, start, totals)
-    assert names(course) == ([] if totals else ["add crosstalk"])
-    assert course.search.phases == ({} if totals else {("flat", ("flicker", "phase")): 1.0})
+    path.evaluation = with_residuals(path.evaluation, {"intervals": 15.0})
+    path.evaluation.residuals[TOTALS][:] = 20.0
+    path.scan.phases = {("flat", ("flicker", "phase")): 1.0}
+    assert path.failed
+    drop_mimics(path, start, totals)
+    assert names(path) == ([] if totals else ["add crosstalk"])
+    assert path.scan.phases == ({} if totals else {("flat", ("flicker", "phase")): 1.0})
 
 
 def test_means_alone_have_limits_too(lab) -> None:
     """Nothing was simulated, so no capture shows a trace."""
-    bench = bench_of(lab())
-    state = replace(bench.state({}), made={})
-    assert captures_showing(bench.template(state, Moved({}, {}, {})), 0.1) == []
+    replicates = bench_of(lab())
+    evaluation = replace(evaluate(replicates, {}), made={})
+    assert captures_showing(template_of(replicates, evaluation, Signature({}, {}, {})), 0.1) == []
 
 
 def test_a_light_that_is_not_stated_is_the_one_that_fits(lab) -> None:
     """A longer capture of it has as many detections in a second, not those of the dark."""
-    bench = bench_of(lab())
-    state = bench.state({})
-    flat = bench.seen["flat"].capture
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    flat = replicates.seen["flat"].capture
     free = replace(flat, light=replace(flat.light, level=None))
-    other = state.sensors.changed({CROSSTALK: 0.3})
-    stated, found = (advice._apart(bench, state, other, one, "flat") for one in (flat, free))
+    other = evaluation.sensors.changed({CROSSTALK: 0.3})
+    stated, found = (_apart(replicates, evaluation, other, one, "flat") for one in (flat, free))
     assert found == pytest.approx(stated, rel=0.3) and found > 1
 
 
@@ -230,32 +238,34 @@ def test_a_light_that_is_not_stated_is_the_one_that_fits(lab) -> None:
 
 
 def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab):
-    bench = bench_of(lab())
-    state = bench.state({})
-    clean, foul = with_residuals(state, {}).residuals, with_residuals(state, {"intervals": 10.0}).residuals
-    kinds = [change_of(bench, f"add {name}") for name in ("afterpulsing", "slow_afterpulsing", "crosstalk")]
-    best, near, third = (Tried(c, {}, Moved({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    clean, foul = with_residuals(evaluation, {}).residuals, with_residuals(evaluation, {"intervals": 10.0}).residuals
+    kinds = [change_of(replicates, f"add {name}") for name in ("afterpulsing", "slow_afterpulsing", "crosstalk")]
+    best, near, third = (Trial(c, {}, Signature({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
 
     def told(**other: Any) -> list[tuple[str, bool]]:
-        found = diagnose._alternatives(quiet(bench), state, best, [], [best, replace(near, **other)])
+        found = _alternatives(quiet(replicates), evaluation, best, [], [best, replace(near, **other)])
         return [(a["effect"], a["confused"]) for a in found]
 
     assert told(gain=93.0) == [("slow_afterpulsing", True)]
     assert told(gain=88.0) == [("slow_afterpulsing", False)]
     assert told(residuals=foul) == [("slow_afterpulsing", False)]
     assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
-    many = diagnose._alternatives(quiet(bench), state, best, [], [best, near, near, third])
+    many = _alternatives(quiet(replicates), evaluation, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
     # where chance makes pixels odd, by that model's own scatter
-    own = with_residuals(state, {})
-    assert told(residuals=foul, chips=True, state=own) == [("slow_afterpulsing", True)]
-    assert told(chips=True, state=with_residuals(state, {"intervals": 10.0})) == [("slow_afterpulsing", False)]
+    own = with_residuals(evaluation, {})
+    assert told(residuals=foul, chips=True, evaluation=own) == [("slow_afterpulsing", True)]
+    assert told(chips=True, evaluation=with_residuals(evaluation, {"intervals": 10.0})) == [
+        ("slow_afterpulsing", False)
+    ]
     # whose squares fall as much, though the law of its scatter gains little
-    odd = with_residuals(state, {"intervals": 0.0}).residuals
-    fell = fit.square(state.residuals) - fit.square(odd)
+    odd = with_residuals(evaluation, {"intervals": 0.0}).residuals
+    fell = square(evaluation.residuals) - square(odd)
     for most, alike in ((fell, True), (fell + 100.0, False)):
         best.gain = most
-        assert told(residuals=odd, gain=-50.0, chips=True, state=own) == [("slow_afterpulsing", alike)], fell
+        assert told(residuals=odd, gain=-50.0, chips=True, evaluation=own) == [("slow_afterpulsing", alike)], fell
     best.gain = 100.0
     # at the end of where it is looked for no law is quite right: what nearly does as well may be
     for lifetime, alike in ((499e-9, False), (500e-9, True), (5e-9, True)):
@@ -263,8 +273,10 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
         assert told(gain=82.0) == [("slow_afterpulsing", alike)]
         assert told(gain=78.0) == told(gain=99.0, residuals=foul) == [("slow_afterpulsing", False)]
     # another value and a map of it are two things
-    two = [replace(near, change=change_of(bench, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")]
-    assert [a["change"] for a in diagnose._alternatives(quiet(bench), state, best, [], [best, *two])] == [
+    two = [
+        replace(near, candidate=change_of(replicates, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")
+    ]
+    assert [a["change"] for a in _alternatives(quiet(replicates), evaluation, best, [], [best, *two])] == [
         "set",
         "per_pixel",
     ]
@@ -292,76 +304,76 @@ def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, t
     """Both blur the edge of the intervals; what tells them apart is how many short ones each pixel has, where these are
     many. Of pixels so few and dim their counts say nothing.
     """
-    course = course_of.begun(bench_of(lab(f"    {truth}\n", light=900, side=8)))
-    seen = {cell: z for cell, z in course.state.residuals.items() if cell[1] != unseen}
-    assert (len(seen) < len(course.state.residuals)) == bool(unseen)
-    course.state = replace(course.state, residuals=seen)
-    one = given(course, name, values, settle=True)
-    found = course.search.scattered(course.state, {}, one)
-    assert [t.change.effect for t in found if t.change.name == "per_pixel dead_time.duration"] == alike
-    assert one.gain > 100 and all(t.gain > one.gain - search.alike(one.gain) and t.residuals for t in found)
+    path = begin(bench_of(lab(f"    {truth}\n", light=900, side=8)))
+    seen = {cell: z for cell, z in path.evaluation.residuals.items() if cell[1] != unseen}
+    assert (len(seen) < len(path.evaluation.residuals)) == bool(unseen)
+    path.evaluation = replace(path.evaluation, residuals=seen)
+    one = given(path, name, values, settle=True)
+    found = unseen_maps(path.scan, path.evaluation, {}, one)
+    assert [t.candidate.effect for t in found if t.candidate.name == "per_pixel dead_time.duration"] == alike
+    assert one.gain > 100 and all(t.gain > one.gain - tie(one.gain) and t.residuals for t in found)
 
 
 def test_verdicts(lab):
-    course = course_of.begun(bench_of(lab()))
+    path = begin(bench_of(lab()))
     step, some = object(), [object()]
 
-    def verdict(left: Any, setup: bool = False, rival: Tried | None = None) -> str:
-        return diagnose._verdict(course, left, diagnose._Beside([{}] * setup, setup, rival=rival))
+    def verdict(left: Any, setup: bool = False, rival: Trial | None = None) -> str:
+        return _verdict(path, left, _Notes([{}] * setup, setup, rival=rival))
 
     assert verdict([]) == "adequate"
     assert verdict([], setup=True) == "setup"
     assert verdict(some) == "unexplained"
-    course.steps.append(step)  # type: ignore[arg-type]
+    path.steps.append(step)  # type: ignore[arg-type]
     assert verdict([]) == "explained"
     assert verdict(some) == "partly_explained"
-    assert verdict([], setup=True, rival=given(course, "add crosstalk", {}, False)) == "confused"
+    assert verdict([], setup=True, rival=given(path, "add crosstalk", {}, False)) == "confused"
 
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer(lab, monkeypatch):
     kinds = ("add afterpulsing", "add crosstalk")
-    few = [c for c in candidates.changes(lab()[0].settled()) if c.name in kinds]
-    monkeypatch.setattr(fit.Bench, "changes", lambda self, sensor: few)
+    few = [c for c in candidates(lab()[0].settled()) if c.name in kinds]
+    monkeypatch.setattr(Replicates, "candidates", lambda self, sensor: few)
     made = lab("    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n")
-    one, same = (diagnose.diagnose(*made, quick=True, jobs=1, max_steps=1) for _ in range(2))
-    assert [step.change.name for step in one.steps] == ["add afterpulsing"]
+    one, same = (diagnose(*made, quick=True, jobs=1, max_steps=1) for _ in range(2))
+    assert [step.candidate.name for step in one.steps] == ["add afterpulsing"]
     assert canonical(one) == canonical(same)
 
 
 def test_no_chance_is_none_at_all(lab):
     """However wrong a model is: p-values have logarithms, and JSON has no infinite numbers."""
     sensor, data = lab("    afterpulsing: {probability: 40 %, lifetime: 50 ns}\n")
-    checks = json.loads(json.dumps(compare.compare(sensor, data, jobs=1, replicates=16).as_data(), allow_nan=False))
+    checks = json.loads(json.dumps(compare(sensor, data, jobs=1, replicates=16).as_data(), allow_nan=False))
     p = [check["p_value"] for check in checks["checks"]]
     assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
-    course = course_of.begun(bench_of((sensor, data)))
-    one = given(course, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
-    significance, p = chance.of_best(course.bench, course.state, [one], replace(one, gain=1e18))
+    path = begin(bench_of((sensor, data)))
+    one = given(path, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
+    significance, p = p_of_best(path.replicates, path.evaluation, [one], replace(one, gain=1e18))
     assert 0 < p < 1e-100 and math.isfinite(significance)
 
 
 def test_of_what_is_faint_the_trace_decides_and_not_the_squares(lab):
     """Chance moves the squares of all cells by more than a faint effect does."""
-    course = course_of.begun(bench_of(lab()))
-    one = given(course, "add afterpulsing", {PROBABILITY: 0.02, LIFETIME: 50e-9}, False)
+    path = begin(bench_of(lab()))
+    one = given(path, "add afterpulsing", {PROBABILITY: 0.02, LIFETIME: 50e-9}, False)
     much, none = (replace(one, gain=gain) for gain in (400.0, 0.0))
-    assert chance.of_best(course.bench, course.state, [one], much)[1] < 1e-8  # as where something is plainly wrong
-    of_trace = chance.of_best(course.bench, course.state, [one], none, False)
-    assert chance.of_best(course.bench, course.state, [one], much, False) == of_trace and of_trace[1] > 1e-6
+    assert p_of_best(path.replicates, path.evaluation, [one], much)[1] < 1e-8  # as where something is plainly wrong
+    of_trace = p_of_best(path.replicates, path.evaluation, [one], none, False)
+    assert p_of_best(path.replicates, path.evaluation, [one], much, False) == of_trace and of_trace[1] > 1e-6
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_several_strengths_the_clearest_tells_the_limit(lab, monkeypatch, order: int) -> None:
     """One that is so weak that it does nothing says nothing of what can be seen."""
-    bench = bench_of(lab())
-    state, change = bench.state({}), change_of(bench, "add slow_recovery")
-    key, loud, silent = change.strengths[0].key, Moved({}, {}, {"flat": 1.0}), Moved({}, {}, {}, True)
-    tried = [Tried(change, {key: 5e-9}, loud, 0.0, 1.0), Tried(change, {key: 5e-10}, silent, 0.0, 1.0)]
+    replicates = bench_of(lab())
+    evaluation, candidate = evaluate(replicates, {}), change_of(replicates, "add slow_recovery")
+    key, loud, silent = candidate.strengths[0].key, Signature({}, {}, {"flat": 1.0}), Signature({}, {}, {}, True)
+    tried = [Trial(candidate, {key: 5e-9}, loud, 0.0, 1.0), Trial(candidate, {key: 5e-10}, silent, 0.0, 1.0)]
 
-    def along(bench: Bench, state: fit.State, moved: Moved) -> chance.Likeness:
-        return chance.Likeness(20.0 if moved is loud else 0.0, 0.0, np.zeros(16), 1.0, 15.0)
+    def scored(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> ScoreTest:
+        return ScoreTest(20.0 if signature is loud else 0.0, 0.0, np.zeros(16), 1.0, 15.0)
 
-    monkeypatch.setattr(limits, "along", along)
-    (excluded,), hidden, _ = limits.upper_limits(quiet(bench), state, tried[::order])
+    monkeypatch.setattr("spadmnist.inference.upper_limits.score_test", scored)
+    (excluded,), hidden, _ = upper_limits(quiet(replicates), evaluation, tried[::order])
     assert not hidden and excluded["upper_limit_95"] == pytest.approx(1.645 / 20 * 5e-9, rel=1e-6)

@@ -15,11 +15,15 @@ from joblib import Parallel
 from scipy import stats
 
 from spadmnist import config, measurement, twin
-from spadmnist.criticism import checks, fit, memory, nulls, recordings
-from spadmnist.criticism import compare as criticism
 from spadmnist.effects import Conditions, Effect
 from spadmnist.errors import InputError
 from spadmnist.events import Events, Layout
+from spadmnist.inference.comparison import Comparison, canonical, compare, table
+from spadmnist.inference.evaluation import Evaluation, evaluate, misfits
+from spadmnist.inference.light_levels import CaptureNull, _score
+from spadmnist.inference.null_distribution import learn
+from spadmnist.inference.replicate_cache import recall
+from spadmnist.inference.replicates import ReducedCapture, Replicates
 from spadmnist.measurement import Measurement
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -84,8 +88,8 @@ def measured(made_by: Sensor, modality: str, number: int, light: float = 1.0) ->
     return Measurement(f"{modality} {number}", made_by.layout, tuple(all_captures), "in memory", read)
 
 
-def compared(model: Sensor, data: Measurement, **more: Any) -> criticism.Comparison:
-    return criticism.compare(model, data, jobs=1, **{"replicates": 48, **more})
+def compared(model: Sensor, data: Measurement, **more: Any) -> Comparison:
+    return compare(model, data, jobs=1, **{"replicates": 48, **more})
 
 
 # --- a right model is left alone ---
@@ -152,9 +156,9 @@ def test_a_wrong_model_fails_at_the_right_place(
     names = [c.statistic for c in found.failing]
     assert where & set(names[:6]), names[:10]
     assert all(c.where and c.size and not c.passes and c.material for c in found.failing)
-    data = json.loads(criticism.canonical(found))
+    data = json.loads(canonical(found))
     assert data["format"] == "spadmnist-comparison/1" and data["verdict"] == "fails"
-    assert "fails" in criticism.table(found) and max(map(len, criticism.table(found).splitlines())) <= 100
+    assert "fails" in table(found) and max(map(len, table(found).splitlines())) <= 100
 
 
 @pytest.mark.slow
@@ -165,10 +169,10 @@ def test_the_misfit_is_that_of_a_diagnosis() -> None:
     """
     data = measured(sensor(flicker={"amplitude": 0.2, "frequency": 20.0}), "str", 8)
     found = compared(sensor(), data)
-    bench = fit.Bench(sensor(), data, 0, Parallel(n_jobs=1), 48)
-    state = bench.state({})
+    replicates = Replicates(sensor(), data, 0, Parallel(n_jobs=1), 48)
+    state = evaluate(replicates, {})
     of_checks = {(c.capture, c.statistic): c.misfit for c in found.checks}
-    said = checks.misfits(state.own, state.residuals)
+    said = misfits(state.replicate_residuals, state.residuals)
     fanos = {cell for cell in said if cell[1].endswith("fano")}
     assert fanos <= of_checks.keys() and max(said[cell] for cell in fanos) > 3
     for cell in fanos:
@@ -201,34 +205,34 @@ def test_the_same_seed_gives_the_same_answer_from_memory_and_anew(
 ) -> None:
     data = measured(sensor(), "str", 7)
     monkeypatch.setenv("SPADMNIST_CACHE", str(tmp_path))
-    first = criticism.canonical(compared(sensor(), data))
+    first = canonical(compared(sensor(), data))
     stored = list(tmp_path.rglob("*.npz"))
     assert len(stored) == 3
-    assert criticism.canonical(compared(sensor(), data)) == first
+    assert canonical(compared(sensor(), data)) == first
     for path in stored:
         path.write_bytes(path.read_bytes()[:1000])  # damaged: learnt again
-    assert criticism.canonical(compared(sensor(), data)) == first
-    assert memory.recall("no such entry") is None
-    other = criticism.canonical(compared(sensor(dark_counts={"rate": 201.0}), data))
+    assert canonical(compared(sensor(), data)) == first
+    assert recall("no such entry") is None
+    other = canonical(compared(sensor(dark_counts={"rate": 201.0}), data))
     assert other != first  # another model has other nulls
 
 
 def test_a_lamp_that_was_off_is_no_light_level() -> None:
     """As few detections as the dark has say nothing of the light, and everything of the set-up."""
     dark, per = 20.0, 4e-3
-    made = recordings.CaptureNull(
-        1e6, 1e6, np.full(48, 4020.0), lambda level: dark + per * level, (0.0, 1.0), 0.016, {}
-    )
+    made = CaptureNull(1e6, 1e6, np.full(48, 4020.0), lambda level: dark + per * level, (0.0, 1.0), 0.016)
     assert [made.drowned(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
     assert made.score(18.0) < -40 and made.score(18.0, 0.05) < -15
     assert abs(made.score(18.0, mean=18.0)) < 0.2 and made.score(30.0, mean=18.0) == pytest.approx(2.5, abs=0.4)
     # and a recording of the model's own, made where there are as few, is none that stands out
-    bench = object.__new__(fit.Bench)
-    bench.seen = {
-        "flat": fit.Seen(Capture("flat", "tr", Light(500e-9), Conditions(1.0, 1, 1.0, 1.0, 5e-7)), 18.0, None, {})
+    replicates = object.__new__(Replicates)
+    replicates.seen = {
+        "flat": ReducedCapture(Capture("flat", "tr", Light(500e-9), Conditions(1.0, 1, 1.0, 1.0, 5e-7)), 18.0, None, {})
     }
-    state = fit.State({}, None, {}, {}, {"flat": made}, {}, {}, {}, [])  # type: ignore[arg-type]
-    own, data = (bench._score(state, "flat", 18.0, expected) for expected in (19.0, made.total_at(made.stated or 1.0)))
+    state = Evaluation({}, None, {}, {}, {"flat": made}, {}, {}, {}, {})  # type: ignore[arg-type]
+    own, data = (
+        _score(replicates, state, "flat", 18.0, expected) for expected in (19.0, made.total_at(made.stated or 1.0))
+    )
     assert own is not None and abs(own) < 1 and data == made.score(18.0)
     # Poisson's own where the dark is most of it: 25 expected, 17 found
     dim = replace(made, level=1250.0, stated=1250.0, totals=np.full(48, 25.0), scatter=0.2)
@@ -343,7 +347,7 @@ def test_p_values_of_a_right_model_are_uniform_or_larger(
         level = np.exp(0.03 * np.linspace(-1, 1, 96))
         values = np.stack([draw(rng, mean * s, mean.shape) for s in level])
         totals = rng.poisson(1e6 * level).astype(float)
-        null = nulls.learn(summaries_of(law, values, np.sqrt(mean) if scaled else None), totals)
+        null = learn(summaries_of(law, values, np.sqrt(mean) if scaled else None), totals)
         s = math.exp(0.02 * rng.standard_normal())
         ps.append(null.judge(draw(rng, mean * s, mean.shape), rng.poisson(1e6 * s)).p_value)
     for bound in (0.5, 0.1, 0.01):
@@ -359,7 +363,7 @@ def test_p_values_of_a_right_model_are_uniform_or_larger(
 
 def test_what_must_be_exact_is() -> None:
     same = summaries_of("exact", np.tile([0.0, 3.0], (20, 1)))
-    null = nulls.learn(same, np.full(20, 100.0))
+    null = learn(same, np.full(20, 100.0))
     assert null.judge(np.array([0.0, 3.0]), 100).p_value == 1
     assert null.judge(np.array([0.0, 4.0]), 100).p_value < 1e-9
 
@@ -367,9 +371,9 @@ def test_what_must_be_exact_is() -> None:
 # --- the challenge and real data ---
 
 
-def case(name: str) -> criticism.Comparison:
+def case(name: str) -> Comparison:
     folder = CHALLENGE / name
-    return criticism.compare(config.read_sensor(folder / "sensor.yaml"), measurement.open(folder), jobs=2)
+    return compare(config.read_sensor(folder / "sensor.yaml"), measurement.open(folder), jobs=2)
 
 
 @challenge
@@ -408,9 +412,7 @@ def test_hidden_effects_are_seen_where_they_are(name: str) -> None:
 @challenge
 def test_one_case_of_the_challenge_in_short() -> None:
     folder = CHALLENGE / "open-qis-gate"
-    found = criticism.compare(
-        config.read_sensor(folder / "sensor.yaml"), measurement.open(folder), jobs=2, replicates=32
-    )
+    found = compare(config.read_sensor(folder / "sensor.yaml"), measurement.open(folder), jobs=2, replicates=32)
     assert {(c.statistic, c.capture) for c in found.failing} >= PLACES["open-qis-gate"]
     (light,) = [c for c in found.checks if c.statistic == "light"]
     assert "-15" in light.size
@@ -426,7 +428,7 @@ def test_a_real_detector_is_no_plain_poisson_process_but_nearly_one(tmp_path: Pa
     cli.main(["import", str(file), "-o", str(tmp_path / "lab"), "--light", "500 nm free"], standalone_mode=False)
     effects = [Effect.registry.find("detection")(pdp=0.5), Effect.registry.find("tdc")(resolution=1e-12)]
     plain = Sensor(Layout(1, 1, 1e-10, 1.0), effects, "device", name="plain Poisson")
-    found = criticism.compare(plain, measurement.open(tmp_path / "lab"), jobs=2, replicates=32)
+    found = compare(plain, measurement.open(tmp_path / "lab"), jobs=2, replicates=32)
     assert found.verdict == "fails" and found.failing[0].statistic in ("intervals", "autocorrelation", "edge_intervals")
     (check,) = [c for c in found.checks if c.statistic == "intervals"]
     assert not check.passes and check.summary is not None and check.judgement is not None

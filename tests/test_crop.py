@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 
 from spadmnist import config, measurement, plugins, sensor_file, twin
-from spadmnist.criticism import candidates, likelihood, memory, recordings
 from spadmnist.effects import Chip, Conditions, Effect, parameter
 from spadmnist.errors import EffectError, InputError
 from spadmnist.events import Events, Layout
+from spadmnist.inference import candidates
+from spadmnist.inference.candidates import on_chip, with_values
+from spadmnist.inference.coordinates import Key
+from spadmnist.inference.point_process import blur_of
+from spadmnist.inference.replicate_cache import entry_name
+from spadmnist.inference.replicates import InTheDark
 from spadmnist.plugins import Distribution
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
@@ -145,7 +150,7 @@ def test_a_part_of_a_part_counts_from_its_corner() -> None:
 
 def test_another_chip_of_its_kind_draws_for_the_whole_array() -> None:
     whole = chip_with(strongly("blinking_dark_counts"))
-    part, other = candidates.on_chip(whole.cropped(*FEW), 9), candidates.on_chip(whole, 9)
+    part, other = on_chip(whole.cropped(*FEW), 9), on_chip(whole, 9)
     assert np.array_equal(part.expected(lit(part), CLOCK)[0], inside(other.expected(lit(other), CLOCK)[0], other, *FEW))
     assert not np.array_equal(part.expected(lit(part), CLOCK), whole.cropped(*FEW).expected(lit(part), CLOCK))
 
@@ -395,7 +400,7 @@ def test_how_much_stamps_scatter_is_asked_of_the_whole_chip() -> None:
             return events.moved(events.times + np.repeat(self._delay, events.counts))
 
     whole = Sensor(GRID, [of("dark_counts"), Late()], "device").settled()
-    assert likelihood.blur_of(whole.cropped(*FEW)) == likelihood.blur_of(whole)
+    assert blur_of(whole.cropped(*FEW)) == blur_of(whole)
 
 
 def test_how_far_an_effect_says_to_reach_must_be_a_distance() -> None:
@@ -419,7 +424,7 @@ def test_how_far_an_effect_says_to_reach_must_be_a_distance() -> None:
 def test_a_map_of_the_window_leaves_the_rest_of_the_chip_as_it_is() -> None:
     whole = chip_with(of("row_pattern", gain=Distribution("normal", (1.0, 0.1))))
     part, found = whole.cropped(*FEW), np.linspace(1e2, 1e4, 20)
-    new = candidates.with_values(part, {("dark_counts", "rate"): found, ("row_pattern", "gain"): np.full(5, 2.0)})
+    new = with_values(part, {("dark_counts", "rate"): found, ("row_pattern", "gain"): np.full(5, 2.0)})
     assert new.chip is not None and new.window == part.window
     rate = whole.effect("dark_counts").rate.reshape(12, 10).copy()
     rate[FEW] = found.reshape(5, 4)
@@ -437,7 +442,7 @@ def test_a_map_of_the_window_leaves_the_rest_of_the_chip_as_it_is() -> None:
 def test_where_the_chip_has_nothing_else_the_median_of_the_window_stands() -> None:
     part = Sensor(GRID, [of("detection")], "device").settled().cropped(*FEW)
     found = np.append(np.full(19, 300.0), 1e5)
-    new = candidates.with_values(part, {("dark_counts", "rate"): found, ("detection", "pdp"): np.full(20, 0.3)})
+    new = with_values(part, {("dark_counts", "rate"): found, ("detection", "pdp"): np.full(20, 0.3)})
     assert new.chip is not None
     rate, pdp = new.chip.effect("dark_counts").rate, new.chip.effect("detection").pdp
     assert rate.sum() == found.sum() + 100 * 300.0
@@ -445,7 +450,7 @@ def test_where_the_chip_has_nothing_else_the_median_of_the_window_stands() -> No
 
 
 def test_numbers_are_set_on_the_whole_chip() -> None:
-    new = candidates.with_values(chip_with().cropped(*FEW), {("dark_counts", "rate"): 70.0})
+    new = with_values(chip_with().cropped(*FEW), {("dark_counts", "rate"): 70.0})
     assert new.chip is not None and new.chip.effect("dark_counts").rate == 70.0
 
 
@@ -454,7 +459,7 @@ def test_rates_in_the_dark_are_scaled_in_the_pixels_around_too() -> None:
     rate = np.full(120, 1e3)
     rate[35] = 1e6  # row 3, column 5
     effects = [of("dark_counts", rate=rate), of("crosstalk", probability=0.05)]
-    part = recordings.InTheDark.of(Sensor(GRID, effects, "device").settled().cropped(*FEW))
+    part = InTheDark.of(Sensor(GRID, effects, "device").settled().cropped(*FEW))
     now = Conditions(1e-3, 100, 1e-5, 1e-5, None)
     assert np.array_equal(part.rates(lit(part, 1, 3.0), now)[0], np.full((1, 20), 3e3))
     few, many = (part.expose(lit(part, 300, factor), now, streams(300), ("tr",)).counts for factor in (1.0, 3.0))
@@ -467,7 +472,7 @@ def test_rates_in_the_dark_are_scaled_in_the_pixels_around_too() -> None:
 def test_what_is_kept_of_simulations_belongs_to_one_window_of_one_chip() -> None:
     capture = Capture("dark", "tr", Light(), CLOCK)
     whole = chip_with()
-    moved = candidates.with_values(whole, {("dark_counts", "rate"): whole.effect("dark_counts").rate.copy()})
+    moved = with_values(whole, {("dark_counts", "rate"): whole.effect("dark_counts").rate.copy()})
     moved.effect("dark_counts").rate[0] += 1.0
     parts = [
         whole,
@@ -477,8 +482,8 @@ def test_what_is_kept_of_simulations_belongs_to_one_window_of_one_chip() -> None
         moved.cropped(*FEW),
         Sensor(Layout(5, 4, 25e-12, 1.0), whole.cropped(*FEW).effects, "device", CHIP, "chip", True),
     ]
-    assert len({memory.name_of(part, capture) for part in parts}) == len(parts)
-    assert memory.name_of(whole.cropped(*FEW), capture) == memory.name_of(chip_with().cropped(*FEW), capture)
+    assert len({entry_name(part, capture) for part in parts}) == len(parts)
+    assert entry_name(whole.cropped(*FEW), capture) == entry_name(chip_with().cropped(*FEW), capture)
 
 
 def test_a_model_is_never_made_from_a_layout_alone() -> None:
@@ -604,7 +609,7 @@ def test_the_next_sensor_describes_the_whole_chip(lab: Path, tmp_path: Path) -> 
     """Read again with the same part it is the model that was found, around the part as well."""
     part = config.read_sensor(lab / "sensor.yaml").cropped(slice(16, 32), slice(8, 24))
     rng = np.random.Generator(np.random.PCG64(4))
-    values: dict[candidates.Key, Any] = {
+    values: dict[Key, Any] = {
         ("dark_counts", "rate"): rng.random(256) * 1e3,
         ("detection", "relative"): 1 + 0.1 * rng.standard_normal(256),
         ("row_pattern", "gain"): 1 + 0.1 * rng.standard_normal(16),
@@ -614,7 +619,7 @@ def test_the_next_sensor_describes_the_whole_chip(lab: Path, tmp_path: Path) -> 
     }
     out = sensor_file.write(lab / "sensor.yaml", tmp_path / "sensor.yaml", values, {}, part.window)
     again = config.read_sensor(out).cropped(slice(16, 32), slice(8, 24))
-    found = candidates.with_values(part, values)
+    found = with_values(part, values)
     for one, other in ((again, found), (again.chip, found.chip)):
         assert one is not None and other is not None
         for effect in other.effects:

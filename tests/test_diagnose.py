@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from spadmnist import config, measurement, plugins, sensor_file
-from spadmnist.criticism import candidates, diagnose
 from spadmnist.effects import Effect
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.model_selection import diagnose
 
 CASES = Path(__file__).resolve().parents[2] / "shared" / "challenge"
 
@@ -57,7 +58,7 @@ def case(name: str):
 
 def found_in(name: str, **keywords):
     sensor, data, truth = case(name)
-    return diagnose.diagnose(sensor, data, quick=True, **keywords), truth
+    return diagnose(sensor, data, quick=True, **keywords), truth
 
 
 @pytest.mark.slow
@@ -70,7 +71,7 @@ def test_a_right_model_is_adequate():
 def test_a_short_gate_is_found_by_its_trace_in_the_dark():
     found, truth = found_in("open-qis-gate")
     assert found.verdict == "explained"
-    assert [s.change.effect for s in found.steps] == ["short_gate"]
+    assert [s.candidate.effect for s in found.steps] == ["short_gate"]
     value = found.steps[0].values["fraction"]
     assert value.low <= truth["hidden"]["gate_fraction"] <= value.high
 
@@ -78,7 +79,7 @@ def test_a_short_gate_is_found_by_its_trace_in_the_dark():
 @pytest.mark.slow
 def test_crosstalk_is_found():
     found, truth = found_in("open-tr-crosstalk")
-    assert found.steps[0].change.effect == "crosstalk"
+    assert found.steps[0].candidate.effect == "crosstalk"
     value = found.steps[0].values["probability"]
     assert value.low <= truth["hidden"]["crosstalk"][0] <= value.high
     assert found.after < 1.3 < found.before
@@ -88,7 +89,7 @@ def test_candidates_come_from_the_registry(tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text(SENSOR)
     sensor = config.read_sensor(file)
-    names = {change.name for change in candidates.changes(sensor)}
+    names = {candidate.name for candidate in candidates(sensor)}
     assert {"add crosstalk", "add flicker", "set dead_time.duration", "per_pixel detection.pdp"} <= names
     assert {"add row_pattern", "set dead_time.paralyzable", "per_pixel dark_counts.rate"} <= names
     # a common factor on the light is the set-up's, and what is listed is not added
@@ -96,7 +97,7 @@ def test_candidates_come_from_the_registry(tmp_path):
     for name in Effect.registry:
         if name not in {e.name for e in sensor.effects}:
             kind = Effect.registry.find(name)
-            can = [p for p in kind.parameters.values() if p.off is not None and p.search is not None]
+            can = [p for p in kind.parameters.values() if p.off is not None and p.scan is not None]
             assert bool(can and not kind.of_scene) == (f"add {name}" in names), name
 
 
@@ -143,7 +144,7 @@ def test_a_users_own_effect_is_a_candidate(tmp_path):
     file.write_text(SENSOR)
     plugins.load_file(plugin)
     try:
-        names = {change.name for change in candidates.changes(config.read_sensor(file))}
+        names = {candidate.name for candidate in candidates(config.read_sensor(file))}
         assert "add echo" in names
     finally:
         plugins._loaded.pop(plugin.resolve(), None)

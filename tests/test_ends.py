@@ -24,8 +24,9 @@ from test_factory import alive, descendants, wait_for, workers, write_config
 import spadmnist.cli as command_line
 from spadmnist import disk
 from spadmnist.cli import _run
-from spadmnist.criticism import memory, nulls
 from spadmnist.errors import SpadError
+from spadmnist.inference.replicate_cache import keep, recall
+from spadmnist.inference.replicates import CaptureReplicates
 
 START = [sys.executable, "-c", "from spadmnist.start import main; main()"]
 SENTENCE = "Interrupted. What is complete is kept: the same command goes on from there."
@@ -236,19 +237,23 @@ def test_half_an_export_is_cleared_by_the_next_one_and_a_living_writer_keeps_its
 
 
 @pytest.mark.parametrize("at", [3, 0.3, 0.6, 0.9, 0.999])
-def test_a_damaged_null_is_not_taken(at: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_replicates_are_not_taken(at: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One bit anywhere; also where the archive itself has no digest of it."""
-    monkeypatch.setattr(memory, "_folder", lambda: tmp_path)
-    one = nulls.Null("poisson", 1.0, np.ones((3, 5)), np.ones((3, 3)), np.ones(5), 8, 1.0, 1.0, np.ones(8), False)
-    memory.keep("entry", {"totals": np.arange(8.0)}, {"map": one}, {})
+    monkeypatch.setattr("spadmnist.inference.replicate_cache._folder", lambda: tmp_path)
+    values = {"map": np.arange(40.0).reshape(8, 5), "spread": np.full((8, 2), 0.5)}
+    laws = {"map": ("poisson", None), "spread": ("normal", np.ones(2))}
+    one = CaptureReplicates(np.arange(8, dtype=np.uint64), np.arange(8.0), values, laws)
+    keep("entry", one)
     file = tmp_path / "entry.npz"
     whole = file.read_bytes()
-    found = memory.recall("entry")
-    assert found is not None and np.array_equal(found[1]["map"].coefficients, one.coefficients)
+    found = recall("entry")
+    assert found is not None and all(np.array_equal(found.values[name], x) for name, x in values.items())
+    assert found.laws["map"] == ("poisson", None) and np.array_equal(found.laws["spread"][1], np.ones(2))
+    assert found.values["map"].dtype == np.float64 and np.array_equal(found.first(3).totals, [0.0, 1.0, 2.0])
     place = int(at if at >= 1 else at * len(whole))
     file.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-    assert memory.recall("entry") is None
+    assert recall("entry") is None
     file.write_bytes(whole[:place])
-    assert memory.recall("entry") is None
-    memory.keep("entry", {"totals": np.arange(8.0)}, {"map": one}, {})
+    assert recall("entry") is None
+    keep("entry", one)
     assert file.read_bytes() == whole and [path.name for path in tmp_path.iterdir()] == ["entry.npz"]

@@ -13,9 +13,26 @@ from joblib import Parallel
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
-from spadmnist.criticism import answer, candidates, course, fit, fitted, likelihood, mapping, recordings, settling
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
+from spadmnist.inference.candidates import candidates, with_values
+from spadmnist.inference.coordinates import Coordinate, point_of
+from spadmnist.inference.evaluation import Evaluation, evaluate, square, stacked
+from spadmnist.inference.exact_likelihood import MaximumLikelihood, maximise
+from spadmnist.inference.gauss_newton import (
+    Fit,
+    covariance_of,
+    error_scale,
+    gauss_newton,
+    gauss_newton_step,
+    profile_intervals,
+)
+from spadmnist.inference.held_out import captures_needed, leave_one_capture_out, optimism
+from spadmnist.inference.map_fits import fit_maps, light_levels_of
+from spadmnist.inference.named_fit import _named, fit_named
+from spadmnist.inference.pixel_maps import PixelMap, map_values, summary
+from spadmnist.inference.replicates import TOTALS, Model, Replicates
+from spadmnist.inference.results import sentence
 from spadmnist.recording import Capture, Light
 from spadmnist.streams import Streams
 from spadmnist.twin import model_recordings
@@ -39,7 +56,7 @@ def made(tmp_path):
     file.write_text(SENSOR)
     sensor = config.read_sensor(file)
     map_ = 1 + 0.1 * np.random.default_rng(3).standard_normal(64)
-    hidden = candidates.with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
+    hidden = with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
     captures = []
     for id, exposure, level in (("dark", 0.5, None), ("flat", 0.05, 1e5), ("bright", 2e-3, 5e6)):
         wave = None if level is None else 500e-9
@@ -71,19 +88,19 @@ def test_a_dead_time_is_settled_and_a_map_found(tmp_path, made):
     sensor, captures, map_ = made
     data = measured(tmp_path, sensor, captures)
     with Parallel(n_jobs=1) as parallel:
-        bench = fit.Bench(sensor, data, 0, parallel, 16)
-        state = bench.state({})
-        change = next(c for c in candidates.changes(sensor) if c.name == "per_pixel detection.pdp")
-        levels = mapping.levels_of(bench, state)
-        found = mapping.settle_maps(bench, {}, [change], levels)[change.carrier]
+        replicates = Replicates(sensor, data, 0, parallel, 16)
+        evaluation = evaluate(replicates, {})
+        candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")
+        levels = light_levels_of(replicates, evaluation)
+        found = fit_maps(replicates, {}, [candidate], levels)[candidate.carrier]
         assert np.corrcoef(found.estimate, np.log(map_))[0, 1] > 0.95
-        assert mapping.summary(found)["sigma"] == pytest.approx(0.1, rel=0.35)
-        length = next(c for c in candidates.changes(sensor) if c.name == "set dead_time.duration")
+        assert summary(found)["sigma"] == pytest.approx(0.1, rel=0.35)
+        length = next(c for c in candidates(sensor) if c.name == "set dead_time.duration")
         values = {("dead_time", "duration"): 55e-9}
-        settled = settling.settle(
-            bench, state, length.dials, values, lambda v: fit.Sensors.same(candidates.with_values(sensor, v))
+        fit = gauss_newton(
+            replicates, evaluation, length.coordinates, values, lambda v: Model.same(with_values(sensor, v))
         )
-    value, low, high = settled.interval(0)
+    value, low, high = fit.interval(0)
     assert abs(value - 60e-9) < max(2e-9, high - low)
 
 
@@ -91,116 +108,119 @@ def test_what_cannot_be_settled_is_told(tmp_path, made):
     sensor, captures, _ = made
     data = measured(tmp_path, sensor, captures)
     with pytest.raises(InputError, match="crosstalk"):
-        fitted.fitted(sensor, data, add=["cross"])
+        fit_named(sensor, data, add=["cross"])
     with pytest.raises(InputError, match=r"EFFECT\.PARAMETER"):
-        fitted.fitted(sensor, data, free=["dead_time"])
-    with pytest.raises(InputError, match="nothing is to be settled"):
-        fitted.fitted(sensor, data)
+        fit_named(sensor, data, free=["dead_time"])
+    with pytest.raises(InputError, match="nothing is to be fitted"):
+        fit_named(sensor, data)
 
 
-class _Law:
-    """A bench whose models are numbers (a, b), and whose residuals are a function of them."""
+def closed_form(monkeypatch, function, asked=None):
+    """Models are numbers (a, b), and their residuals a function of them. asked: takes how many each call simulates."""
 
-    def __init__(self, function):
-        self.function = function
-
-    def moved(self, state, models, few, only=None):
+    def simulated(replicates, evaluation, models, few, only=None):
+        if asked is not None:
+            asked.append(len(models))
         return models
 
-    def residuals(self, state, model):
-        return {("one", "cells"): self.function(*model.values())}
+    def residuals(replicates, evaluation, model, times=1.0):
+        return {("one", "cells"): function(*model.values())}
+
+    monkeypatch.setattr("spadmnist.inference.gauss_newton.signatures", simulated)
+    monkeypatch.setattr("spadmnist.inference.gauss_newton.residuals_at", residuals)
 
 
-def profile_of(function, slopes, own, dials, point):
+def profile_of(monkeypatch, function, jacobian, own, coordinates, point):
     cell = ("one", "cells")
-    state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(len(slopes))}, {}, [])
-    covariance = settling.covariance_of(slopes, own)
+    evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: np.zeros(len(jacobian))}, {}, {})
+    covariance = covariance_of(jacobian, own)
     z = {cell: function(*point)}
-    settled = settling.Settled(dials, np.array(point), covariance, z, {cell: slopes}, 0.0, {})
-    return settled, settling.profiled(_Law(function), state, settled, lambda values: values)
+    fit = Fit(coordinates, np.array(point), covariance, z, {cell: jacobian}, 0.0, {})
+    closed_form(monkeypatch, function)
+    return fit, profile_intervals(None, evaluation, fit, lambda values: values)
 
 
-def test_a_profile_is_the_covariance_where_all_is_linear():
+def test_a_profile_is_the_covariance_where_all_is_linear(monkeypatch):
     """Also where cells are not independent, and where two numbers do nearly the same."""
     rng = np.random.default_rng(5)
-    slopes = np.stack([np.ones(40), np.linspace(0.5, 1.5, 40)], axis=1)
+    jacobian = np.stack([np.ones(40), np.linspace(0.5, 1.5, 40)], axis=1)
     own = rng.standard_normal((96, 40)) + 0.6 * rng.standard_normal((96, 1))
     data = rng.standard_normal(40)
-    data -= slopes @ np.linalg.lstsq(slopes, data, rcond=None)[0]
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
-    settled, ends = profile_of(lambda a, b: data + slopes @ [a, b], slopes, own, dials, [0.0, 0.0])
-    for i, dial in enumerate(dials):
-        assert ends[dial.key] == pytest.approx(settled.interval(i)[1:], rel=1e-3)
+    data -= jacobian @ np.linalg.lstsq(jacobian, data, rcond=None)[0]
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    fit, ends = profile_of(monkeypatch, lambda a, b: data + jacobian @ [a, b], jacobian, own, coordinates, [0.0, 0.0])
+    for i, coordinate in enumerate(coordinates):
+        assert ends[coordinate.key] == pytest.approx(fit.interval(i)[1:], rel=1e-3)
 
 
 def test_what_a_law_leaves_in_its_own_cells_makes_its_numbers_less_certain():
     """Of 40 cells the first 20 tell a, the others b; those of a lie three times as wide as chance has it, or less."""
     rng = np.random.default_rng(7)
     cell = ("one", "cells")
-    slopes = np.kron(np.eye(2), np.ones((20, 1)))
+    jacobian = np.kron(np.eye(2), np.ones((20, 1)))
     own = rng.standard_normal((96, 40))
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
-    state = fit.State({}, None, {}, {}, {}, {}, {}, {cell: own}, [])
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    evaluation = Evaluation({}, None, {}, {}, {}, {}, {}, {cell: own}, {})
 
     def wider(wide_of_a):
         z = np.tile([1.0, -1.0], 20) * np.repeat([wide_of_a, 0.5], 20)
-        settled = settling.Settled(dials, np.zeros(2), np.eye(2), {cell: z}, {cell: slopes}, 0.0, {})
-        return settling.unexplained_scatter(settled, state)
+        fit = Fit(coordinates, np.zeros(2), np.eye(2), {cell: z}, {cell: jacobian}, 0.0, {})
+        return error_scale(fit, evaluation)
 
     assert wider(3.0) == pytest.approx([3.0, 1.0], rel=0.05)
     assert wider(0.5).tolist() == [1.0, 1.0]
-    nothing = settling.Settled(dials, np.zeros(2), np.eye(2), {}, {}, 0.0, {})
-    assert settling.unexplained_scatter(nothing, state).tolist() == [1.0, 1.0]
+    nothing = Fit(coordinates, np.zeros(2), np.eye(2), {}, {}, 0.0, {})
+    assert error_scale(nothing, evaluation).tolist() == [1.0, 1.0]
 
 
 def test_what_is_unseen_is_what_numbers_settled_without_it_leave():
     """Against least squares done anew without each capture, and in one that alone tells a number without each cell."""
     rng = np.random.default_rng(12)
-    cells = {("a", "x"): 30, ("b", "x"): 20, ("b", "y"): 10, ("c", "x"): 30, fit.RATES: 3}
-    slopes = {cell: rng.standard_normal((n, 2)) for cell, n in cells.items()}
+    cells = {("a", "x"): 30, ("b", "x"): 20, ("b", "y"): 10, ("c", "x"): 30, TOTALS: 3}
+    jacobian = {cell: rng.standard_normal((n, 2)) for cell, n in cells.items()}
     noise = {cell: rng.standard_normal(n) for cell, n in cells.items()}
 
-    def settled(left_out: str = "") -> np.ndarray:
+    def fit(left_out: str = "") -> np.ndarray:
         keys = [cell for cell in cells if not left_out or cell[0] != left_out]
-        return np.linalg.lstsq(np.concatenate([slopes[k] for k in keys]), -fit.stacked(noise, keys), rcond=None)[0]
+        return np.linalg.lstsq(np.concatenate([jacobian[k] for k in keys]), -stacked(noise, keys), rcond=None)[0]
 
-    z = {cell: noise[cell] + slopes[cell] @ settled() for cell in cells}
-    found = settling.unseen(z, slopes)
+    z = {cell: noise[cell] + jacobian[cell] @ fit() for cell in cells}
+    found = leave_one_capture_out(z, jacobian)
     for cell in cells:
-        without = z[cell] if cell == fit.RATES else noise[cell] + slopes[cell] @ settled(cell[0])
+        without = z[cell] if cell == TOTALS else noise[cell] + jacobian[cell] @ fit(cell[0])
         assert found[cell] == pytest.approx(without, rel=1e-6, abs=1e-9)
-    slopes["a", "x"] *= 9.0
-    z = {cell: noise[cell] + slopes[cell] @ settled() for cell in cells}
+    jacobian["a", "x"] *= 9.0
+    z = {cell: noise[cell] + jacobian[cell] @ fit() for cell in cells}
     worst = int(np.argmax(np.abs(z["a", "x"])))
     keep = np.arange(30) != worst
-    left = np.concatenate([slopes["a", "x"][keep], *(slopes[k] for k in cells if k[0] != "a")])
+    left = np.concatenate([jacobian["a", "x"][keep], *(jacobian[k] for k in cells if k[0] != "a")])
     rest = np.concatenate([noise["a", "x"][keep], *(noise[k] for k in cells if k[0] != "a")])
-    alone = noise["a", "x"][worst] - slopes["a", "x"][worst] @ np.linalg.lstsq(left, rest, rcond=None)[0]
-    assert settling.unseen(z, slopes)["a", "x"][worst] == pytest.approx(alone, rel=1e-6)
+    alone = noise["a", "x"][worst] - jacobian["a", "x"][worst] @ np.linalg.lstsq(left, rest, rcond=None)[0]
+    assert leave_one_capture_out(z, jacobian)["a", "x"][worst] == pytest.approx(alone, rel=1e-6)
 
 
 def test_numbers_that_are_not_where_the_squares_are_least_gain_nothing_by_that() -> None:
     """At a bound, or settled half way: what they lack there they lack on captures that are not seen, too."""
     rng = np.random.default_rng(14)
-    slopes = {(id, "x"): rng.standard_normal((50, 2)) for id in "abc"}
-    noise = {cell: rng.standard_normal(50) for cell in slopes}
-    keys = list(slopes)
-    best = np.linalg.lstsq(np.concatenate([slopes[k] for k in keys]), -fit.stacked(noise, keys), rcond=None)[0]
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    jacobian = {(id, "x"): rng.standard_normal((50, 2)) for id in "abc"}
+    noise = {cell: rng.standard_normal(50) for cell in jacobian}
+    keys = list(jacobian)
+    best = np.linalg.lstsq(np.concatenate([jacobian[k] for k in keys]), -stacked(noise, keys), rcond=None)[0]
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
     found = {}
     for lacks in (0.0, 2.0):
-        z = {cell: noise[cell] + slopes[cell] @ (best - lacks) for cell in keys}
-        settled = settling.Settled(dials, best, np.eye(2), z, slopes, fit.square(z), {})
-        found[lacks] = settling.unseen(z, slopes)
-        assert fit.square(found[lacks]) > fit.square(z) - 1e-9 or lacks
-        assert 0 <= settling.optimism(z, settled) < 60
-        assert lacks == 0 or fit.square(z) > 500
+        z = {cell: noise[cell] + jacobian[cell] @ (best - lacks) for cell in keys}
+        fit = Fit(coordinates, best, np.eye(2), z, jacobian, square(z), {})
+        found[lacks] = leave_one_capture_out(z, jacobian)
+        assert square(found[lacks]) > square(z) - 1e-9 or lacks
+        assert 0 <= optimism(z, fit) < 60
+        assert lacks == 0 or square(z) > 500
     for cell in keys:
-        assert found[2.0][cell] - found[0.0][cell] == pytest.approx(-2.0 * slopes[cell].sum(axis=1), rel=1e-6)
-    slopes["a", "x"] = 9.0 * slopes["a", "x"]  # it alone tells them, cell by cell
-    moved = {lacks: {c: noise[c] + slopes[c] @ (best - lacks) for c in keys} for lacks in (0.0, 2.0)}
-    one, other = (settling.unseen(moved[lacks], slopes)["a", "x"] for lacks in (0.0, 2.0))
-    assert other - one == pytest.approx(-2.0 * slopes["a", "x"].sum(axis=1), rel=1e-6)
+        assert found[2.0][cell] - found[0.0][cell] == pytest.approx(-2.0 * jacobian[cell].sum(axis=1), rel=1e-6)
+    jacobian["a", "x"] = 9.0 * jacobian["a", "x"]  # it alone tells them, cell by cell
+    signature = {lacks: {c: noise[c] + jacobian[c] @ (best - lacks) for c in keys} for lacks in (0.0, 2.0)}
+    one, other = (leave_one_capture_out(signature[lacks], jacobian)["a", "x"] for lacks in (0.0, 2.0))
+    assert other - one == pytest.approx(-2.0 * jacobian["a", "x"].sum(axis=1), rel=1e-6)
 
 
 def test_what_two_numbers_have_in_common_may_be_told_by_one_capture() -> None:
@@ -209,25 +229,25 @@ def test_what_two_numbers_have_in_common_may_be_told_by_one_capture() -> None:
     shape = rng.standard_normal(200)
     near = shape + 0.02 * rng.standard_normal(200)
     apart = np.stack([rng.standard_normal(200), rng.standard_normal(200)], axis=1)
-    slopes = {("a", "x"): np.stack([shape, near], axis=1), ("b", "x"): 0.3 * apart}
-    z = {cell: rng.standard_normal(200) for cell in slopes}
-    assert settling.alone(z, slopes) == {"a", "b"}  # a the sum of both, b their difference
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
-    best = np.linalg.lstsq(np.concatenate(list(slopes.values())), -fit.stacked(z, list(z)), rcond=None)[0]
-    z = {cell: z[cell] + slopes[cell] @ best for cell in z}
-    settled = settling.Settled(dials, best, np.eye(2), z, slopes, fit.square(z), {})
-    assert settling.optimism(z, settled) == pytest.approx(4.0, rel=1e-6)  # 1,000 and more if each judged the other
-    assert settling.alone(z, {cell: np.zeros((200, 2)) for cell in z}) == settling.alone(z, {}) == set()
+    jacobian = {("a", "x"): np.stack([shape, near], axis=1), ("b", "x"): 0.3 * apart}
+    z = {cell: rng.standard_normal(200) for cell in jacobian}
+    assert captures_needed(z, jacobian) == {"a", "b"}  # a the sum of both, b their difference
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    best = np.linalg.lstsq(np.concatenate(list(jacobian.values())), -stacked(z, list(z)), rcond=None)[0]
+    z = {cell: z[cell] + jacobian[cell] @ best for cell in z}
+    fit = Fit(coordinates, best, np.eye(2), z, jacobian, square(z), {})
+    assert optimism(z, fit) == pytest.approx(4.0, rel=1e-6)  # 1,000 and more if each judged the other
+    assert captures_needed(z, {cell: np.zeros((200, 2)) for cell in z}) == captures_needed(z, {}) == set()
 
 
 def test_numbers_of_one_capture_and_of_totals_cost_as_many() -> None:
     rng = np.random.default_rng(16)
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "abc")
-    for cell in (("a", "x"), fit.RATES):
-        slopes = {cell: rng.standard_normal((30, 3))}
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "abc")
+    for cell in (("a", "x"), TOTALS):
+        jacobian = {cell: rng.standard_normal((30, 3))}
         z = {cell: rng.standard_normal(30)}
-        settled = settling.Settled(dials, np.zeros(3), np.eye(3), z, slopes, fit.square(z), {})
-        assert settling.optimism(z, settled) == pytest.approx(6.0, rel=1e-6)
+        fit = Fit(coordinates, np.zeros(3), np.eye(3), z, jacobian, square(z), {})
+        assert optimism(z, fit) == pytest.approx(6.0, rel=1e-6)
 
 
 def test_numbers_cost_what_chance_lets_them_gain():
@@ -237,27 +257,27 @@ def test_numbers_cost_what_chance_lets_them_gain():
     """
     rng = np.random.default_rng(13)
     shape = rng.standard_normal((40, 2))
-    slopes = {(id, "x"): shape for id in "abc"}
-    dials = tuple(candidates.Dial("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
+    jacobian = {(id, "x"): shape for id in "abc"}
+    coordinates = tuple(Coordinate("any", name, "", -20.0, 20.0, 0.0) for name in "ab")
     costs = []
     for _ in range(1600):
         noise = rng.standard_normal((3, 40))
         best = np.linalg.lstsq(shape, -noise.mean(axis=0), rcond=None)[0]
-        z = {cell: x + shape @ best for cell, x in zip(slopes, noise, strict=True)}
-        settled = settling.Settled(dials, best, np.eye(2), z, slopes, fit.square(z), {})
-        costs.append(settling.optimism(z, settled))
+        z = {cell: x + shape @ best for cell, x in zip(jacobian, noise, strict=True)}
+        fit = Fit(coordinates, best, np.eye(2), z, jacobian, square(z), {})
+        costs.append(optimism(z, fit))
     assert np.mean(costs) == pytest.approx(5.0, abs=0.47)
     assert np.std(costs) / 40 < 0.1
 
 
-def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
+def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound(monkeypatch):
     rng = np.random.default_rng(6)
     own = rng.standard_normal((960, 30))
-    dial = candidates.Dial("any", "a", "", -0.3, 5.0, 0.0, bounds=(-0.3, None))
+    coordinate = Coordinate("any", "a", "", -0.3, 5.0, 0.0, bounds=(-0.3, None))
     law = lambda a: np.full(30, np.expm1(a))  # noqa: E731
-    settled, ends = profile_of(law, np.ones((30, 1)), own, (dial,), [0.0])
-    wide = 1.96 * float(np.sqrt(settled.covariance[0, 0]))
-    low, high = ends[dial.key]
+    fit, ends = profile_of(monkeypatch, law, np.ones((30, 1)), own, (coordinate,), [0.0])
+    wide = 1.96 * float(np.sqrt(fit.covariance[0, 0]))
+    low, high = ends[coordinate.key]
     assert low == -0.3, "at -0.3 the squares have risen by less"
     assert high == pytest.approx(np.log1p(wide), rel=0.03)
     assert high < 0.9 * wide
@@ -281,25 +301,23 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound():
     ],
 )
 def test_where_a_number_is_looked_for_is_no_bound_of_what_it_may_be(ends, bounds, off, reach, expected):
-    dial = candidates.Dial("any", "a", "", *ends, off, bounds=bounds)
-    assert dial.interval(*reach) == pytest.approx(expected)
-    assert all(ends[0] <= dial.value(u) <= ends[1] for u in reach)
+    coordinate = Coordinate("any", "a", "", *ends, off, bounds=bounds)
+    assert coordinate.interval(*reach) == pytest.approx(expected)
+    assert all(ends[0] <= coordinate.value(u) <= ends[1] for u in reach)
 
 
 def test_a_number_that_nothing_follows_stays_as_it_is():
     """Of two numbers the cells follow one; the other, of a slope that is hardly one, is not thrown to its bound."""
     rng = np.random.default_rng(8)
     cell = ("one", "cells")
-    dials = tuple(candidates.Dial("any", name, "", 1e-4, 0.5, 0.0) for name in "ab")
-    slopes = np.stack([np.full(30, 2.0), np.linspace(-1e-3, 1e-3, 30)], axis=1)
-    z = 0.5 * slopes[:, 0] + rng.standard_normal(30)
+    coordinates = tuple(Coordinate("any", name, "", 1e-4, 0.5, 0.0) for name in "ab")
+    jacobian = np.stack([np.full(30, 2.0), np.linspace(-1e-3, 1e-3, 30)], axis=1)
+    z = 0.5 * jacobian[:, 0] + rng.standard_normal(30)
     own = {cell: rng.standard_normal((64, 30))}
-    state = fit.State({}, None, {}, {}, {}, {}, {cell: z}, own, [])
-    values = {dial.key: 0.01 for dial in dials}
-    before = settling.Settled(
-        dials, settling.point_of(dials, values), np.eye(2), {cell: z}, {cell: slopes}, 0.0, dict(values)
-    )
-    found = settling.follow(_Law(None), state, dials, values, lambda v: v, before=before)
+    evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: z}, own, {})
+    values = {coordinate.key: 0.01 for coordinate in coordinates}
+    before = Fit(coordinates, point_of(coordinates, values), np.eye(2), {cell: z}, {cell: jacobian}, 0.0, dict(values))
+    found = gauss_newton_step(None, evaluation, coordinates, values, lambda v: v, before=before)
     assert found.values["any", "b"] == pytest.approx(0.01)
     assert np.log(found.values["any", "a"] / 0.01) == pytest.approx(-0.5, abs=5 * 0.5 / np.sqrt(30))
 
@@ -355,18 +373,16 @@ def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
 def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     """The only other place that a switch has is the wrong one."""
     sensor, captures, map_ = made
-    sensor = candidates.with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
-    monkeypatch.setattr(recordings, "REPLICATES", 8)
+    sensor = with_values(sensor, {("detection", "relative"): map_, ("dead_time", "duration"): 60e-9})
+    monkeypatch.setattr("spadmnist.inference.named_fit.REPLICATES", 8)
     data = measured(tmp_path, sensor, captures)
-    found = fitted.fitted(sensor, data, free=["dead_time.paralyzable"], jobs=1)
+    found = fit_named(sensor, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0 and not found.values
     assert found.steps[0].significance == 0
     # nothing was wrong, and nothing explained: it was settled
-    assert found.verdict == "adequate" and answer.sentence(found).endswith(
-        "No check failed before, and none fails now."
-    )
-    blind = candidates.with_values(sensor, {("dead_time", "paralyzable"): True})
-    found = fitted.fitted(blind, data, free=["dead_time.paralyzable"], jobs=1)
+    assert found.verdict == "adequate" and sentence(found).endswith("No check failed before, and none fails now.")
+    blind = with_values(sensor, {("dead_time", "paralyzable"): True})
+    found = fit_named(blind, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0
     assert found.values["dead_time", "paralyzable"] is False and found.steps[0].significance > 3
 
@@ -375,10 +391,10 @@ def test_beside_maps_no_number_that_changes_rates_is_settled_by_likelihood(made)
     """Which takes the pixels' rates for known; of a dead time it need not know them."""
     sensor, captures, _ = made
     data = [recording for _, _, recording in captures]
-    every = {change.name: change for change in candidates.changes(sensor.settled())}
+    every = {candidate.name: candidate for candidate in candidates(sensor.settled())}
     for name, able in (("set dead_time.duration", True), ("set dark_counts.rate", False)):
-        found = likelihood.settled(sensor.settled(), data, [every[name]], mapped=True)
-        assert isinstance(found, likelihood.Exact) == able, found
+        found = maximise(sensor.settled(), data, [every[name]], mapped=True)
+        assert isinstance(found, MaximumLikelihood) == able, found
 
 
 def test_lazy_pixels_have_an_interval():
@@ -388,48 +404,40 @@ def test_lazy_pixels_have_an_interval():
     logs = 0.01 * rng.standard_normal(400)
     logs[:16] = np.log(0.5) + 0.1 * rng.standard_normal(16)
     pulled = logs * 0.97  # to the others, as a prior does it
-    one = mapping.Map(("detection", "relative"), 1.0, np.arange(400), pulled, error, logs, error, 0.01)
-    told = course.map_values(one)["low_ratio"]
+    one = PixelMap(("detection", "relative"), 1.0, np.arange(400), pulled, error, logs, error, 0.01)
+    told = map_values(one)["low_ratio"]
     assert told.low < 0.5 < told.high
     assert (told.high - told.low) / 2 == pytest.approx(1.96 * 0.5 * 0.1 / 4, rel=0.5)
     assert told.value == pytest.approx(np.exp(logs[:16]).mean() / np.exp(np.median(logs)), rel=2e-3)
     logs[:16] = pulled[:16] = 0.0
-    assert course.map_values(one)["low_ratio"].low is None
+    assert map_values(one)["low_ratio"].low is None
 
 
-def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after():
+def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after(monkeypatch):
     """Squares that every point raises, whatever its slopes promise: two steps in vain are enough."""
     asked = []
     rng = np.random.default_rng(3)
-    dial = candidates.Dial("any", "a", "", -20.0, 20.0, 0.0)
+    coordinate = Coordinate("any", "a", "", -20.0, 20.0, 0.0)
     cell = ("one", "cells")
 
-    class Noise(_Law):
-        def moved(self, state, models, few, only=None):
-            asked.append(len(models))
-            return models
-
-        def residuals(self, state, model, times=1.0):
-            return super().residuals(state, model)
-
-    law = Noise(lambda a: 5 + a + rng.standard_normal(30) * (1 + 3 * len(asked)))
-    state = fit.State({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, [])
-    settling.settle(law, state, [dial], {dial.key: 0.0}, lambda v: v, rounds=8)
+    closed_form(monkeypatch, lambda a: 5 + a + rng.standard_normal(30) * (1 + 3 * len(asked)), asked)
+    evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, {})
+    gauss_newton(None, evaluation, [coordinate], {coordinate.key: 0.0}, lambda v: v, rounds=8)
     assert sum(n > 1 for n in asked) <= 4 < 16
 
 
 def test_what_cannot_be_settled_is_told_with_what_can(made):
     sensor, *_ = made
-    known = candidates.changes(sensor.settled()), {e.name for e in sensor.effects}
+    known = candidates(sensor.settled()), {e.name for e in sensor.effects}
     with pytest.raises(
-        InputError, match=r"dead_time\.durations cannot be settled here; .*Did you mean dead_time\.duration\?"
+        InputError, match=r"dead_time\.durations cannot be fitted here; .*Did you mean dead_time\.duration\?"
     ):
-        fitted._named(*known, "set", "dead_time", "durations")
-    with pytest.raises(InputError, match=r"crosstalks cannot be settled here; .*Did you mean crosstalk\?"):
-        fitted._named(*known, "add", "crosstalks", None)
+        _named(*known, "set", "dead_time", "durations")
+    with pytest.raises(InputError, match=r"crosstalks cannot be fitted here; .*Did you mean crosstalk\?"):
+        _named(*known, "add", "crosstalks", None)
     with pytest.raises(
         InputError, match=r"--add dead_time: the sensor lists it already; .*--free dead_time\.PARAMETER"
     ):
-        fitted._named(*known, "add", "dead_time", None)
+        _named(*known, "add", "dead_time", None)
     with pytest.raises(InputError, match=r"--free crosstalk\.probability: .* --add crosstalk adds it"):
-        fitted._named(*known, "set", "crosstalk", "probability")
+        _named(*known, "set", "crosstalk", "probability")

@@ -11,11 +11,16 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, bench_of, change_of, names, quiet, taken
 
-from spadmnist.criticism import course as course_of
-from spadmnist.criticism import fit, refining
-from spadmnist.criticism.candidates import with_values
-from spadmnist.criticism.fit import RATES, Moved, likelier
-from spadmnist.criticism.tried import Tried
+from spadmnist.inference.candidates import with_values
+from spadmnist.inference.elimination import drop_needless
+from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
+from spadmnist.inference.gauss_newton import gauss_newton_step
+from spadmnist.inference.model_path import _bounded, _gauss_newton, begin
+from spadmnist.inference.ranking import compare_by_squares
+from spadmnist.inference.replicates import TOTALS
+from spadmnist.inference.signature import Signature, _mean_shift, signatures
+from spadmnist.inference.trial import Trial
+from spadmnist.inference.trial_fits import fit_trial
 
 CONTRAST, COHERENCE = ("source_noise", "contrast"), ("source_noise", "coherence_time")
 TREND, MANY = ("flat", "trend"), ("flat", "fine_intervals")
@@ -23,22 +28,24 @@ TREND, MANY = ("flat", "trend"), ("flat", "fine_intervals")
 
 def test_totals_that_go_the_same_way_in_two_recordings_are_chance(lab) -> None:
     """The power is 1 in the mean, whatever it is in the two recordings that a first look has."""
-    bench = bench_of(lab(light=1000))
-    state = bench.state({})
+    replicates = bench_of(lab(light=1000))
+    evaluation = evaluate(replicates, {})
     coherence = [1e-3, 3e-3, 1e-2, 3e-2]  # of an exposure of 20 ms
-    models = [state.sensors.changed({CONTRAST: 0.1, COHERENCE: x}) for x in coherence]
-    for moved in bench.moved(state, models, 2, kept="sure"):
-        assert isinstance(moved, Moved)
-        assert moved.fluctuates
-        assert all(abs(log) < 1e-6 for log in moved.logs.values())
+    models = [evaluation.sensors.changed({CONTRAST: 0.1, COHERENCE: x}) for x in coherence]
+    for signature in signatures(replicates, evaluation, models, 2, kept="sure"):
+        assert isinstance(signature, Signature)
+        assert signature.fluctuates
+        assert all(abs(log) < 1e-6 for log in signature.logs.values())
     # nor are four of them sure of it, of which a slope is made: they are far less alike than the model's own
-    for moved in bench.moved(state, models, 4):
-        assert isinstance(moved, Moved)
-        assert all(abs(log) < 1e-6 for log in moved.logs.values())
+    for signature in signatures(replicates, evaluation, models, 4):
+        assert isinstance(signature, Signature)
+        assert all(abs(log) < 1e-6 for log in signature.logs.values())
     # what adds detections in every recording is none of these
-    (moved,) = bench.moved(state, [state.sensors.changed({("afterpulsing", "probability"): 0.1})], 4)
-    assert isinstance(moved, Moved)
-    assert not moved.fluctuates
+    (signature,) = signatures(
+        replicates, evaluation, [evaluation.sensors.changed({("afterpulsing", "probability"): 0.1})], 4
+    )
+    assert isinstance(signature, Signature)
+    assert not signature.fluctuates
 
 
 @pytest.mark.parametrize(
@@ -54,18 +61,18 @@ def test_totals_that_go_the_same_way_in_two_recordings_are_chance(lab) -> None:
 )
 def test_what_a_few_totals_share(apart: list[float], believed: bool) -> None:
     """Their scatter in the model's own recordings: 1 %."""
-    shared = fit._shared(np.array(apart), 0.01)
+    shared = _mean_shift(np.array(apart), 0.01)
     assert shared == (pytest.approx(np.mean(apart)) if believed else 0.0)
 
 
 def test_a_lamp_is_seen_to_fluctuate_beside_a_chip_that_is_not_known_exactly(lab) -> None:
-    bench = bench_of(lab(light=1000))
-    sensors = bench.state({}).sensors.changed({}, chips=True)
-    state = bench.state({}, sensors)
+    replicates = bench_of(lab(light=1000))
+    sensors = evaluate(replicates, {}).sensors.changed({}, chips=True)
+    evaluation = evaluate(replicates, {}, sensors)
     for contrast in (0.1, 1e-4):
-        (moved,) = bench.moved(state, [sensors.changed({CONTRAST: contrast, COHERENCE: 3e-3})], 4)
-        assert isinstance(moved, Moved)
-        assert moved.fluctuates == (contrast > 0.01)
+        (signature,) = signatures(replicates, evaluation, [sensors.changed({CONTRAST: contrast, COHERENCE: 3e-3})], 4)
+        assert isinstance(signature, Signature)
+        assert signature.fluctuates == (contrast > 0.01)
 
 
 def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
@@ -75,21 +82,23 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     """
     z, totals = np.array([3.0, -4.0, 2.0, 3.5, -2.0, 1.0]), np.array([4.0, -3.0, 2.0])
 
-    def state(width: float, other: float) -> Any:
+    def evaluation(width: float, other: float) -> Any:
         null = {TREND: SimpleNamespace(breadth=width, law="normal"), MANY: SimpleNamespace(breadth=1.0, law="normal")}
-        left = {TREND: z / width, MANY: np.full(1000, other), RATES: totals / width}
+        left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))
 
-    trace = {TREND: np.zeros(6), MANY: np.zeros(1000), RATES: np.zeros(3)}
-    now, there = state(1.0, 1.2), state(3.0, 1.0)
+    trace = {TREND: np.zeros(6), MANY: np.zeros(1000), TOTALS: np.zeros(3)}
+    now, there = evaluation(1.0, 1.2), evaluation(3.0, 1.0)
     exact = float(z @ z + totals @ totals) * (1 - 1 / 9) - 2 * 9 * math.log(3)
-    assert likelier(now, there, trace, fluctuates=True) == pytest.approx(exact)
-    assert likelier(now, there, trace) == 0.0
+    assert log_likelihood_ratio(now, there, trace, fluctuates=True) == pytest.approx(exact)
+    assert log_likelihood_ratio(now, there, trace) == 0.0
     # data that are no wider than the model's own do not speak for it
-    quiet_now, quiet_there = state(1.0, 1.0), state(3.0, 1.0)
+    quiet_now, quiet_there = evaluation(1.0, 1.0), evaluation(3.0, 1.0)
     for one, width in ((quiet_now, 1.0), (quiet_there, 3.0)):
-        one.residuals = {TREND: np.ones(6) / width, MANY: np.ones(1000), RATES: np.ones(3) / width}
-    assert likelier(quiet_now, quiet_there, trace, fluctuates=True) == pytest.approx(9 * (8 / 9 - 2 * math.log(3)))
+        one.residuals = {TREND: np.ones(6) / width, MANY: np.ones(1000), TOTALS: np.ones(3) / width}
+    assert log_likelihood_ratio(quiet_now, quiet_there, trace, fluctuates=True) == pytest.approx(
+        9 * (8 / 9 - 2 * math.log(3))
+    )
 
 
 def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> None:
@@ -98,23 +107,29 @@ def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> N
     Nor is it weighed against others by squares, for they fall whatever makes the totals wider.
     """
     noise = "    source_noise: {contrast: 0.2, coherence_time: 40 ms}\n"
-    bench = bench_of(lab(noise, light=1000, seed=3))
-    state = bench.state({})
-    assert float(np.max(np.abs(state.residuals[RATES]))) > 4.0
+    replicates = bench_of(lab(noise, light=1000, seed=3))
+    evaluation = evaluate(replicates, {})
+    assert float(np.max(np.abs(evaluation.residuals[TOTALS]))) > 4.0
     values = {CONTRAST: 0.15, COHERENCE: 30e-3}
-    (moved,) = bench.moved(state, [state.sensors.changed(values)], 8, kept="sure")
-    assert isinstance(moved, Moved)
-    one = refining.refine(bench, state, Tried(change_of(bench, "add source_noise"), values, moved, 0.0, 1.0))
-    squares = sum(float(z @ z) for z in state.residuals.values())
+    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], 8, kept="sure")
+    assert isinstance(signature, Signature)
+    one = fit_trial(
+        replicates, evaluation, Trial(change_of(replicates, "add source_noise"), values, signature, 0.0, 1.0)
+    )
+    squares = sum(float(z @ z) for z in evaluation.residuals.values())
     fall = squares - sum(float(z @ z) for z in (one.residuals or {}).values())
     assert one.gain > fall + 8.0
     assert one.fluctuates
     assert one.scatters
-    rivals = [Tried(change_of(bench, "add crosstalk"), {}, moved, one.gain - 1.0, 1.0) for _ in range(2)]
+    rivals = [Trial(change_of(replicates, "add crosstalk"), {}, signature, one.gain - 1.0, 1.0) for _ in range(2)]
     for rival in rivals:
-        rival.moved, rival.residuals, rival.state = replace(moved, fluctuates=False), state.residuals, state
+        rival.signature, rival.residuals, rival.evaluation = (
+            replace(signature, fluctuates=False),
+            evaluation.residuals,
+            evaluation,
+        )
     before = one.gain
-    quiet(bench).weigh(state, [one, *rivals])
+    compare_by_squares(quiet(replicates), evaluation, [one, *rivals])
     assert [t.gain for t in (one, *rivals)] == [before, before - 1.0, before - 1.0]
 
 
@@ -122,11 +137,11 @@ def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> N
 def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -> None:
     """Beside later steps: judged by how wide it makes them itself, nothing would ever be missed without it."""
     noise = f"    source_noise: {{contrast: {contrast}, coherence_time: 2 s}}\n" if contrast else ""
-    course = course_of.begun(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=3)))
-    taken(course, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, settle=False)
-    taken(course, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    course_of.drop_needless(course)
-    assert names(course) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=3)))
+    taken(path, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    drop_needless(path)
+    assert names(path) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]
 
 
 def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, monkeypatch) -> None:
@@ -135,24 +150,24 @@ def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, 
     Whether the sensor has such a lamp from the start or was given it is no matter.
     """
     many: list[int] = []
-    follow, moved = course_of.settling.follow, fit.Bench.moved
-    monkeypatch.setattr(course_of.settling, "follow", lambda *a: many.append(a[5]) or follow(*a))
+    step, simulated = gauss_newton_step, signatures
+    monkeypatch.setattr("spadmnist.inference.model_path.gauss_newton_step", lambda *a: many.append(a[5]) or step(*a))
     for noise, lamp, replicates in [(False, False, 40), (False, True, 40), (False, True, 16), (True, True, 40)]:
         stated = f"    source_noise: {{contrast: {0.2 if lamp else 0.0}, coherence_time: 20 ms}}\n"
         sensor, data = lab(stated if lamp else "", light=1000)
         if noise:
             sensor = with_values(sensor, {CONTRAST: 0.2, COHERENCE: 20e-3})
-        course = course_of.begun(bench_of((sensor, data), replicates))
+        path = begin(bench_of((sensor, data), replicates))
         if lamp and not noise:
-            course.state = course.bench.state({CONTRAST: 0.2, COHERENCE: 20e-3})
+            path.evaluation = evaluate(path.replicates, {CONTRAST: 0.2, COHERENCE: 20e-3})
         held: list[int] = []
         with monkeypatch.context() as patch:
-            patch.setattr(fit.Bench, "moved", lambda *a, **k: held.append(a[3]) or moved(*a, **k))  # noqa: B023
-            dials = tuple(change_of(course.bench, "add crosstalk").dials[:1])
-            course.values[CROSSTALK] = 0.01
-            found, _, _ = course_of._followed(course, course.state, {}, dials, {})
+            patch.setattr("spadmnist.inference.model_path.signatures", lambda *a: held.append(a[3]) or simulated(*a))  # noqa: B023
+            coordinates = tuple(change_of(path.replicates, "add crosstalk").coordinates[:1])
+            path.values[CROSSTALK] = 0.01
+            found, _, _ = _gauss_newton(path, path.evaluation, {}, coordinates, {})
             assert found is not None
             held.clear()
-            course_of._held(course, found)
+            _bounded(path, found)
         wanted = min(replicates, 32) if lamp else 8
         assert many[-1] == held[0] == wanted

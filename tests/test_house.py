@@ -35,7 +35,7 @@ LAYERS = [
     {"dataset"},
     {"measurement"},
     {"factory", "look", "reference", "template", "twin"},
-    {"criticism"},
+    {"inference"},
     {"plan", "verify", "report", "pages", "testing"},
     {"importers"},
     {"exporters", "fluxes", "torch"},
@@ -141,7 +141,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
             {
                 "workers.py",
                 "factory.py",
-                *(f"criticism/{name}.py" for name in ("recordings", "fit")),
+                *(f"inference/{name}.py" for name in ("comparison", "replicates")),
             },
         ),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),

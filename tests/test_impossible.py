@@ -10,23 +10,26 @@ import pytest
 from tinylab import bench_of
 
 from spadmnist import pages
-from spadmnist.criticism import (
-    advice,
-    answer,
-    blocks,
-    candidates,
-    chance,
-    diagnose,
-    fit,
-    limits,
-    mapping,
-    settling,
-    setups,
-)
-from spadmnist.criticism import course as course_of
-from spadmnist.criticism.fit import Bench
-from spadmnist.criticism.search import Search
 from spadmnist.errors import SpadError
+from spadmnist.inference import (
+    experiment_design,
+    map_fits,
+    model_path,
+    model_selection,
+    time_blocks,
+    trial_fits,
+    upper_limits,
+)
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.map_trials import map_trials_of
+from spadmnist.inference.model_path import begin
+from spadmnist.inference.model_selection import _or_as_before, diagnose
+from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.results import Step, Value, canonical, table
+from spadmnist.inference.scan import Scan
+from spadmnist.inference.setups import rivals
+from spadmnist.inference.signature import Signature, signature_of_totals, signatures
 from spadmnist.sensor import Sensor
 
 _AFTER = "afterpulsing: {probability: 0.05, lifetime: 30 ns}\n"
@@ -67,22 +70,22 @@ ERRORS = [SpadError("a cascade does not end"), OverflowError("too large"), ZeroD
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda e: type(e).__name__)
 def test_a_model_that_cannot_be_simulated_is_told_by_the_bench(error: Exception, lab, monkeypatch) -> None:
-    bench = bench_of(lab(), 8)
-    state = bench.state({})
+    replicates = bench_of(lab(), 8)
+    evaluation = evaluate(replicates, {})
     Broken(monkeypatch, "crosstalk", error, armed=True)
-    bad = state.sensors.changed({("crosstalk", "probability"): 0.01})
-    good = state.sensors.changed({("dead_time", "duration"): 60e-9})
-    first, second, third = bench.moved(state, [good, bad, good])
+    bad = evaluation.sensors.changed({("crosstalk", "probability"): 0.01})
+    good = evaluation.sensors.changed({("dead_time", "duration"): 60e-9})
+    first, second, third = signatures(replicates, evaluation, [good, bad, good])
     assert isinstance(second, str) and second
-    assert isinstance(first, fit.Moved) and isinstance(third, fit.Moved)
+    assert isinstance(first, Signature) and isinstance(third, Signature)
     with pytest.raises(SpadError):
-        bench.state({}, bad)
+        evaluate(replicates, {}, bad)
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda e: type(e).__name__)
 def test_a_closed_form_that_fails_is_told_by_the_bench(error: Exception, lab, monkeypatch) -> None:
-    bench = bench_of(lab(), 8)
-    state = bench.state({})
+    replicates = bench_of(lab(), 8)
+    evaluation = evaluate(replicates, {})
     usual = Sensor.expected
 
     def expected(sensor: Sensor, *given: Any) -> Any:
@@ -91,29 +94,29 @@ def test_a_closed_form_that_fails_is_told_by_the_bench(error: Exception, lab, mo
         return usual(sensor, *given)
 
     monkeypatch.setattr(Sensor, "expected", expected)
-    bad = state.sensors.changed({("crosstalk", "probability"): 0.01})
-    good = state.sensors.changed({("dead_time", "duration"): 60e-9})
-    first, second, third = bench.moved(state, [good, bad, good])
+    bad = evaluation.sensors.changed({("crosstalk", "probability"): 0.01})
+    good = evaluation.sensors.changed({("dead_time", "duration"): 60e-9})
+    first, second, third = signatures(replicates, evaluation, [good, bad, good])
     assert isinstance(second, str) and second
-    assert isinstance(first, fit.Moved) and isinstance(third, fit.Moved)
+    assert isinstance(first, Signature) and isinstance(third, Signature)
     with pytest.raises(SpadError):
-        bench.told(state, bad)
+        signature_of_totals(replicates, evaluation, bad)
     with pytest.raises(SpadError):
-        bench.state({}, bad)
+        evaluate(replicates, {}, bad)
 
 
 STAGES: dict[str, tuple[Any, str, bool]] = {
-    "scoring": (Search, "scan", True),
-    "looking again": (Search, "again", True),
-    "refining": (diagnose, "refine", True),
-    "settling": (settling, "settle", True),
-    "accepting": (diagnose, "accept", True),
-    "all together": (course_of, "settle_all", True),
-    "taking out": (diagnose, "drop_needless", False),
-    "likelihood": (diagnose, "settle_exactly", False),
-    "intervals": (diagnose, "open_ends", False),
-    "final comparison": (blocks, "measure", False),
-    "limits": (limits, "upper_limits", False),
+    "scoring": (Scan, "scan", True),
+    "looking again": (Scan, "again", True),
+    "refining": (model_selection, "fit_trial", True),
+    "settling": (trial_fits, "gauss_newton", True),
+    "accepting": (model_selection, "accept", True),
+    "all together": (model_path, "fit_all", True),
+    "taking out": (model_selection, "drop_needless", False),
+    "likelihood": (model_selection, "sharpen", False),
+    "intervals": (model_selection, "open_ends", False),
+    "final comparison": (time_blocks, "measure", False),
+    "limits": (upper_limits, "upper_limits", False),
 }
 
 
@@ -125,34 +128,34 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
     broken = Broken(monkeypatch, "afterpulsing", SpadError("a cascade does not end"), armed=False)
     place, name, stays = STAGES[stage]
     broken.at(monkeypatch, place, name, stays)
-    some = [c for c in candidates.changes(sensor) if c.effect in ("afterpulsing", "crosstalk", "dead_time")]
-    names = {change.effect for change in some}
+    some = [c for c in candidates(sensor) if c.effect in ("afterpulsing", "crosstalk", "dead_time")]
+    names = {candidate.effect for candidate in some}
     monkeypatch.setattr(
-        Bench, "changes", lambda self, model: [c for c in candidates.changes(model) if c.effect in names]
+        Replicates, "candidates", lambda self, model: [c for c in candidates(model) if c.effect in names]
     )
-    found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
+    found = diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
     told = [e for e in found.untried if e["effect"] == "afterpulsing"]
     if stage not in ("taking out", "likelihood", "intervals", "limits"):  # which may need no recording of it
         assert broken.raised
     assert bool(told) == bool(broken.raised)
     if stays:
-        assert all(step.change.effect != "afterpulsing" for step in found.steps)
+        assert all(step.candidate.effect != "afterpulsing" for step in found.steps)
     else:
-        assert [step.change.effect for step in found.steps] == ["afterpulsing"]
+        assert [step.candidate.effect for step in found.steps] == ["afterpulsing"]
     for entry in told:
         assert entry["change"] == "add" and entry["where"] and "a cascade does not end" in entry["why"]
-    assert json.loads(answer.canonical(found))["not_tried"] == found.untried
+    assert json.loads(canonical(found))["not_tried"] == found.untried
     if told:
-        text, page = answer.table(found), pages.diagnosis(found, tmp_path / "page").read_text()
+        text, page = table(found), pages.diagnosis(found, tmp_path / "page").read_text()
         assert "a cascade does not end" in " ".join(text.split()) and "a cascade does not end" in page
 
 
 FAILING: dict[str, tuple[Any, str, bool]] = {
-    "alternative": (diagnose, "_alternative", True),
-    "placebo": (diagnose, "placebo_of", True),
-    "chance": (chance, "of_best", False),
-    "weighing": (Search, "weigh", False),
-    "advice": (advice, "between", True),
+    "alternative": (model_selection, "_alternative", True),
+    "placebo": (model_selection, "placebo_of", True),
+    "chance": (model_selection, "p_of_best", False),
+    "weighing": (model_selection, "compare_by_squares", False),
+    "advice": (experiment_design, "between", True),
 }
 
 
@@ -167,19 +170,19 @@ def test_an_answer_is_given_whatever_is_raised_beside_the_steps(stage: str, lab,
         raise OverflowError("too large")
 
     monkeypatch.setattr(place, name, fails)
-    usual = candidates.changes
+    usual = candidates
     some = ("afterpulsing", "crosstalk", "dead_time")
-    monkeypatch.setattr(Bench, "changes", lambda self, model: [c for c in usual(model) if c.effect in some])
-    found = diagnose.diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
-    assert [step.change.effect for step in found.steps] == (["afterpulsing"] if found_it else [])
+    monkeypatch.setattr(Replicates, "candidates", lambda self, model: [c for c in usual(model) if c.effect in some])
+    found = diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
+    assert [step.candidate.effect for step in found.steps] == (["afterpulsing"] if found_it else [])
     assert found.verdict in (("explained", "confused", "partly_explained") if found_it else ("unexplained",))
     if not found_it:
         assert {e["effect"] for e in found.untried} >= {"afterpulsing"} and found.untried[0]["where"]
 
 
 def test_a_rival_of_the_set_up_that_has_no_closed_form_is_none(lab, monkeypatch) -> None:
-    bench = bench_of(lab(), 8)
-    state, look = bench.state({}), Search(bench, lambda what: None)
+    replicates = bench_of(lab(), 8)
+    evaluation, look = evaluate(replicates, {}), Scan(replicates, lambda what: None)
     usual = Sensor.expected
 
     def expected(sensor: Sensor, *given: Any) -> Any:
@@ -188,19 +191,19 @@ def test_a_rival_of_the_set_up_that_has_no_closed_form_is_none(lab, monkeypatch)
         return usual(sensor, *given)
 
     monkeypatch.setattr(Sensor, "expected", expected)
-    assert all(rival.change.effect != "crosstalk" for rival in setups.rivals(look, state, 1e6))
+    assert all(rival.candidate.effect != "crosstalk" for rival in rivals(look, evaluation, 1e6))
     assert {(e["effect"], e["where"]) for e in look.untried} == {("crosstalk", "explaining the totals")}
 
 
 def test_a_map_that_cannot_be_made_is_none(lab, monkeypatch) -> None:
-    bench = bench_of(lab(), 8)
-    state, look = bench.state({}), Search(bench, lambda what: None)
+    replicates = bench_of(lab(), 8)
+    evaluation, look = evaluate(replicates, {}), Scan(replicates, lambda what: None)
 
     def fails(*_: Any) -> Any:
         raise FloatingPointError("no map")
 
-    monkeypatch.setattr(mapping, "sensors_with", fails)
-    assert look.maps(state, {}) == []
+    monkeypatch.setattr(map_fits, "models_with_maps", fails)
+    assert map_trials_of(look, evaluation, {}) == []
     assert look.untried and all("no map" in entry["why"] for entry in look.untried)
     assert {entry["where"] for entry in look.untried} == {"making a map"}
 
@@ -209,28 +212,28 @@ def test_a_sensor_that_cannot_be_simulated_itself_is_one_error(lab, monkeypatch)
     sensor, data = lab()
     Broken(monkeypatch, "dead_time", OverflowError("too large"), armed=True)
     with pytest.raises(SpadError, match="too large"):
-        diagnose.diagnose(sensor, data, quick=True, jobs=1)
+        diagnose(sensor, data, quick=True, jobs=1)
 
 
 def test_an_interrupt_ends_a_diagnosis(lab, monkeypatch) -> None:
-    bench = bench_of(lab(), 8)
-    state = bench.state({})
+    replicates = bench_of(lab(), 8)
+    evaluation = evaluate(replicates, {})
     Broken(monkeypatch, "crosstalk", KeyboardInterrupt(), armed=True)
     with pytest.raises(KeyboardInterrupt):
-        bench.moved(state, [state.sensors.changed({("crosstalk", "probability"): 0.01})])
+        signatures(replicates, evaluation, [evaluation.sensors.changed({("crosstalk", "probability"): 0.01})])
 
 
 def test_steps_are_as_they_were_where_a_later_stage_fails(lab) -> None:
     """Values and intervals, too, that were written before it failed."""
-    bench = bench_of(lab(), 8)
-    course = course_of.begun(bench)
-    change = next(c for c in candidates.changes(bench.start) if c.name == "add crosstalk")
-    step = answer.Step(change, {"probability": answer.Value(0.01, 0.0, 0.02)}, 1.0, 9.0, "")
-    course.steps, before = [step], dict(step.values)
-    with diagnose._or_as_before(course, "the intervals"):
-        step.values["probability"] = answer.Value(0.5, 0.4, 0.6)
-        course.steps = []
+    replicates = bench_of(lab(), 8)
+    path = begin(replicates)
+    candidate = next(c for c in candidates(replicates.start) if c.name == "add crosstalk")
+    step = Step(candidate, {"probability": Value(0.01, 0.0, 0.02)}, 1.0, 9.0, "")
+    path.steps, before = [step], dict(step.values)
+    with _or_as_before(path, "the intervals"):
+        step.values["probability"] = Value(0.5, 0.4, 0.6)
+        path.steps = []
         raise OverflowError("too large")
-    assert course.steps == [step] and step.values == before
-    (told,) = course.search.untried
+    assert path.steps == [step] and step.values == before
+    (told,) = path.scan.untried
     assert told["effect"] == "crosstalk" and told["where"] == "the intervals" and "too large" in told["why"]

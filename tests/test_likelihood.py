@@ -12,8 +12,12 @@ import pytest
 from scipy import integrate, stats
 
 from spadmnist import config
-from spadmnist.criticism import candidates, likelihood, maxima
 from spadmnist.effects import Conditions
+from spadmnist.inference.candidates import Candidate, candidates, with_values
+from spadmnist.inference.coordinates import Key
+from spadmnist.inference.exact_likelihood import Likelihood, MaximumLikelihood, maximise, not_in_likelihood
+from spadmnist.inference.point_process import _FOLLOWS, _LAST, _followed, _of_rates
+from spadmnist.inference.profile_likelihood import crossing, maximum
 from spadmnist.light import photons_from_irradiance
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -70,17 +74,17 @@ def bits(sensor: Sensor, frames: int, photons: Sequence[float], stated: float) -
     return model_recordings(sensor, capture, np.array(photons), streams, images)
 
 
-def named(sensor: Sensor, *names: str) -> list[candidates.Change]:
-    return [next(c for c in candidates.changes(sensor) if c.name == name) for name in names]
+def named(sensor: Sensor, *names: str) -> list[Candidate]:
+    return [next(c for c in candidates(sensor) if c.name == name) for name in names]
 
 
-def found(sensor: Sensor, data: Sequence[Recording], *names: str) -> likelihood.Exact:
-    exact = likelihood.settled(sensor, data, named(sensor, *names))
-    assert isinstance(exact, likelihood.Exact), exact
+def found(sensor: Sensor, data: Sequence[Recording], *names: str) -> MaximumLikelihood:
+    exact = maximise(sensor, data, named(sensor, *names))
+    assert isinstance(exact, MaximumLikelihood), exact
     return exact
 
 
-def check(answers: Sequence[likelihood.Exact], key: candidates.Key, truth: float, coverage: bool = True) -> None:
+def check(answers: Sequence[MaximumLikelihood], key: Key, truth: float, coverage: bool = True) -> None:
     """Values scatter about the truth as their intervals say, and the intervals miss it as often as they should."""
     values = np.array([a.values[key] for a in answers])
     ends = np.array([a.intervals[key] for a in answers])
@@ -94,10 +98,10 @@ def check(answers: Sequence[likelihood.Exact], key: candidates.Key, truth: float
 
 @pytest.mark.slow
 def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
-    hidden = candidates.with_values(sensor, TRUTH)
+    hidden = with_values(sensor, TRUTH)
     # no two pixels need be alike: each has a rate of its own
     map_ = {("detection", "relative"): np.linspace(0.6, 1.4, 16)}
-    data = stamps(candidates.with_values(hidden, map_), 3e-4, 2e6, SETS)
+    data = stamps(with_values(hidden, map_), 3e-4, 2e6, SETS)
     assert 3000 < np.mean([r.totals.sum() for r in data]) < 5000
     answers = [found(sensor, [one], "set dead_time.duration", "set afterpulsing.probability") for one in data]
     for key, truth in TRUTH.items():
@@ -106,8 +110,8 @@ def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
 
 def test_a_rate_is_covered_with_its_light(sensor: Sensor) -> None:
     truth = 3000.0
-    hidden = candidates.with_values(sensor, {RATE: truth, CHANCE: 0.0})
-    model = candidates.with_values(sensor, {CHANCE: 0.0})
+    hidden = with_values(sensor, {RATE: truth, CHANCE: 0.0})
+    model = with_values(sensor, {CHANCE: 0.0})
     light = 2e4 * np.exp(0.02 * np.random.default_rng(3).standard_normal(SETS))
     pairs = zip(bits(hidden, 300, np.zeros(SETS), 0.0), bits(hidden, 300, light, 2e4), strict=True)
     answers = [found(model, pair, "set dark_counts.rate") for pair in pairs]
@@ -122,7 +126,7 @@ def test_an_effect_that_is_missing_is_added(sensor: Sensor) -> None:
     """With its lifetime."""
     rest = [e for e in sensor.effects if e.name not in CHANCE]
     without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
-    hidden = candidates.with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9})
+    hidden = with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9})
     exact = found(without, stamps(hidden, 5e-3, 1e6, 1), "add afterpulsing")
     for key, truth in ((CHANCE, 0.05), (LIFETIME, 60e-9)):
         low, high = exact.intervals[key]
@@ -134,7 +138,7 @@ def test_traps_that_outlive_the_next_detection(sensor: Sensor) -> None:
     rest = [e for e in sensor.effects if e.name not in CHANCE]
     without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
     keys = ("slow_afterpulsing", "probability"), ("slow_afterpulsing", "lifetime")
-    hidden = candidates.with_values(without, {keys[0]: 0.1, keys[1]: 3e-6})
+    hidden = with_values(without, {keys[0]: 0.1, keys[1]: 3e-6})
     exact = found(without, stamps(hidden, 1e-2, 4e5, 1), "add slow_afterpulsing")
     for key, truth in zip(keys, (0.1, 3e-6), strict=True):
         low, high = exact.intervals[key]
@@ -143,8 +147,8 @@ def test_traps_that_outlive_the_next_detection(sensor: Sensor) -> None:
 
 def test_an_edge_that_jitter_blurs(sensor: Sensor) -> None:
     jitter = ("jitter", "sigma")
-    hidden = candidates.with_values(sensor, {jitter: 400e-12, DEAD: 52e-9})
-    model = candidates.with_values(sensor, {jitter: 300e-12})
+    hidden = with_values(sensor, {jitter: 400e-12, DEAD: 52e-9})
+    model = with_values(sensor, {jitter: 300e-12})
     exact = found(model, stamps(hidden, 4e-3, 4e6, 1), "set dead_time.duration", "set jitter.sigma")
     for key, truth in ((DEAD, 52e-9), (jitter, 400e-12)):
         low, high = exact.intervals[key]
@@ -162,13 +166,13 @@ def test_nothing_is_told_where_nothing_happened(sensor: Sensor) -> None:
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Where the likelihood is asked for from now on."""
     asked: list[np.ndarray] = []
-    value = likelihood.Likelihood.__call__
+    value = Likelihood.__call__
 
-    def call(self: likelihood.Likelihood, u: np.ndarray) -> float:
+    def call(self: Likelihood, u: np.ndarray) -> float:
         asked.append(u)
         return value(self, u)
 
-    monkeypatch.setattr(likelihood.Likelihood, "__call__", call)
+    monkeypatch.setattr(Likelihood, "__call__", call)
     return asked
 
 
@@ -177,21 +181,21 @@ def test_a_start_saves_time_and_changes_nothing(sensor: Sensor, monkeypatch: pyt
     """Even where it is none."""
     rest = [e for e in sensor.effects if e.name not in CHANCE]
     without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
-    hidden = candidates.with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9, DEAD: 52e-9})
+    hidden = with_values(without, {CHANCE: 0.05, LIFETIME: 60e-9, DEAD: 52e-9})
     data = stamps(hidden, 5e-3, 1e6, 1)
-    changes = named(without, "add afterpulsing", "set dead_time.duration")
+    candidates = named(without, "add afterpulsing", "set dead_time.duration")
     asked = counted(monkeypatch)
-    exact = likelihood.settled(without, data, changes)
-    assert isinstance(exact, likelihood.Exact)
+    exact = maximise(without, data, candidates)
+    assert isinstance(exact, MaximumLikelihood)
     alone = len(asked)
-    dials = {d.key: d for change in changes for d in change.dials}
-    ends = {key: [dials[key].coordinate(x) for x in interval] for key, interval in exact.intervals.items()}
+    coordinates = {d.key: d for candidate in candidates for d in candidate.coordinates}
+    ends = {key: [coordinates[key].coordinate(x) for x in interval] for key, interval in exact.intervals.items()}
     errors = {key: (high - low) / 3.92 for key, (low, high) in ends.items()}
-    start = {key: d.value(d.coordinate(exact.values[key]) - off * errors[key]) for key, d in dials.items()}
-    again = likelihood.settled(without, data, changes, start=start, errors=errors)
-    assert isinstance(again, likelihood.Exact)
+    start = {key: d.value(d.coordinate(exact.values[key]) - off * errors[key]) for key, d in coordinates.items()}
+    again = maximise(without, data, candidates, start=start, errors=errors)
+    assert isinstance(again, MaximumLikelihood)
     assert len(asked) - alone < (0.7 if off < 10 else 2.0) * alone
-    for key, d in dials.items():
+    for key, d in coordinates.items():
         assert abs(d.coordinate(again.values[key]) - d.coordinate(exact.values[key])) < 0.2 * errors[key]
         assert [d.coordinate(x) for x in again.intervals[key]] == pytest.approx(ends[key], abs=0.05 * errors[key])
 
@@ -199,17 +203,17 @@ def test_a_start_saves_time_and_changes_nothing(sensor: Sensor, monkeypatch: pyt
 def test_a_number_that_nothing_follows_is_left_alone(sensor: Sensor) -> None:
     """A tail without weight."""
     bounds = np.array([[-5.0, -5.0], [5.0, 5.0]])
-    top = maxima.topped(lambda u: -(u[0] ** 2), np.array([1.0, 1.0]), np.ones(2), bounds)
+    top = maximum(lambda u: -(u[0] ** 2), np.array([1.0, 1.0]), np.ones(2), bounds)
     assert top is not None
     assert top.tells.tolist() == [True, False]
     assert top.u == pytest.approx([0.0, 1.0], abs=1e-6)
-    model = candidates.with_values(sensor, {("jitter", "sigma"): 300e-12})
-    hidden = candidates.with_values(model, {DEAD: 52e-9})
+    model = with_values(sensor, {("jitter", "sigma"): 300e-12})
+    hidden = with_values(model, {DEAD: 52e-9})
     data = stamps(hidden, 4e-3, 4e6, 1)
     alone = found(model, data, "set dead_time.duration")
     both = found(model, data, "set dead_time.duration", "set jitter.tail")
-    (dial,) = named(model, "set jitter.tail")[0].dials
-    assert both.intervals[dial.key] == pytest.approx((dial.low, dial.high))
+    (coordinate,) = named(model, "set jitter.tail")[0].coordinates
+    assert both.intervals[coordinate.key] == pytest.approx((coordinate.low, coordinate.high))
     assert both.intervals[DEAD] == pytest.approx(alone.intervals[DEAD], rel=1e-5)
 
 
@@ -231,7 +235,7 @@ def test_where_a_fall_comes_to_so_much(fallen: Callable[[float], float], where: 
         asked.append(x)
         return fallen(x)
 
-    assert maxima.reached(of, 2.0, first, 50.0, 0.01)[2] == pytest.approx(where, rel=0.02)
+    assert crossing(of, 2.0, first, 50.0, 0.01)[2] == pytest.approx(where, rel=0.02)
     assert len(asked) < 25
 
 
@@ -243,15 +247,15 @@ def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
     def density(end: float, *later: float) -> float:
         times = np.array([*history, *later])
         # every gap is followed: those between, then the one to the end; none comes before the first
-        gaps, kinds = np.diff([*times, end]), np.array([*[likelihood._FOLLOWS] * (len(times) - 1), 0], np.uint8)
+        gaps, kinds = np.diff([*times, end]), np.array([*[_FOLLOWS] * (len(times) - 1), 0], np.uint8)
         kinds = np.roll(kinds, 1)
-        kinds[-1] |= likelihood._LAST
+        kinds[-1] |= _LAST
         offsets, counts = np.array([0, len(gaps)]), np.array([len(times)])
         hazard, used = np.zeros(len(gaps)), np.zeros(1, np.int64)
         about = counts, end, dead, chance, lifetime, rate, 500e-12, 0.0
-        base, awake = likelihood._followed(gaps, kinds, offsets, *about, hazard, used)
+        base, awake = _followed(gaps, kinds, offsets, *about, hazard, used)
         rest = hazard, offsets, used, counts, awake
-        return math.exp(float(base[0] + likelihood._of_rates(*rest, rate)[0][0]))
+        return math.exp(float(base[0] + _of_rates(*rest, rate)[0][0]))
 
     last, end = history[-1], history[-1] + 3e-6
     grid = last + np.concatenate([np.linspace(49e-9, 51e-9, 801), np.geomspace(51.01e-9, 3e-6, 3001)])
@@ -281,20 +285,20 @@ def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
         ({}, "str", "str of lit"),
     ],
 )
-def test_what_it_does_not_know(sensor: Sensor, values: dict[candidates.Key, float], modality: str, word: str) -> None:
+def test_what_it_does_not_know(sensor: Sensor, values: dict[Key, float], modality: str, word: str) -> None:
     capture = lit(sensor, modality, 1e5, Conditions(1e-3, 100, 1e-5, 1e-5, 500e-9))
-    assert likelihood.unknown(candidates.with_values(sensor, values), capture) == word
+    assert not_in_likelihood(with_values(sensor, values), capture) == word
 
 
 def test_neither_the_traps_of_the_papers_rules_nor_a_mean(sensor: Sensor) -> None:
     capture = lit(sensor, "tr", 1e5, Conditions(1e-3, 100, 1e-5, 1e-5, 500e-9))
     paper = Sensor(sensor.layout, sensor.effects, "paper", sensor.chip_seed, sensor.name)
-    assert likelihood.unknown(paper.settled(), capture) == "afterpulsing"
-    assert likelihood.unknown(sensor, replace(capture, mean=3.0)) == "the mean of lit"
+    assert not_in_likelihood(paper.settled(), capture) == "afterpulsing"
+    assert not_in_likelihood(sensor, replace(capture, mean=3.0)) == "the mean of lit"
 
 
 def test_maps_and_switches_have_none(sensor: Sensor) -> None:
     (data,) = stamps(sensor, 1e-4, 1e5, 1)
     for name in ("per_pixel detection.pdp", "set dead_time.paralyzable"):
-        assert isinstance(likelihood.settled(sensor, [data], named(sensor, name)), str)
-    assert likelihood.settled(sensor, [data], named(sensor, "add crosstalk")) == "crosstalk"
+        assert isinstance(maximise(sensor, [data], named(sensor, name)), str)
+    assert maximise(sensor, [data], named(sensor, "add crosstalk")) == "crosstalk"

@@ -11,9 +11,12 @@ from joblib import Parallel
 
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
-from spadmnist.criticism import mapping, recordings
-from spadmnist.criticism.candidates import changes, with_values
-from spadmnist.criticism.fit import Bench
+from spadmnist.inference.candidates import candidates, with_values
+from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.light_levels import closed_form
+from spadmnist.inference.map_fits import fit_maps, light_levels_of
+from spadmnist.inference.pixel_maps import _DOUBT, PixelMap, pattern_tests
+from spadmnist.inference.replicates import Replicates
 
 SIDE, FRAMES = 20, 60_000
 SENSOR = f"""sensor:
@@ -44,10 +47,10 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
-    change = next(c for c in changes(sensor) if c.name == "per_pixel dark_counts.rate")
-    found = mapping.settle_maps(bench, {}, [change], {"dark": 1.0})[("dark_counts", "rate")].values()
-    counts = bench.seen["dark"].counts
+    replicates = Replicates(sensor, data, 0, Parallel(n_jobs=1), 8)
+    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
+    found = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")].values()
+    counts = replicates.seen["dark"].counts
     assert counts is not None
     expected = found * FRAMES * 1e-6
     # 5 sigma of all of them, of what most have, of the hot ones
@@ -67,10 +70,10 @@ def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
-    change = next(c for c in changes(sensor) if c.name == "per_pixel dark_counts.rate")
-    map_ = mapping.settle_maps(bench, {}, [change], {"dark": 1.0})[("dark_counts", "rate")]
-    counts = bench.seen["dark"].counts
+    replicates = Replicates(sensor, data, 0, Parallel(n_jobs=1), 8)
+    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
+    map_ = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")]
+    counts = replicates.seen["dark"].counts
     assert counts is not None and map_.likely is not None
     rng = np.random.default_rng(6)
     drawn = np.stack([rng.poisson(map_.values(rng.standard_normal(SIDE**2)) * 0.01) for _ in range(200)])
@@ -96,12 +99,12 @@ def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> N
     truth = with_values(sensor, {("detection", "relative"): relative / relative.mean()})
     wanted = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, wanted, tmp_path / "lab", 5))
-    bench = Bench(sensor, data, 0, Parallel(n_jobs=1), 8)
-    share = bench.seen["flat"].total / SIDE**2 / 1500
+    replicates = Replicates(sensor, data, 0, Parallel(n_jobs=1), 8)
+    share = replicates.seen["flat"].total / SIDE**2 / 1500
     assert 0.97 < share < 0.99
-    change = next(c for c in changes(sensor) if c.name == "per_pixel detection.pdp")
-    levels = mapping.levels_of(bench, bench.state({}))
-    map_ = mapping.settle_maps(bench, {}, [change], levels)[change.carrier]  # type: ignore[index]
+    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")
+    levels = light_levels_of(replicates, evaluate(replicates, {}))
+    map_ = fit_maps(replicates, {}, [candidate], levels)[candidate.carrier]  # type: ignore[index]
     assert np.median(map_.raw_error) == pytest.approx(1 / math.sqrt(1500 * share), rel=0.05)
     apart = map_.raw - np.log(relative / relative.mean())
     pull = (apart - np.median(apart)) / map_.raw_error
@@ -117,7 +120,7 @@ def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_pat
     sensor = with_values(config.read_sensor(tmp_path / "sensor.yaml"), {("short_gate", "fraction"): fraction})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(sensor, plan, tmp_path / "lab", 5))
-    expected = recordings.closed_form(sensor, data.captures[0])(1e-9)
+    expected = closed_form(sensor, data.captures[0])(1e-9)
     total = float(data.recording("dark", sensor).totals.sum())
     # about 45,000 detections; 5 sigma are 2 %, the gate makes 40 %
     assert abs(total / expected - 1) < 5 / np.sqrt(expected)
@@ -133,7 +136,7 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     raw = rng.normal(0, math.hypot(sigma, noise), n)
     share = sigma**2 / (sigma**2 + noise**2)
     error = np.full(n, math.sqrt(share) * noise)
-    map_ = mapping.Map(("a", "b"), 1.0, np.arange(n), share * raw, error, raw, np.full(n, noise), sigma)
+    map_ = PixelMap(("a", "b"), 1.0, np.arange(n), share * raw, error, raw, np.full(n, noise), sigma)
 
     def widths(doubt: bool) -> np.ndarray:
         draws = [map_.values(rng.standard_normal(n), float(rng.standard_normal()) * doubt) for _ in range(400)]
@@ -142,7 +145,7 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     known, doubted = widths(False), widths(True)
     assert np.mean(known) == pytest.approx(sigma**2, rel=0.25)
     # by how much the estimate of a variance scatters, times how the width of a draw follows it
-    alone = mapping._DOUBT / math.sqrt(n) * (sigma**2 + noise**2)
+    alone = _DOUBT / math.sqrt(n) * (sigma**2 + noise**2)
     bigger, usual = (s**2 / (s**2 + noise**2) for s in (math.sqrt(sigma**2 + alone), sigma))
     follows = float(np.var(raw)) * (bigger**2 - usual**2) + noise**2 * (bigger - usual)
     assert 0.7 < math.sqrt(np.var(doubted) - np.var(known)) / follows < 1.4
@@ -151,7 +154,7 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     for width in (-3.0, 3.0):
         assert math.log(map_.values(np.zeros(n), width)[7]) == pytest.approx(3.0, abs=0.01)
     # where each pixel says where it is, there is no doubt
-    clear = mapping.Map(("a", "b"), 1.0, np.arange(n), raw, np.full(n, 1e-4), raw, np.full(n, 1e-4), sigma)
+    clear = PixelMap(("a", "b"), 1.0, np.arange(n), raw, np.full(n, 1e-4), raw, np.full(n, 1e-4), sigma)
     draw = rng.standard_normal(n)
     assert clear.values(draw, 2.0) == pytest.approx(clear.values(draw, 0.0), rel=1e-4)
 
@@ -169,8 +172,8 @@ def test_a_gradient_is_a_gradient_and_no_pattern_of_rows(slope: float) -> None:
     def told(light: np.ndarray) -> dict[str, tuple[float, float]]:
         raw = np.log(light) + rng.normal(0, noise, n)
         raw[[5, 100]] = [-3.0, 2.0]  # odd pixels make no pattern
-        map_ = mapping.Map(("a", "b"), 1.0, np.arange(n), raw, np.full(n, noise), raw, np.full(n, noise), 0.01)
-        return mapping.patterned(map_, {"gradient": gradient, "rows": rows})
+        map_ = PixelMap(("a", "b"), 1.0, np.arange(n), raw, np.full(n, noise), raw, np.full(n, noise), 0.01)
+        return pattern_tests(map_, {"gradient": gradient, "rows": rows})
 
     found = told(1 + slope * y)
     assert found["gradient"][0] < 1e-6 and found["rows"][0] < 1e-6

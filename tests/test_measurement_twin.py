@@ -23,11 +23,11 @@ from scipy import stats
 
 import spadmnist.sensor
 from spadmnist import config, measurement, twin
-from spadmnist.criticism import compare
 from spadmnist.effects.detection import Detection
 from spadmnist.effects.flicker import Flicker
 from spadmnist.effects.short_gate import ShortGate
 from spadmnist.events import Layout
+from spadmnist.inference.comparison import compare
 from spadmnist.plugins import ByWavelength
 from spadmnist.recording import Capture, Recording
 from spadmnist.sensor import Sensor
@@ -179,7 +179,7 @@ def test_a_wavelength_that_the_sensor_says_nothing_of_is_told_with_its_capture(t
     opened = measurement.open(described(tmp_path, light.format("a", 500), light.format("b", 900)))
     table = ByWavelength((400e-9, 800e-9), (0.4, 0.1))
     sensor = Sensor(Layout(3, 10, 25e-12, 1.0), [Detection(pdp=table)], "device", name="test")
-    for judge in (lambda: opened.check_sensor(sensor), lambda: compare.compare(sensor, opened, jobs=1)):
+    for judge in (lambda: opened.check_sensor(sensor), lambda: compare(sensor, opened, jobs=1)):
         text = refused(judge, "detection.pdp: the wavelength 900 nm lies outside the table", "400 nm to 800 nm")
         assert "measurement.yaml:6: captures[1]" in text
     measurement.open(described(tmp_path, light.format("a", 500))).check_sensor(sensor)

@@ -23,10 +23,10 @@ import pytest
 from PIL import Image
 
 from spadmnist import pages
-from spadmnist.criticism import compare
-from spadmnist.criticism.compare import Check, Comparison, Nuisance
-from spadmnist.criticism.nulls import Judgement
 from spadmnist.errors import SpadError
+from spadmnist.inference.comparison import Check, Comparison, _verdicts, light_of
+from spadmnist.inference.light_levels import Nuisance
+from spadmnist.inference.null_distribution import Judgement
 from spadmnist.pages import _comparison, _figures, _frame
 from spadmnist.recording import Capture, Light
 from spadmnist.statistics import Statistic, Summary
@@ -130,7 +130,7 @@ def check_of(
 
 
 def comparison_of(checks: list[Check], tolerance: float | None = None, **options: Any) -> Comparison:
-    judged = compare._verdicts(checks, tolerance)
+    judged = _verdicts(checks, tolerance)
     values: dict[str, Any] = {
         "sensor": "lab tr",
         "measurement": "monday",
@@ -455,7 +455,7 @@ def test_the_picture_of_the_light_shows_what_is_stated(uncertainty: float, shift
     for k in range(3):
         capture = Capture(f"flat-{k}", "tr", Light(500e-9, 1.0, "irradiance", uncertainty, 0.002), conditions)
         levels.append((capture, shift + 0.001 * k, 0.003, 1.0))
-    nuisances, _ = compare.light_of(levels, [])
+    nuisances, _ = light_of(levels, [])
     assert nuisances[0].capture is None and len(nuisances) == 4
     assert nuisances[0].stated == uncertainty and nuisances[1].stated == 0.002
     form, data = decoded(_comparison._light_picture(nuisances).source)

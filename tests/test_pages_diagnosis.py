@@ -16,12 +16,11 @@ from click.testing import CliRunner
 from test_pages import EVIL, Parts, decoded, marks, near, needs_a_browser, screenshot, summary_of
 
 from spadmnist import cli, measurement, pages
-from spadmnist.criticism import answer
-from spadmnist.criticism import diagnose as criticism
-from spadmnist.criticism.answer import Diagnosis, Step, Trace, Value
-from spadmnist.criticism.candidates import Change
 from spadmnist.effects import Effect
 from spadmnist.errors import SpadError
+from spadmnist.inference import model_selection
+from spadmnist.inference.candidates import Candidate
+from spadmnist.inference.results import Diagnosis, Step, Trace, Value, table
 from spadmnist.pages import _diagnosis, _figures
 from spadmnist.statistics import Statistic, Summary
 
@@ -63,8 +62,8 @@ def rung(model: str, misfit: float, errors: tuple[float, ...] = (), placebo: boo
     return {"model": model, "misfit": misfit, "errors": dict(zip(names, errors, strict=False)), "placebo": placebo}
 
 
-def change_of(kind: str, effect: str, parameter: str | None = None) -> Change:
-    return Change(kind, effect, parameter, (), carrier=(effect, "relative") if kind == "per_pixel" else None)
+def change_of(kind: str, effect: str, parameter: str | None = None) -> Candidate:
+    return Candidate(kind, effect, parameter, (), carrier=(effect, "relative") if kind == "per_pixel" else None)
 
 
 def other(kind: str, effect: str, parameter: str | None, misfit: float) -> dict[str, Any]:
@@ -279,7 +278,7 @@ def test_what_would_look_the_same_is_said(tmp_path: Path) -> None:
     for name, there in (("jitter", True), ("crosstalk", False)):
         step = Step(change_of("add", name), {}, 1.0, 8.0, "mean rate +0%")
         found = answer_of(steps=[step])
-        assert (said in answer.table(found)) == there
+        assert (said in table(found)) == there
         assert (said in written(found, tmp_path)[1].text) == there
 
 
@@ -433,7 +432,7 @@ def test_the_command_writes_it_and_says_before_the_work_that_it_cannot(
         asked.append(1)
         return answer_of(**BARE | {"verdict": "adequate"})
 
-    monkeypatch.setattr(criticism, "diagnose", diagnose)
+    monkeypatch.setattr(model_selection, "diagnose", diagnose)
     monkeypatch.setattr(measurement, "open", lambda path: None)
     sensor = str(Path(__file__).parents[1] / "configs" / "spad23.yaml")
     folder = tmp_path / "next"

@@ -15,12 +15,12 @@ from measured import described, device, stored
 from scipy import stats
 
 from spadmnist import cli, config, factory, look, measurement, scene, twin
-from spadmnist.criticism import compare
-from spadmnist.criticism.recordings import statistics_for
 from spadmnist.effects import Conditions
 from spadmnist.effects.detection import Detection
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Layout
+from spadmnist.inference.comparison import compare
+from spadmnist.inference.replicates import statistics_for
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.scene import Scene
 from spadmnist.sensor import Sensor
@@ -315,7 +315,7 @@ def test_a_right_model_of_a_scene_is_adequate_and_another_scene_is_not(tmp_path:
     sensor, seen = large()
     lit = ", lux: 1 lux, relative_uncertainty: 0.05"
     data = measured(tmp_path / "a", seen, lit, seed=4)
-    right = compare.compare(sensor, data, jobs=1)
+    right = compare(sensor, data, jobs=1)
     assert right.verdict == "adequate" and "pixel_map" in {c.statistic for c in right.checks}
     assert not {c.statistic for c in right.checks} & {"surface", "spread", "tails", "outliers"}
     (capture,) = data.captures
@@ -328,7 +328,7 @@ def test_a_right_model_of_a_scene_is_adequate_and_another_scene_is_not(tmp_path:
     recording = data.recording("a", sensor)
     wrong = replace(data, captures=(other,))
     wrong._read = lambda index, layout, dead_time: (recording.named(other), [])
-    found = compare.compare(sensor, wrong, jobs=1)
+    found = compare(sensor, wrong, jobs=1)
     assert found.verdict == "fails" and "pixel_map" in {c.statistic for c in found.failing}
 
 
@@ -340,7 +340,7 @@ def test_a_free_level_of_a_scene_is_fitted(tmp_path: Path) -> None:
     free = replace(data, captures=(replace(capture, light=replace(capture.light, level=None)),))
     recording = data.recording("a", sensor)
     free._read = lambda index, layout, dead_time: (recording.named(free.captures[0]), [])
-    found = compare.compare(sensor, free, jobs=1)
+    found = compare(sensor, free, jobs=1)
     assert found.verdict == "adequate" and not found.nuisances
 
 
@@ -377,7 +377,7 @@ def test_a_dataset_of_a_chart_is_a_measurement_of_its_scene(tmp_path: Path) -> N
     charts = experiment.load_images()
     for capture in data.captures:
         assert capture.light.scene == Scene("x", charts[capture.id.split()[2]].pixels[0])
-    assert compare.compare(experiment.sensor, data, jobs=1).verdict == "adequate"
+    assert compare(experiment.sensor, data, jobs=1).verdict == "adequate"
 
 
 def test_a_dataset_of_other_images_is_none(tmp_path: Path) -> None:

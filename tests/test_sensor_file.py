@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from spadmnist import cli, config, measurement, sensor_file
-from spadmnist.criticism import diagnose
-from spadmnist.criticism.answer import Diagnosis
 from spadmnist.errors import InputError, SpadError
+from spadmnist.inference import model_selection
+from spadmnist.inference.results import Diagnosis
 from spadmnist.plugins import PER, ByWavelength
 
 SENSOR = """sensor:
@@ -113,7 +113,7 @@ def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, values: dict[Any, An
     """`diagnose` on the command line, where these values were found."""
     lists: list[Any] = [[], [], [], [], [], [], []]
     found = Diagnosis("small", "lab", "adequate", 1.0, 1.0, 1.2, *lists, values=values)
-    monkeypatch.setattr(diagnose, "diagnose", lambda *_, **__: found)
+    monkeypatch.setattr(model_selection, "diagnose", lambda *_, **__: found)
     monkeypatch.setattr(measurement, "open", lambda path: None)
     (folder / "lab").mkdir()
     asked = ["diagnose", str(sensor_in(folder, 16, 16)), str(folder / "lab"), "-o", str(folder / "next")]

@@ -11,8 +11,10 @@ from click.testing import CliRunner
 
 from spadmnist import cli, config, sensor_file
 from spadmnist import measurement as measurements
-from spadmnist.criticism import answer, compare, diagnose
 from spadmnist.errors import InputError
+from spadmnist.inference.comparison import _between_wavelengths, compare
+from spadmnist.inference.model_selection import diagnose
+from spadmnist.inference.results import NONLINEARITY, table
 from spadmnist.measurement import Measurement
 
 SENSOR = """sensor:
@@ -56,8 +58,8 @@ PAPER = {
 def test_the_papers_means_are_a_matter_of_the_set_up(tmp_path):
     data = measured(tmp_path, PAPER)
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
-    assert compare.compare(sensor, data, jobs=1).verdict == "fails"
-    found = diagnose.diagnose(sensor, data, quick=True, jobs=1)
+    assert compare(sensor, data, jobs=1).verdict == "fails"
+    found = diagnose(sensor, data, quick=True, jobs=1)
     assert found.verdict == "setup" and not found.steps
     # opposite signs at low and high light: light or exposure, which these captures cannot tell apart
     assert {e["quantity"] for e in found.setup} == {"light", "exposure"} and all(e["confused"] for e in found.setup)
@@ -75,8 +77,8 @@ def test_means_that_the_model_has_are_adequate(tmp_path):
     means = {"low-500": 457, "low-700": 60, "high-500": 9740, "high-700": 4184, "dark": 2.65}
     data = measured(tmp_path, {id: (*PAPER[id][:3], mean) for id, mean in means.items()})
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
-    assert compare.compare(sensor, data, jobs=1).verdict == "adequate"
-    assert diagnose.diagnose(sensor, data, quick=True, jobs=1).verdict == "adequate"
+    assert compare(sensor, data, jobs=1).verdict == "adequate"
+    assert diagnose(sensor, data, quick=True, jobs=1).verdict == "adequate"
 
 
 @pytest.mark.parametrize("factor", [1.08, 0.92])
@@ -84,11 +86,11 @@ def test_a_light_level_beyond_its_uncertainty_is_no_pdp(tmp_path, factor):
     means = {id: (*PAPER[id][:3], mean) for id, mean in {"low-500": 457, "low-700": 60, "high-700": 4184}.items()}
     scaled = {id: (wave, level / factor, t, mean) for id, (wave, level, t, mean) in means.items()}
     data = measured(tmp_path, {"dark": PAPER["dark"], **scaled})
-    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    found = diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
     assert found.verdict in ("setup", "confused")  # a dark capture of 2.6 counts hardly tells a shorter gate
     named = [e for e in found.setup if e["quantity"] == "light"]
     assert len(named) == 3 and all(e["factor"]["value"] == pytest.approx(factor, rel=0.03) for e in named)
-    assert not any(s.change.effect == "detection" for s in found.steps)
+    assert not any(s.candidate.effect == "detection" for s in found.steps)
 
 
 def test_a_capture_at_another_wavelength_is_named(tmp_path):
@@ -101,7 +103,7 @@ def test_a_capture_at_another_wavelength_is_named(tmp_path):
     }
     means["low-700"] = ("700 nm", 21.95 / ratio, "1 us", 60)
     data = measured(tmp_path, means)
-    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    found = diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
     assert found.verdict == "setup"
     (entry,) = found.setup
     assert (entry["capture"], entry["quantity"], entry["confused"]) == ("low-700", "wavelength", False)
@@ -113,12 +115,12 @@ def test_the_brightest_capture_alone_may_be_a_nonlinearity(tmp_path, odd, mean, 
     """A mistake at any other level is the laboratory's: no sensor answers less at a level between two others."""
     means = {"low-500": 457, "low-700": 60, "high-500": 9740, "high-700": 4184, "dark": 2.65, odd: mean}
     data = measured(tmp_path, {id: (*PAPER[id][:3], mean) for id, mean in means.items()})
-    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    found = diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
     assert found.verdict == verdict and not found.steps
     assert {e["capture"] for e in found.setup} == {odd}
-    doubted = [a for a in found.advice if answer.NONLINEARITY in a["separates"]]
+    doubted = [a for a in found.advice if NONLINEARITY in a["separates"]]
     assert bool(doubted) == bool(found.unexplained) == (verdict == "confused")
-    assert (answer.NONLINEARITY in answer.table(found)) == (verdict == "confused")
+    assert (NONLINEARITY in table(found)) == (verdict == "confused")
     assert all(odd in a["capture"] and a["significance_then"] > a["significance_now"] for a in doubted)
 
 
@@ -164,7 +166,7 @@ def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
     assert "360 ms" in text
     (tmp_path / "lab" / "measurement.yaml").write_text(text.replace("360 ms", "400 ms"))
     data = measurements.open(tmp_path / "lab")
-    found = diagnose.diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
+    found = diagnose(config.read_sensor(tmp_path / "sensor.yaml"), data, quick=True, jobs=1)
     assert found.verdict == "setup"
     (entry,) = found.setup
     assert (entry["capture"], entry["quantity"]) == ("dim", "exposure")
@@ -175,9 +177,9 @@ def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
 def test_what_swings_is_found_with_its_frequency_and_its_phases(tmp_path):
     data = lab(tmp_path, "    flicker: {amplitude: 0.4, frequency: 120 Hz, phase: 1 rad}\n")
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
-    assert compare.compare(sensor, data, jobs=1, replicates=48).verdict == "fails"
-    found = diagnose.diagnose(sensor, data, quick=True, jobs=1)
-    assert [s.change.name for s in found.steps] == ["add flicker"] and found.verdict == "explained"
+    assert compare(sensor, data, jobs=1, replicates=48).verdict == "fails"
+    found = diagnose(sensor, data, quick=True, jobs=1)
+    assert [s.candidate.name for s in found.steps] == ["add flicker"] and found.verdict == "explained"
     values = found.steps[0].values
     assert values["amplitude"].value == pytest.approx(0.4, rel=0.15)
     assert values["frequency"].low < 120 < values["frequency"].high
@@ -189,23 +191,23 @@ def test_a_model_that_swings_is_not_wrong_for_its_phase(tmp_path):
     other = TR + "    flicker: {amplitude: 0.4, frequency: 120 Hz}\n"
     (tmp_path / "other.yaml").write_text(other)
     sensor = config.read_sensor(tmp_path / "other.yaml")
-    assert compare.compare(sensor, data, jobs=1, replicates=64).verdict == "adequate"
+    assert compare(sensor, data, jobs=1, replicates=64).verdict == "adequate"
 
 
 def test_pixels_that_differ_at_one_wavelength_alone(tmp_path):
     """The ratio of the maps tells, and only where there are two wavelengths."""
     data = lab(tmp_path)
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
-    known = compare.compare(sensor, data, jobs=1, replicates=32)
+    known = compare(sensor, data, jobs=1, replicates=32)
     assert not [c for c in known.checks if c.statistic == "wavelength_ratio"]
     (map_,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "flat"]
     (dim,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "dim"]
     captures = [c for c in data.captures if c.id != "dark"]
     red = replace(captures[0], light=replace(captures[0].light, wavelength=700e-9))
-    (check,) = compare._between_wavelengths([red, captures[1]], [map_, dim], 8)
+    (check,) = _between_wavelengths([red, captures[1]], [map_, dim], 8)
     assert check.p_value > 1e-3
     shifted = replace(dim.judgement, residuals=dim.judgement.residuals + np.where(np.arange(64) == 17, 8.0, 0.0))
-    (check,) = compare._between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
+    (check,) = _between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
     assert check.p_value < 1e-6 and "row 2, column 1" in check.where
 
 

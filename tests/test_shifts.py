@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from tinylab import bench_of
 
-from spadmnist.criticism import fit, shifts
-from spadmnist.criticism.nulls import Null, learn
+from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.null_distribution import Null, learn
+from spadmnist.inference.shifts import beyond_noise, mean_shift
+from spadmnist.inference.signature import Signature, _signature
 from spadmnist.statistics import Summary
 
 BLOCKS, RECORDINGS = 200, 32
@@ -38,9 +40,9 @@ def learnt(law: str, values: np.ndarray, totals: np.ndarray) -> Null:
 def shift_of(null: Null, values: np.ndarray, base: np.ndarray, few: int) -> np.ndarray:
     expected = null.expected(1000.0)[0]
     spread = np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
-    shift, left, beta = shifts.difference(values - expected, base[:few] - expected, spread)
+    shift, left, beta = mean_shift(values - expected, base[:few] - expected, spread)
     chance = left + 3.0 * (1 - beta) / null.recordings
-    return shifts.beyond_noise(shift, spread, chance, null, expected, few, True)
+    return beyond_noise(shift, spread, chance, null, expected, few, True)
 
 
 @pytest.mark.slow
@@ -90,16 +92,19 @@ def test_what_is_another_in_every_recording_is_no_shift(few: int) -> None:
 
 def test_no_expectation_is_taken_from_where_none_was_learnt(lab) -> None:
     """A model with three times as many detections in the dark, that no level brings down to as many: as at the most."""
-    bench = bench_of(lab())
-    state = bench.state({})
-    wanted = [(state.sensors, id, 3 * state.rates[id].level * state.factors[id][:4], np.arange(4)) for id in state.made]
-    made = dict(zip(state.made, bench.simulate(wanted), strict=True))
-    moved = bench._moved(state, state.sensors, made, "sure")  # type: ignore[arg-type]
-    assert isinstance(moved, fit.Moved)
-    null, most = state.nulls["dark", "intervals"], state.made["dark"].totals.max()
-    (values, usual), few = (made["dark"].values["intervals"], state.made["dark"].values["intervals"]), slice(0, 4)  # type: ignore[union-attr]
-    old = usual[few] - np.stack([null.expected(t)[0] for t in state.made["dark"].totals[few]])
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    wanted = [
+        (evaluation.sensors, id, 3 * evaluation.rates[id].level * evaluation.factors[id][:4], np.arange(4))
+        for id in evaluation.made
+    ]
+    made = dict(zip(evaluation.made, replicates.simulate(wanted), strict=True))
+    signature = _signature(replicates, evaluation, evaluation.sensors, made, "sure")  # type: ignore[arg-type]
+    assert isinstance(signature, Signature)
+    null, most = evaluation.nulls["dark", "intervals"], evaluation.made["dark"].totals.max()
+    (values, usual), few = (made["dark"].values["intervals"], evaluation.made["dark"].values["intervals"]), slice(0, 4)  # type: ignore[union-attr]
+    old = usual[few] - np.stack([null.expected(t)[0] for t in evaluation.made["dark"].totals[few]])
     new = (values - null.expected(most)[0]).mean(axis=0)
-    shift = moved.shifts["dark", "intervals"]
+    shift = signature.shifts["dark", "intervals"]
     seen = shift != 0
     assert seen.any() and np.all(np.abs(shift - new)[seen] <= np.abs(old.mean(axis=0))[seen] + 1e-9)

@@ -13,8 +13,13 @@ from joblib import Parallel
 from scipy import stats
 from tinylab import bench_of
 
-from spadmnist.criticism import checks, compare, findings, fit, mapping, recordings
 from spadmnist.effects import Conditions
+from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, failing
+from spadmnist.inference.findings import nuisances
+from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_TOTALS
+from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, of_mean, totals_space
+from spadmnist.inference.map_fits import CountModel
+from spadmnist.inference.replicates import TOTALS, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 
@@ -22,17 +27,17 @@ from spadmnist.sensor import Sensor
 def null_of(expected: Any, scatter: float) -> Any:
     """A capture's law: level -> detections, known without error."""
     draws = 1000
-    return recordings.CaptureNull(1.0, 1.0, np.ones(draws), expected, (0.0, 1.0), scatter, {})
+    return CaptureNull(1.0, 1.0, np.ones(draws), expected, (0.0, 1.0), scatter)
 
 
-def score_of(bench: fit.Bench, state: fit.State, id: str, total: float) -> float:
+def score_of(replicates: Replicates, evaluation: Evaluation, id: str, total: float) -> float:
     """Standard deviations of a total, as the checks have it."""
-    seen = bench.seen[id]
-    bench.seen[id] = replace(seen, total=total)
-    state = replace(state, space=None)
-    x = bench.levels(state, [id], {id: math.log(max(total, 0.5))})[0]
-    z = x / bench.level_error(state, id)
-    bench.seen[id] = seen
+    seen = replicates.seen[id]
+    replicates.seen[id] = replace(seen, total=total)
+    evaluation = replace(evaluation, space=None)
+    x = log_levels(replicates, evaluation, [id], {id: math.log(max(total, 0.5))})[0]
+    z = x / level_error(replicates, evaluation, id)
+    replicates.seen[id] = seen
     return float(z)
 
 
@@ -40,11 +45,11 @@ def score_of(bench: fit.Bench, state: fit.State, id: str, total: float) -> float
 @pytest.mark.parametrize("mean", [5.6, 8.0, 15.0, 31.0, 100.0, 1000.0])
 def test_few_dark_counts_alarm_as_often_as_they_should(lab, mean: float) -> None:
     """All totals that Poisson's law has, each with its probability: twice the level is allowed, for it is discrete."""
-    bench = bench_of(lab())
-    state = bench.state({})
-    state.rates["dark"] = null_of(lambda level: mean * level, 1 / math.sqrt(mean))
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    evaluation.rates["dark"] = null_of(lambda level: mean * level, 1 / math.sqrt(mean))
     totals = np.arange(int(mean + 12 * math.sqrt(mean)))
-    z = np.array([score_of(bench, state, "dark", float(n)) for n in totals])
+    z = np.array([score_of(replicates, evaluation, "dark", float(n)) for n in totals])
     assert np.all(np.diff(z) > 0)
     for level in (1e-2, 1e-3):
         p = stats.poisson.pmf(totals, mean)[2 * stats.norm.sf(np.abs(z)) < level].sum()
@@ -53,62 +58,60 @@ def test_few_dark_counts_alarm_as_often_as_they_should(lab, mean: float) -> None
 
 def test_a_light_beside_which_the_dark_is_bright_is_judged_where_it_is_stated(lab) -> None:
     """10,000 dark counts and 200 of the light: their sum is normal, the logarithm of the light's level is not."""
-    bench = bench_of(lab())
-    state = bench.state({})
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
     spread = 1 / math.sqrt(10_200)
-    state.rates["flat"] = null_of(lambda level: 10_000 + 200 * level, spread)
+    evaluation.rates["flat"] = null_of(lambda level: 10_000 + 200 * level, spread)
     for z in (-1.5, 1.0, 2.0, 3.0, 4.0):
         total = 10_200 * math.exp(z * spread)
-        assert score_of(bench, state, "flat", total) == pytest.approx(z, rel=0.02)
+        assert score_of(replicates, evaluation, "flat", total) == pytest.approx(z, rel=0.02)
 
 
 def test_a_leak_where_hardly_anything_is_expected_is_a_total(lab) -> None:
-    bench = bench_of(lab())
-    state = bench.state({})
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
     for expected, total, told in ((4.0, 400.0, True), (4.0, 3.0, False), (0.1, 400.0, False), (6.0, 0.0, True)):
-        state.rates["dark"] = null_of(lambda level, n=expected: n * level, 0.5)
-        bench.seen["dark"] = replace(bench.seen["dark"], total=total)
-        assert ("dark" in bench.rate_space(replace(state, space=None))[0]) == told
+        evaluation.rates["dark"] = null_of(lambda level, n=expected: n * level, 0.5)
+        replicates.seen["dark"] = replace(replicates.seen["dark"], total=total)
+        assert ("dark" in totals_space(replicates, replace(evaluation, space=None))[0]) == told
 
 
 def test_a_sensor_without_dark_counts_is_not_judged_by_how_many_there_are(lab) -> None:
     """Nothing is expected, and no factor on nothing is more: what adds some is found by all else."""
     sensor, data = lab()
     bare = Sensor(sensor.layout, [e for e in sensor.effects if e.name != "dark_counts"], sensor.rules)
-    bench = fit.Bench(bare, data, 0, Parallel(n_jobs=1), 16)
-    state = bench.state({})
-    assert bench.seen["dark"].total > 300 and bench.rate_space(state)[0] == ["flat"]
-    assert np.all(np.isfinite(state.residuals[fit.RATES]))
+    replicates = Replicates(bare, data, 0, Parallel(n_jobs=1), 16)
+    evaluation = evaluate(replicates, {})
+    assert replicates.seen["dark"].total > 300 and totals_space(replicates, evaluation)[0] == ["flat"]
+    assert np.all(np.isfinite(evaluation.residuals[TOTALS]))
 
 
 def test_totals_have_the_share_of_false_alarms_that_compare_gives_them() -> None:
-    def block(name: str, p: float) -> checks.Block:
-        return checks.Block((name, "map"), p, 0, 0.0)
+    def block(name: str, p: float) -> BlockCheck:
+        return BlockCheck((name, "map"), p, 0, 0.0)
 
     others = [block("flat", 0.5) for _ in range(50)]
-    share = compare.SHARE_OF_TOTALS * compare.FALSE_ALARM
+    share = SHARE_OF_TOTALS * FALSE_ALARM
     for p, fails in ((0.4 * share, True), (0.6 * share, False)):
         totals = [block("", p), block("", 0.5)]
-        assert checks.failing([*totals, *others]) == ([totals[0]] if fails else [])
+        assert failing([*totals, *others]) == ([totals[0]] if fails else [])
     for p, fails in ((0.9, True), (1.1, False)):  # without totals all of it is for the others
-        one = block("flat", p * compare.FALSE_ALARM / 51)
-        assert checks.failing([one, *others]) == ([one] if fails else [])
+        one = block("flat", p * FALSE_ALARM / 51)
+        assert failing([one, *others]) == ([one] if fails else [])
     # false alarms of 2 totals and 50 others, all independent: of 4000 sets 40 are expected, 76 at most (1e-6)
     rng = np.random.default_rng(1)
     sets = rng.uniform(size=(4000, 52))
-    alarms = sum(
-        bool(checks.failing([block("" if k < 2 else "flat", float(p)) for k, p in enumerate(row)])) for row in sets
-    )
+    alarms = sum(bool(failing([block("" if k < 2 else "flat", float(p)) for k, p in enumerate(row)])) for row in sets)
     assert 14 < alarms < 76
 
 
 def test_a_capture_without_a_detection_says_nothing_of_the_light(lab) -> None:
     """Neither a traceback nor a light of a millionth."""
-    bench = bench_of(lab())
-    state = bench.state({})
-    bench.seen["flat"] = replace(bench.seen["flat"], total=0.0)
-    state.rates["flat"] = null_of(lambda level: 6.0 + level, 0.4)
-    assert findings.nuisances(bench, state) == []
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    replicates.seen["flat"] = replace(replicates.seen["flat"], total=0.0)
+    evaluation.rates["flat"] = null_of(lambda level: 6.0 + level, 0.4)
+    assert nuisances(replicates, evaluation) == []
 
 
 def counter(frames: int) -> Capture:
@@ -119,7 +122,7 @@ def counter(frames: int) -> Capture:
 def test_a_counter_has_more_than_one_detection_in_a_frame() -> None:
     """Poisson's scatter, not that of frames which are full."""
     seen = SimpleNamespace(capture=counter(100), counts=np.full(4, 500.0), waited=None)
-    line = mapping.Line(SimpleNamespace(seen={"flat": seen}), "flat", 1.0)  # type: ignore[arg-type]
+    line = CountModel(SimpleNamespace(seen={"flat": seen}), "flat", 1.0)  # type: ignore[arg-type]
     assert line.variance(np.array([500.0]), 0.0)[0] == pytest.approx(500.0)
     assert not line.saturated(np.full(4, 500.0))
     expected = np.array([450.0, 500.0, 550.0])
@@ -128,8 +131,10 @@ def test_a_counter_has_more_than_one_detection_in_a_frame() -> None:
 
 
 def test_the_mean_of_a_counter_scatters_as_its_detections(lab, monkeypatch) -> None:
-    bench = bench_of(lab())
-    monkeypatch.setattr(recordings, "closed_form", lambda sensor, capture: lambda level: 500.0 * 256)
-    monkeypatch.setattr(recordings.twin, "photons_at", lambda capture, layout: 1.0)
-    null, _ = recordings.of_mean(bench.start, counter(100), 500.0 * 256, 16)
+    replicates = bench_of(lab())
+    monkeypatch.setattr(
+        "spadmnist.inference.light_levels.closed_form", lambda sensor, capture: lambda level: 500.0 * 256
+    )
+    monkeypatch.setattr("spadmnist.twin.photons_at", lambda capture, layout: 1.0)
+    null, _ = of_mean(replicates.start, counter(100), 500.0 * 256, 16)
     assert null.scatter == pytest.approx(1 / math.sqrt(500 * 256), rel=0.1)

@@ -10,12 +10,14 @@ from joblib import Parallel
 
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
-from spadmnist.criticism import candidates, refining
-from spadmnist.criticism import course as course_of
-from spadmnist.criticism.candidates import Change, Key
-from spadmnist.criticism.fit import Bench, Moved
-from spadmnist.criticism.search import Search
-from spadmnist.criticism.tried import Tried
+from spadmnist.inference.candidates import Candidate, candidates
+from spadmnist.inference.coordinates import Key
+from spadmnist.inference.model_path import ModelPath, accept
+from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.scan import Scan
+from spadmnist.inference.signature import Signature, signatures
+from spadmnist.inference.trial import Trial
+from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
 
@@ -67,31 +69,31 @@ def labs(tmp_path: Path) -> Lab:
     return made
 
 
-def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Bench:
-    return Bench(*made, 0, Parallel(n_jobs=1), replicates)
+def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Replicates:
+    return Replicates(*made, 0, Parallel(n_jobs=1), replicates)
 
 
-def quiet(bench: Bench) -> Search:
-    return Search(bench, lambda what: None)
+def quiet(replicates: Replicates) -> Scan:
+    return Scan(replicates, lambda what: None)
 
 
-def change_of(bench: Bench, name: str) -> Change:
-    return next(c for c in candidates.changes(bench.start) if c.name == name)
+def change_of(replicates: Replicates, name: str) -> Candidate:
+    return next(c for c in candidates(replicates.start) if c.name == name)
 
 
-def given(course: course_of.Course, name: str, values: dict[Key, Any], settle: bool) -> Tried:
+def given(path: ModelPath, name: str, values: dict[Key, Any], settle: bool) -> Trial:
     """A candidate at some values, or settled from there."""
-    bench, state = course.bench, course.state
-    change = next(c for c in candidates.changes(state.sensors.one) if c.name == name)
-    (moved,) = bench.moved(state, [state.sensors.changed(values)], kept="sure")
-    assert isinstance(moved, Moved)
-    one = Tried(change, values, moved, 0.0, 1.0)
-    return refining.refine(course.bench, state, one) if settle else one
+    replicates, evaluation = path.replicates, path.evaluation
+    candidate = next(c for c in candidates(evaluation.sensors.one) if c.name == name)
+    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], kept="sure")
+    assert isinstance(signature, Signature)
+    one = Trial(candidate, values, signature, 0.0, 1.0)
+    return fit_trial(path.replicates, evaluation, one) if settle else one
 
 
-def taken(course: course_of.Course, name: str, values: dict[Key, Any], settle: bool = True) -> None:
-    course_of.accept(course, given(course, name, values, settle), 1.0)
+def taken(path: ModelPath, name: str, values: dict[Key, Any], settle: bool = True) -> None:
+    accept(path, given(path, name, values, settle), 1.0)
 
 
-def names(course: course_of.Course) -> list[str]:
-    return [step.change.name for step in course.steps]
+def names(path: ModelPath) -> list[str]:
+    return [step.candidate.name for step in path.steps]

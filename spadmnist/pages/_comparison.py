@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..criticism.compare import Check, Comparison, Nuisance
+from ..inference import next_step
+from ..inference.comparison import Check, Comparison, headline
+from ..inference.light_levels import Nuisance
 from . import _figures as figures
 from ._figures import BAND, COVERED, MEASURED, MODEL, WIDTH, WORST, Cells, Picture
 from ._frame import title_of, write
@@ -54,6 +56,8 @@ def _words(found: Comparison) -> dict[str, Any]:
     listed = _clearest(found.checks)[:_MOST]
     return {
         "found": found,
+        "then": next_step.after_comparison(found),
+        "headline": headline(found) if found.checks else "",
         "failing": failing,
         "clearest": failing[0] if failing else None,
         "immaterial": immaterial,
@@ -231,6 +235,8 @@ td.lowish, .key.lowish { background: #f3f6e4; }
 <h1>Nothing could be checked,</h1>
 <p class="lead">for the measurement has neither data nor a light level that is known.</p>
 {% endif %}
+{% if found.checks and not failing %}<p class="small">Worst check: {{ headline }}.</p>{% endif %}
+<p class="next"><b>Next:</b> {{ then }}</p>
 </section>
 
 <h2>What was compared</h2>

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import reference, units
-from ..criticism import answer
-from ..criticism.answer import Diagnosis, Step, Trace, Value
+from ..inference import next_step, results
+from ..inference.comparison import headline
+from ..inference.results import Diagnosis, Step, Trace, Value
 from . import _figures as figures
 from ._figures import MEASURED, ROUGH, Cells, Picture
 from ._frame import number, title_of, write
@@ -99,7 +100,9 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "found": found,
         "verdict": word,
         "look": look,
-        "sentence": answer.sentence(found),
+        "sentence": results.sentence(found),
+        "then": next_step.after_diagnosis(found),
+        "headline": headline(found.in_sample) if found.in_sample is not None else "",
         "next": Path(found.file).name if found.file else None,
         "ladder": ladder,
         "broad": _ladder_picture(ladder, found.null_95, _BROAD) if ladder else None,
@@ -110,11 +113,11 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "traces": [_checked(trace) for trace in found.traces],
         "remains": found.unexplained[:_MOST],
         "titles": {str(r["statistic"]): title_of(str(r["statistic"])) for r in found.unexplained},
-        "mechanism": answer.mechanism(found.unexplained, found.dark) if found.unexplained else "",
+        "mechanism": results.mechanism(found.unexplained, found.dark) if found.unexplained else "",
         "limits": [(e, *_limit(e)) for e in found.excluded[:_MOST]],
         "hidden": [(e["effect"], _about(e["effect"])) for e in found.invisible[:_MOST]],
         "name": _name,
-        "named": answer.named,
+        "named": results.named,
         "about": _about,
     }
 
@@ -159,19 +162,21 @@ def _name(entry: Mapping[str, Any]) -> str:
 
 
 def _step(step: Step) -> _Card:
-    declared = _described(step.change.effect)["parameters"]
-    words = _OF_A_MAP if step.change.carrier else {}
+    declared = _described(step.candidate.effect)["parameters"]
+    words = _OF_A_MAP if step.candidate.carrier else {}
     numbers = []
     for name, value in step.values.items():
         own = declared.get(name, {})
         about = words.get(name, own.get("about", ""))
         numbers.append(_Number(name, *_shown(value, own.get("unit", "")), about))
-    about = _about(step.change.effect)
-    if step.change.parameter in declared:
-        about = f"{step.change.parameter}: {declared[step.change.parameter]['about']}. {about}"
-    but = answer.mimic(step.change)
+    about = _about(step.candidate.effect)
+    if step.candidate.parameter in declared:
+        about = f"{step.candidate.parameter}: {declared[step.candidate.parameter]['about']}. {about}"
+    but = results.mimic(step.candidate)
     about += f" But: {but}." if but else ""
-    return _Card(answer.title(step.change), step, _KINDS.get(step.change.kind, step.change.kind), about, numbers)
+    return _Card(
+        results.title(step.candidate), step, _KINDS.get(step.candidate.kind, step.candidate.kind), about, numbers
+    )
 
 
 def _shown(value: Value, declared: str) -> tuple[str, str]:
@@ -355,6 +360,9 @@ beside {{ found.measurement }}\
 beside this page: <b>{{ next }}</b>{% endif %}\
 {% if found.unwritten %} &middot; the next sensor file was not written: {{ found.unwritten }}{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
+{% if headline %}<p class="small">In sample, the misfit is {{ found.in_sample.misfit | number }}; worst check: \
+{{ headline }}.</p>{% endif %}
+<p class="next"><b>Next:</b> {{ then }}</p>
 </section>
 
 {% if ladder %}
@@ -513,8 +521,8 @@ squared residual {{ card.before | number }} before, <b>{{ card.after | number }}
 {% endif %}
 
 {% if found.untried %}
-<h2>What could not be simulated</h2>
-<p class="small">These were not tried there.</p>
+<h2>What was not tried</h2>
+<p class="small">Candidates that could not be simulated there, and what a budget ended.</p>
 <div class="wide"><table class="list">
 <thead><tr><th>candidate</th><th>where</th><th>why</th></tr></thead>
 <tbody>

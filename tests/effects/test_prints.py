@@ -13,9 +13,6 @@ import pytest
 from scipy import special
 
 from spadmnist import config, measurement, twin
-from spadmnist.criticism import fitted
-from spadmnist.criticism.candidates import changes
-from spadmnist.criticism.recordings import swinging
 from spadmnist.effects import Conditions, Effect, in_order
 from spadmnist.effects.column_pattern import ColumnPattern
 from spadmnist.effects.dark_counts import DarkCounts
@@ -25,6 +22,9 @@ from spadmnist.effects.print_blur import PrintBlur
 from spadmnist.effects.print_contrast import PrintContrast
 from spadmnist.effects.print_tilt import PrintTilt
 from spadmnist.events import Layout
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.named_fit import fit_named
+from spadmnist.inference.replicates import swinging
 from spadmnist.recording import Capture, Light
 from spadmnist.scene import Scene
 from spadmnist.sensor import Sensor
@@ -145,27 +145,27 @@ def captures(shown: Scene | None) -> list[Capture]:
 
 def test_prints_are_candidates_where_a_capture_is_of_a_scene_and_only_there() -> None:
     sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5)]).settled()
-    flat = {c.name for c in changes(sensor, captures(None))}
-    scene = {c.name for c in changes(sensor, captures(Scene("chart.npy", np.eye(4, 6))))}
+    flat = {c.name for c in candidates(sensor, captures(None))}
+    scene = {c.name for c in candidates(sensor, captures(Scene("chart.npy", np.eye(4, 6))))}
     assert scene - flat == {f"add {e.name}" for e in PRINTS} and not flat - scene
-    assert flat == {c.name for c in changes(sensor)}
+    assert flat == {c.name for c in candidates(sensor)}
     listed = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5), *PRINTS]).settled()
-    settable = {c.name for c in changes(listed, captures(Scene("chart.npy", np.eye(4, 6)))) if c.kind == "set"}
+    settable = {c.name for c in candidates(listed, captures(Scene("chart.npy", np.eye(4, 6)))) if c.kind == "set"}
     assert {n for n in settable if "print" in n} == {
         "set print_blur.radius",
         "set print_contrast.black",
         "set print_tilt.angle",
     }
-    assert not [c for c in changes(listed, captures(None)) if "print" in c.name]
+    assert not [c for c in candidates(listed, captures(None)) if "print" in c.name]
 
 
 def test_the_angle_of_a_print_is_no_phase() -> None:
     """A phase is another one in every capture; a chart hangs as it hangs."""
     sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [PrintTilt(angle=0.1), Flicker(amplitude=0.1)]).settled()
     assert swinging(sensor) == [("flicker", "phase")]
-    (tilt,) = (c for c in changes(Sensor(sensor.layout, []).settled(), captures(Scene("c.npy", np.eye(4, 6))))
+    (tilt,) = (c for c in candidates(Sensor(sensor.layout, []).settled(), captures(Scene("c.npy", np.eye(4, 6))))
                if c.effect == "print_tilt")  # fmt: skip
-    assert not tilt.phases and [dial.parameter for dial in tilt.strengths] == ["angle"]
+    assert not tilt.phases and [coordinate.parameter for coordinate in tilt.strengths] == ["angle"]
 
 
 SENSOR = """sensor:
@@ -208,7 +208,7 @@ def test_a_print_is_settled_by_a_capture_of_its_scene(
     truth = config.read_sensor(tmp_path / "truth.yaml")
     twin.simulate(truth, measurement.open(tmp_path / "plan", planned=True), tmp_path / "lab", seed=2)
     effect = hidden.partition(":")[0]
-    found: Any = fitted.fitted(
+    found: Any = fit_named(
         config.read_sensor(tmp_path / "sensor.yaml"), measurement.open(tmp_path / "lab"), add=[effect], jobs=1
     )
     value = found.steps[-1].values[name]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simple_sensor import one_of_each
 
-from spadmnist.criticism.compare import statistics_for
+from spadmnist.inference.replicates import statistics_for
 from spadmnist.recording import Recording
 from spadmnist.statistics._frames import add_pixels, contiguous, first_stamps, frame_sums
 

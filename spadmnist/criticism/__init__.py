@@ -1,1 +1,0 @@
-"""Criticism: a model set beside measurements. Where does it fail, and by how much?"""

@@ -1,0 +1,107 @@
+"""The budget of a diagnosis: an amount of work, not of time, so that the same seed gives the same answer everywhere.
+
+Work is counted in seconds of two idle cores: the number of recordings times the cost of simulating and reducing one.
+The clock only stops a run that takes three times as long.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+from .. import units
+from ..errors import InputError
+from ..recording import Capture
+
+# s of two idle cores, measured with `rules: device` and all statistics: per detection, per pixel of a frame, per
+# recording
+_DETECTION, _PIXEL_FRAME, _RECORDING = 1.5e-7, 2e-9, 2e-3
+_SLOW = 3.0  # times the budget, after which the clock ends a run
+_DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis
+# shares of the budget after which no further step, and no further fit or test of the steps, begins
+STEPS, FITS = 0.75, 0.9
+
+
+class OutOfBudget(Exception):
+    """The budget is spent: the simulation under way has no result."""
+
+
+@dataclass
+class Budget:
+    """The work that a diagnosis may do.
+
+    Attributes:
+        seconds: the budget, s of two idle cores; infinite for no end.
+        until: the share of the budget that may be spent now; infinite for the work that every answer needs.
+        spent: work done so far, s of two idle cores.
+        began: start of the run on the monotonic clock, s.
+    """
+
+    seconds: float = math.inf
+    until: float = math.inf
+    spent: float = 0.0
+    began: float = field(default_factory=time.monotonic)
+
+    def spend(self, seconds: float) -> None:
+        """Count some work before it is done.
+
+        Args:
+            seconds: the work, s of two idle cores.
+        Raises:
+            OutOfBudget: where it exceeds the share that may be spent now, or the run is late.
+        """
+        late = time.monotonic() - self.began > _SLOW * self.seconds
+        if self.until < math.inf and (self.spent + seconds > self.until * self.seconds or late):
+            raise OutOfBudget
+        self.spent += seconds
+
+    @property
+    def left(self) -> float:
+        """Time on this machine until the steps end, s, at most, at the speed so far; infinite without an end."""
+        if not self.spent or self.seconds == math.inf:
+            return self.seconds
+        elapsed = time.monotonic() - self.began
+        at_this_speed = max(STEPS * self.seconds - self.spent, 0.0) * elapsed / self.spent
+        return min(at_this_speed, max(_SLOW * self.seconds - elapsed, 0.0))
+
+
+def seconds_of(within: str | float | None, quick: bool) -> float:
+    """The budget as users state it, in s.
+
+    Args:
+        within: a time with its unit ("3 min"), a number of seconds, "none" for no end, None for the default.
+        quick: the default is that of a quick diagnosis.
+    Raises:
+        InputError: where it is none of these, or no time above 0.
+    """
+    if within is None:
+        return _QUICK if quick else _DEFAULT
+    if isinstance(within, str) and within.strip().lower() == "none":
+        return math.inf
+    try:
+        seconds = float(units.parse(within, "s")) if isinstance(within, str) else float(within)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"within: {error}; or write none, for no end") from None
+    if not seconds > 0:
+        raise InputError(f"within is {within!r}; it is a time of more than 0, for example 10 min, or none for no end")
+    return seconds
+
+
+def clock(seconds: float) -> str:
+    """A time in s as text: 4:10, 1:02:00."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def work_of(capture: Capture, detections: float, pixels: int) -> float:
+    """The work of simulating and reducing one recording of a capture, s of two idle cores.
+
+    Args:
+        capture: its modality and its frames decide the cost of the pixels.
+        detections: of the whole array.
+        pixels: of the array.
+    """
+    frames = 0 if capture.modality == "tr" else capture.conditions.frames * pixels
+    return _RECORDING + _DETECTION * detections + _PIXEL_FRAME * frames

@@ -1,0 +1,429 @@
+"""The comparison of a model with a measurement: residuals and p-values of every statistic of every capture.
+
+The model simulates each capture many times (`replicates`) at a light level that gives as many detections as were
+measured. A check fails where the measured summary lies outside the model's own scatter. The p-values are corrected
+for the number of checks (Holm), so that a right model fails once in a hundred comparisons. A separate check tests
+whether the light levels agree with the stated ones, within their uncertainty.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from .. import units
+from ..errors import InputError
+from ..factory import pool
+from ..measurement import Measurement
+from ..recording import Capture
+from ..sensor import Sensor
+from ..statistics import Summary
+from .candidates import with_values
+from .coordinates import Key, Values
+from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
+from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
+from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
+from .null_distribution import Judgement
+from .phases import evaluate_start
+from .replicates import (
+    REPLICATES,
+    TOTALS,
+    Model,
+    Replicates,
+)
+
+_MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
+_ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
+_LEAST_P = 1e-300  # a p-value is never 0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: a statistic of one capture, or the totals.
+
+    Attributes:
+        capture: None where it is of all captures.
+        misfit: mean squared residual relative to that of the model's replicates, 1 if the model is right.
+        where, size: words for the worst cell and its deviation.
+        relative: that deviation, relative.
+        significant: it lies outside the model's scatter, after Holm's correction.
+        material: it is significant and exceeds the tolerance, so that it fails.
+        summary, judgement: the measured summary and the model's expectation, for pictures; None for totals.
+    """
+
+    statistic: str
+    capture: str | None
+    misfit: float
+    p_value: float
+    where: str
+    size: str
+    relative: float
+    passes: bool = True
+    material: bool = False
+    significant: bool = False
+    summary: Summary | None = field(default=None, repr=False)
+    judgement: Judgement | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of `compare`.
+
+    Attributes:
+        verdict: "adequate" or "fails".
+        misfit: the mean over the blocks; misfit_null_95: its 95 % quantile under the null.
+        replicates: of each capture.
+        tolerance: relative; None for none.
+        false_alarm_rate: probability that a right model fails.
+    """
+
+    sensor: str
+    measurement: str
+    verdict: str
+    misfit: float
+    misfit_null_95: float
+    nuisances: tuple[Nuisance, ...]
+    checks: tuple[Check, ...]
+    replicates: int
+    tolerance: float | None = None
+    false_alarm_rate: float = FALSE_ALARM
+    crop: str | None = None  # the part of the sensor that was measured: rows, columns
+
+    @property
+    def failing(self) -> list[Check]:
+        """The failing checks, by p-value."""
+        return sorted((c for c in self.checks if not c.passes), key=lambda c: (c.p_value, -c.misfit))
+
+    @property
+    def worst(self) -> Check:
+        """The check with the smallest p-value."""
+        return min(self.checks, key=lambda c: (c.p_value, -c.misfit))
+
+    def as_data(self) -> dict[str, Any]:
+        """The result as JSON data: `formats`, spadmnist-comparison/1."""
+        return {
+            "format": "spadmnist-comparison/1",
+            "verdict": self.verdict,
+            "misfit": _plain(self.misfit),
+            "misfit_in_sample": _plain(self.misfit),  # no capture is left out
+            "misfit_null_95": _plain(self.misfit_null_95),
+            "false_alarm_rate": self.false_alarm_rate,
+            "replicates": self.replicates,
+            "tolerance": self.tolerance,
+            **({"crop": self.crop} if self.crop else {}),
+            "nuisances": [
+                {
+                    "capture": n.capture,
+                    "name": n.name,
+                    **{k: _plain(getattr(n, k)) for k in ("value", "low", "high", "pull")},
+                }
+                for n in self.nuisances
+            ],
+            "checks": [
+                {
+                    "statistic": c.statistic,
+                    "capture": c.capture,
+                    "misfit": _plain(c.misfit),
+                    "p_value": _plain(c.p_value),
+                    "passes": c.passes,
+                    "material": c.material,
+                    "where": c.where,
+                    "size": c.size,
+                }
+                for c in self.checks
+            ],
+        }
+
+
+def _plain(value: float) -> float:
+    """A finite number of six digits."""
+    return float(f"{min(max(value, -1e300), 1e300):.6g}")
+
+
+def compare(
+    sensor: Sensor,
+    measurement: Measurement,
+    seed: int = 0,
+    tolerance: float | None = None,
+    jobs: int = 2,
+    replicates: int = REPLICATES,
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """The goodness of fit of a model to a measurement: every statistic of every capture, and the light levels.
+
+    Args:
+        sensor: the model.
+        seed: of the replicates.
+        tolerance: a failing check with a smaller relative deviation passes, as not material.
+        jobs: number of workers.
+        replicates: of each capture.
+        progress: called with the name of a capture and the share of the work that is done.
+    Raises:
+        InputError: where sensor and measurement do not belong together, or nothing can be compared.
+    """
+    with pool(jobs, "generator") as parallel:
+        say = progress or (lambda capture, share: None)
+        simulations = Replicates(sensor, measurement, seed, parallel, replicates, progress=say)
+        evaluation, _ = evaluate_start(simulations)
+        return comparison_of(simulations, evaluation, tolerance)
+
+
+def comparison_with(
+    replicates: Replicates, values: Values, phases: Mapping[tuple[str, Key], float] | None = None
+) -> Comparison:
+    """The comparison of the sensor with these parameters, as the next sensor file has them: in sample.
+
+    Args:
+        values: by (effect, parameter), SI.
+        phases: by (capture, parameter), rad.
+    """
+    sensors = Model.same(with_values(replicates.start, values)).changed({}, phases)
+    return comparison_of(replicates, evaluate(replicates, values, sensors, remember=not phases))
+
+
+def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: float | None = None) -> Comparison:
+    """The checks of an evaluation, with Holm's correction.
+
+    Args:
+        tolerance: see `compare`.
+    Raises:
+        InputError: where nothing can be compared.
+    """
+    checks: list[Check] = []
+    # capture, log of the light factor, its standard error, elasticity
+    levels: list[tuple[Capture, float, float, float]] = []
+    of_cells = misfits(evaluation.replicate_residuals, evaluation.residuals)
+    for id, seen in replicates.seen.items():
+        checks += _level_checks(replicates.start, seen.capture, seen.total, evaluation.rates[id], levels)
+        for name, summary in seen.summaries.items():
+            judged = evaluation.judgements.get((id, name))
+            if judged is not None:
+                measured, expected = float(summary.values[judged.worst]), float(judged.expected[judged.worst])
+                text, relative = summary.size(judged.worst, measured, expected)
+                misfit, where = of_cells.get((id, name), judged.misfit), summary.where(judged.worst)
+                p = max(judged.p_value, _LEAST_P)
+                checks.append(Check(name, id, misfit, p, where, text, relative, summary=summary, judgement=judged))
+    captures = [seen.capture for seen in replicates.seen.values()]
+    nuisances, common = light_of(levels, captures)
+    checks += common
+    checks += _between_wavelengths(captures, checks, replicates.start.layout.columns)
+    if not checks:
+        raise InputError(
+            f"{replicates.measurement.source}: nothing here can be compared: of no capture are light and detections "
+            "known. State the light (irradiance or illuminance) of a capture, or name the file of one"
+        )
+    checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
+    sensor = replicates.start
+    return Comparison(
+        sensor.name,
+        replicates.measurement.name,
+        "adequate" if all(c.passes for c in checks) else "fails",
+        mean_misfit(evaluation.replicate_residuals, evaluation.residuals),
+        misfit_null_95(evaluation.replicate_residuals),
+        tuple(nuisances),
+        tuple(checks),
+        len(evaluation.replicate_residuals[TOTALS]),
+        tolerance,
+        crop=str(sensor.window) if sensor.window else None,
+    )
+
+
+def _between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], columns: int) -> list[Check]:
+    """The checks of the pixels' ratios between neighbouring wavelengths.
+
+    Each wavelength has its capture with the most detections.
+    """
+    best: dict[float, tuple[float, Check]] = {}
+    for capture in captures:
+        wave = capture.light.wavelength
+        found = next((c for c in checks if c.capture == capture.id and c.statistic == _MAP), None)
+        if wave is None or found is None or found.judgement is None:
+            continue
+        total = float(found.judgement.expected.sum())
+        if wave not in best or total > best[wave][0]:
+            best[wave] = total, found
+    out = []
+    waves = sorted(best)
+    for short, long in itertools.pairwise(waves):
+        one, other = best[short][1].judgement, best[long][1].judgement
+        if one is None or other is None or one.expected.size != other.expected.size or one.expected.min() < _ENOUGH:
+            continue
+        if other.expected.min() < _ENOUGH:
+            continue
+        widths = [j.spread / j.expected for j in (one, other)]
+        difference = other.residuals * widths[1] - one.residuals * widths[0]
+        z = difference / np.hypot(*widths)
+        worst = int(np.argmax(np.abs(z)))
+        square = float(np.mean(z**2))
+        p_sum = float(stats.chi2.sf(square * z.size, z.size))
+        p_cell = min(1.0, 2 * z.size * float(stats.norm.sf(abs(float(z[worst])))))
+        place = f"row {worst // columns}, column {worst % columns}"
+        names = " beside ".join(units.show(wave, "m") for wave in (long, short))
+        size = f"{float(difference[worst]):+.2%} in the worst pixel"
+        p = min(1.0, 2 * min(p_sum, p_cell))
+        out.append(Check("wavelength_ratio", None, square, p, f"{place}, {names}", size, float(difference[worst])))
+    return out
+
+
+def _level_checks(
+    sensor: Sensor,
+    capture: Capture,
+    total: float,
+    made: CaptureNull,
+    levels: list[tuple[Capture, float, float, float]],
+) -> list[Check]:
+    """The check of the total of a dark capture; for a lit one its light level is appended to `levels`."""
+    if made.stated is None:
+        return []
+    lost = not capture.light.dark and made.drowned(total)
+    if not capture.light.dark and not lost:
+        level, error, elasticity = made.level_of(max(total, 0.5))
+        if elasticity > LEAST_ELASTICITY:
+            levels.append((capture, math.log(level / made.stated), error, elasticity))
+        return []
+    mean = made.total_at(made.stated)
+    light = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
+    z = made.score(total, light if lost else 0.0)
+    per = sensor.layout.pixels * capture.conditions.exposure
+    size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
+    relative = (total - mean) / max(mean, 1.0)
+    p = float(2 * stats.norm.sf(abs(z)))
+    where = "all pixels, hardly any light" if lost else "all pixels, no light"
+    return [Check("rate", capture.id, z * z, p, where, size, relative)]
+
+
+def light_of(
+    levels: Sequence[tuple[Capture, float, float, float]], captures: Sequence[Capture]
+) -> tuple[list[Nuisance], list[Check]]:
+    """(nuisance parameters, checks): the common light factor and each capture's own, against the stated levels.
+
+    Args:
+        levels: (capture, log of the light factor, its standard error, elasticity) of each lit capture.
+        captures: all captures.
+    """
+    if not levels:
+        return [], []
+    x = np.array([log for _, log, _, _ in levels])
+    error = np.array([math.hypot(e, c.light.own_uncertainty) for c, _, e, _ in levels])
+    error = np.maximum(error, 1e-6)
+    common = max(c.light.relative_uncertainty for c, _, _, _ in levels)
+    weight = 1 / error**2
+    total_weight = weight.sum() + (1 / common**2 if common > 0 else 1e18)
+    best = float((weight * x).sum() / total_weight)
+    spread = 1 / math.sqrt(total_weight)
+    own = float((weight * x).sum() / weight.sum())  # the estimate of the captures alone, without the stated level
+    own_error = 1 / math.sqrt(weight.sum())
+    pull = own / math.hypot(common, own_error)
+    name = "light"
+    nuisances = [
+        Nuisance(
+            None, name, math.exp(best), math.exp(best - 1.96 * spread), math.exp(best + 1.96 * spread), pull, common
+        )
+    ]
+    checks = [
+        Check(
+            name,
+            None,
+            pull**2,
+            float(2 * stats.norm.sf(abs(pull))),
+            "all lit captures",
+            f"light {math.expm1(own):+.2%} of what is stated, uncertain by {common:.2%}",
+            math.expm1(own),
+        )
+    ]
+    for (capture, log, _, elasticity), e in zip(levels, error, strict=True):
+        # the common factor by the other captures and the stated level
+        others = weight.sum() - 1 / e**2 + (1 / common**2 if common > 0 else 1e18)
+        mean = (float((weight * x).sum()) - log / e**2) / others
+        z = (log - mean) / math.sqrt(e**2 + 1 / others)
+        if capture.light.own_uncertainty > 0:
+            nuisances.append(
+                Nuisance(
+                    capture.id,
+                    name,
+                    math.exp(log),
+                    math.exp(log - 1.96 * e),
+                    math.exp(log + 1.96 * e),
+                    z,
+                    capture.light.own_uncertainty,
+                )
+            )
+        change = math.expm1((log - mean) * elasticity)
+        size = f"{change:+.2%} detections beside the other captures"
+        checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))
+    return nuisances, checks
+
+
+def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
+    """The checks with Holm's correction applied: which of them are significant, material, and fail."""
+    # the light, the totals and the statistics have a share each of the false alarms, so that a wrong power meter is
+    # not lost among a hundred statistics
+    kinds = [c.statistic if c.statistic in SHARES else "" for c in checks]
+    weights = [SHARES.get(kind, SHARE_OF_STATISTICS) / kinds.count(kind) for kind in kinds]
+    order = sorted(range(len(checks)), key=lambda i: checks[i].p_value / weights[i])
+    failing: set[int] = set()
+    left = sum(weights)
+    for i in order:
+        if checks[i].p_value > FALSE_ALARM * weights[i] / max(left, 1e-12):
+            break
+        failing.add(i)
+        left -= weights[i]
+    out = []
+    for i, check in enumerate(checks):
+        material = i in failing and (tolerance is None or not abs(check.relative) < tolerance)
+        out.append(replace(check, passes=not material, material=material, significant=i in failing))
+    return out
+
+
+def canonical(comparison: Comparison) -> str:
+    """The result as JSON text."""
+    return json.dumps(comparison.as_data(), indent=1, allow_nan=False)
+
+
+def headline(comparison: Comparison) -> str:
+    """The worst check with its physical size as text; the misfit may be blind to it."""
+    c = comparison.worst
+    p = f"p = {c.p_value:.1g}, " + ("passes" if c.passes else "fails")
+    return f"{c.statistic} of {c.capture or 'all captures'}, {c.where}: {c.size} ({p})"
+
+
+def table(comparison: Comparison) -> str:
+    """The result as text for a terminal, at most 100 characters wide: verdict, failing checks, light."""
+    failing = comparison.failing
+    lines = []
+    if failing:
+        lines.append(f"The model fails {len(failing)} of {len(comparison.checks)} checks. The clearest first:")
+        lines.append("")
+        for c in failing[:12]:
+            head = f"  p = {c.p_value:.1g}"
+            text = f"{c.statistic}, {c.capture or 'all captures'}: {c.where}; {c.size}"
+            lines += textwrap.wrap(text, 100, initial_indent=f"{head:<13}", subsequent_indent=" " * 13)
+        if len(failing) > 12:
+            lines.append(f"... and {len(failing) - 12} more (--json FILE or -o REPORT holds all)")
+    else:
+        lines.append(f"The model is adequate: none of {len(comparison.checks)} checks fails.")
+        closest = sorted(comparison.checks, key=lambda c: c.p_value)[:3]
+        near = ", ".join(f"{c.statistic} of {c.capture or 'all'} (p = {c.p_value:.2g})" for c in closest)
+        lines += textwrap.wrap(f"Nearest to failing: {near}.", 100)
+    lines.append("")
+    lines += textwrap.wrap(f"Worst check: {headline(comparison)}.", 100)
+    about = (
+        f"misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
+        f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture; a right model is "
+        f"called wrong in {comparison.false_alarm_rate:.0%} of comparisons."
+    )
+    lines += textwrap.wrap(about, 100)
+    for n in comparison.nuisances:
+        where = n.capture or "all lit captures"
+        interval = f"95 %: {n.low:.4f} to {n.high:.4f}"
+        text_of_light = f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}"
+        lines += textwrap.wrap(text_of_light, 100)
+    return "\n".join(lines)

@@ -1,0 +1,126 @@
+"""Coordinates: the free parameters of a model, each on the scale on which it moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..plugins import Parameter
+
+Key = tuple[str, str]  # (effect, parameter)
+Values = Mapping[Key, Any]  # parameter values, SI units
+_BEYOND = 0.3  # of a logarithm, or of the search range: how far an interval may extend beyond the search range
+_LEAST = 1e-6  # of the search range: the least distance to its upper end on the scale of that distance
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A free parameter of a model, and the scale on which it moves: linear, logarithmic, or the log of a distance.
+
+    Attributes:
+        low, high: the search range, in the parameter's unit.
+        off: the value at which the effect vanishes; None for a shape. Where it is the upper end of the range, the
+            coordinate is the log of the distance to that end.
+        whole: the parameter has whole values only.
+        bounds: the least and the largest value that exist; None where there is no such bound.
+    """
+
+    effect: str
+    parameter: str
+    unit: str
+    low: float
+    high: float
+    off: float | None
+    whole: bool = False
+    bounds: tuple[float | None, float | None] = (None, None)
+
+    @property
+    def key(self) -> Key:
+        return self.effect, self.parameter
+
+    @property
+    def log(self) -> bool:
+        return self.low > 0
+
+    @property
+    def lacks(self) -> bool:
+        """Whether the coordinate is the log of the distance to the upper end of the range."""
+        return self.log and self.off == self.high
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The range of the coordinate, (low, high)."""
+        low, high = sorted((self.coordinate(self.low), self.coordinate(self.high)))
+        return low, high
+
+    def coordinate(self, value: float) -> float:
+        """The coordinate of a value in the parameter's unit."""
+        if self.lacks:
+            return math.log(max(self.high - value, _LEAST * (self.high - self.low)))
+        return math.log(max(value, 1e-300)) if self.log else value
+
+    def value(self, coordinate: float) -> float:
+        """The value at a coordinate, within the search range, in the parameter's unit."""
+        return min(max(self._anywhere(coordinate), self.low), self.high)
+
+    def interval(self, low: float, high: float) -> tuple[float, float]:
+        """The interval (low, high) of the values between two coordinates.
+
+        The search range is no bound of the parameter: an interval may end a little beyond it, within `bounds`.
+        """
+        low_bound, high_bound = self.bounds
+        least = -math.inf if low_bound is None else low_bound
+        most = math.inf if high_bound is None else high_bound
+        beyond = _BEYOND if self.log else _BEYOND * (self.high - self.low)
+        ends = []
+        for u in (low, high):
+            near = min(max(u, self.ends[0] - beyond), self.ends[1] + beyond)
+            ends.append(min(max(self._anywhere(near), least), most))
+        return min(ends), max(ends)
+
+    def _anywhere(self, coordinate: float) -> float:
+        value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
+        value = self.high - value if self.lacks else value
+        return float(round(value)) if self.whole else value
+
+    def scaled(self, value: float, factor: float) -> float:
+        """The value, within the search range, whose distance from `off` is `factor` times that of `value`."""
+        off = self.off or 0.0
+        found = off + (value - off) * factor
+        return min(max(float(round(found)) if self.whole else found, self.low), self.high)
+
+
+def coordinate_of(effect: str, declared: Parameter, off: float | None) -> Coordinate:
+    """The coordinate of a declared parameter with a search range.
+
+    Args:
+        effect: the effect's name.
+        declared: its declaration; `search` must be there.
+        off: the value at which the effect vanishes; None for a shape.
+    """
+    assert declared.search is not None
+    low, high = map(float, declared.search)
+    ends = (low, high, float(declared.default))
+    whole = not declared.unit and low >= 1 and declared.bounds[0] is not None and all(x == int(x) for x in ends)
+    return Coordinate(effect, declared.name, declared.unit, low, high, off, whole, declared.bounds)
+
+
+def point_of(coordinates: Sequence[Coordinate], values: Mapping[Key, Any]) -> np.ndarray:
+    """The coordinates of parameter values, (coordinates,)."""
+    return np.array([d.coordinate(float(values[d.key])) for d in coordinates])
+
+
+def room_of(coordinate: Coordinate, value: float) -> float:
+    """The factor by which the strength can grow until its distance from `off` is that of the end of the range."""
+    off = coordinate.off or 0.0
+    bound = coordinate.high if value > off else coordinate.low
+    return (bound - off) / (value - off) if value != off else 1.0
+
+
+def is_edge(coordinate: Coordinate) -> bool:
+    """Whether a strength is an edge, a time or a distance to its upper end: no signature is proportional to it."""
+    return coordinate.lacks or (coordinate.unit == "s" and coordinate.off is not None)

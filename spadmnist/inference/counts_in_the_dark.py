@@ -1,0 +1,169 @@
+"""Maps of dark rates from counts in the dark, in closed form, without simulation.
+
+Where captures without light inform a map of a dark rate, and nothing couples the pixels, the counts of each pixel are
+a sufficient statistic. The misfit is that of the counts alone: one half of the blocks of time is judged by a map of
+the other half.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from .. import twin
+from ..effects import Effect
+from ..measurement import Measurement
+from ..sensor import Sensor
+from . import map_fits, pixel_maps
+from .candidates import Candidate, with_values
+from .light_levels import closed_form, level_for
+from .pixel_maps import map_values
+from .replicates import Replicates
+from .results import Diagnosis, Step, title
+from .score_test import LEAST_P
+
+_SURE = 1e-3  # p-value below which a misfit is significant
+_WIDER = 1.1  # factor by which afterpulses and the errors of a map may raise the misfit
+_LIT = 0.02  # share of the information on a map in lit captures that is neglected, at most
+
+
+def may_fit(sensor: Sensor, wanted: Sequence[Candidate]) -> bool:
+    """Whether the fit is one map of a dark rate, of a sensor whose pixels do not couple."""
+    candidate = wanted[0]
+    if len(wanted) > 1 or not candidate.carrier or candidate.per != "pixel" or not pixel_maps.by_counts(candidate):
+        return False
+    return Effect.registry.find(candidate.effect).stage == "dark" and not any(
+        map(_couples, (sensor.chip or sensor).effects)
+    )
+
+
+def _couples(effect: Effect) -> bool:
+    """Whether counts in the dark depend on more than a pixel's own rate: an effect reaches others, or fluctuates."""
+    return effect.influence() > 0 or (effect.stage == "arrival" and effect.acts_on != "light")
+
+
+def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: Candidate) -> Diagnosis | str:
+    """The fit of the map by counts in the dark, or the name of what else informs it.
+
+    Args:
+        replicates: its captures need no summaries.
+        candidate: the map.
+    """
+    assert candidate.carrier is not None
+    dark = [id for id, seen in replicates.seen.items() if seen.capture.light.dark and seen.counts is not None]
+    if not dark:
+        return "no dark capture with data"
+    levels = {id: 1.0 if id in replicates.dark else _level(replicates, id) for id in replicates.seen}
+    map_ = map_fits.fit_maps(replicates, {}, [candidate], levels, dark)[candidate.carrier]
+    information = map_fits.information(replicates, {candidate.carrier: map_.values()}, candidate, levels)
+    whole = np.maximum(np.sum(list(information.values()), axis=0), 1e-12)
+    if float(np.mean(np.sum([information[id] for id in dark], axis=0) / whole)) < 1 - _LIT:
+        return "light in which it shows, too"
+    return _answer(replicates, measurement, candidate, map_, dark)
+
+
+def _level(replicates: Replicates, id: str) -> float:
+    """The light level of a lit capture, photons/s: the stated one, or that of its total."""
+    seen = replicates.seen[id]
+    stated = twin.photons_at(seen.capture, replicates.start.layout)
+    if stated is not None:
+        return stated
+    return level_for(closed_form(replicates.start, seen.capture), seen.total, None)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """The errors of a model in the counts of captures: misfit, relative errors of the mean rate and of the map."""
+
+    misfit: float
+    mean_rate: float
+    map: float
+
+    def row(self, model: str) -> dict[str, Any]:
+        errors = {"mean_rate": self.mean_rate, "map": self.map}
+        return {"model": model, "misfit": self.misfit, "errors": errors, "placebo": False}
+
+
+def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: np.ndarray | float = 0.0) -> _Judged:
+    """The errors of a model in the counts of dark captures.
+
+    Args:
+        errors: (pixels,) relative, of the sensor's rates.
+    """
+    squares, totals, excess = [], [], []
+    for id in ids:
+        line = map_fits.CountModel(replicates, id, 1.0)
+        expected, counts = line.expected(sensor), line.seen.counts
+        assert counts is not None
+        variance = line.variance(np.maximum(expected, 0.5), replicates.dead)
+        apart = counts - expected
+        squares.append(apart**2 / (variance + (errors * expected) ** 2))
+        totals.append(abs(math.log(max(float(counts.sum()), 0.5) / float(expected.sum()))))
+        excess.append(math.sqrt(max(float(np.mean(apart**2 - variance)), 0.0)) / max(float(expected.mean()), 1e-12))
+    return _Judged(float(np.mean(squares)), float(np.mean(totals)), float(np.mean(excess)))
+
+
+def _answer(
+    replicates: Replicates,
+    measurement: Measurement,
+    candidate: Candidate,
+    map_: pixel_maps.PixelMap,
+    dark: Sequence[str],
+) -> Diagnosis:
+    assert candidate.carrier is not None
+    start = _judge(replicates, dark, replicates.start)
+    halves = replicates.halves(dark)
+    if halves.seen:  # the second half of each capture by the first
+        first = [id for k, id in enumerate(halves.seen) if k % 2 == 0]
+        part = map_fits.fit_maps(halves, {}, [candidate], dict.fromkeys(halves.seen, 1.0), first)[candidate.carrier]
+        others = [id for id in halves.seen if id not in first]
+        found = _judge(halves, others, with_values(replicates.start, {candidate.carrier: part.values()}), part.error)
+    else:
+        found = _judge(replicates, dark, with_values(replicates.start, {candidate.carrier: map_.values()}), map_.error)
+    free = replicates.start.layout.pixels * len(dark)
+    null_95 = float(stats.chi2.ppf(0.95, free) / free)
+    likely = float(stats.chi2.ppf(1 - _SURE, free) / free)
+    rest: list[dict[str, Any]] = []
+    if found.misfit > _WIDER * likely:  # the rates differ between blocks of time
+        clear = _clear(found.misfit / _WIDER, free)
+        where = "pixels of one half of the blocks of time, by a map of the other"
+        rest.append({"statistic": "pixel_map", "capture": dark[0], "significance": clear, "where": where})
+    right = "explained" if start.misfit > likely else "adequate"
+    mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
+    results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
+    step = Step(candidate, results, found.misfit, _clear(start.misfit, free), f"mean of the map {mean - 1:+.2%}")
+    return Diagnosis(
+        replicates.start.name,
+        measurement.name,
+        "partly_explained" if rest else right,
+        start.misfit,
+        found.misfit,
+        null_95,
+        [],
+        [step],
+        [],
+        rest,
+        [start.row("start"), found.row(f"+ {title(candidate)}")],
+        [],
+        [],
+        [],
+        values={candidate.carrier: map_.values()},
+        dark=replicates.dark,
+        crop=str(replicates.start.window) if replicates.start.window else None,
+    )
+
+
+def _clear(misfit: float, free: int) -> float:
+    """The significance of a mean square, in standard deviations."""
+    return float(stats.norm.isf(max(float(stats.chi2.sf(misfit * free, free)), LEAST_P) / 2))
+
+
+def _listed(sensor: Sensor, candidate: Candidate) -> np.ndarray:
+    assert candidate.carrier is not None
+    effect = sensor.effect(candidate.carrier[0])
+    return np.asarray(getattr(effect, candidate.carrier[1], 0.0), float)

@@ -1,0 +1,161 @@
+"""Backward elimination: steps that later ones made needless, and steps that only resemble what is there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
+from .gauss_newton import Fit, gauss_newton
+from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
+from .model_path import ModelPath, fit_all, keys_of
+from .replicates import FEW, TOTALS, Cell, Model
+from .results import Step, title
+from .signature import residuals_at, signatures
+
+_MOSTLY = 0.95  # of the excess misfit: a step that explains as much is no look-alike, whatever its law leaves
+_CHANCE = 3.0  # standard deviations of a mean square: as much is left by noise
+_VAIN = 2  # look-alike steps, after which further ones are of no use
+_NEEDLESS = 9.0  # in chi square: a step whose loss costs less is dropped
+
+
+def drop_needless(path: ModelPath) -> None:
+    """Drop the steps that later ones made needless."""
+    replicates = path.replicates
+    for step in list(path.steps[:-1]):
+        if len(path.steps) < 2 or step.phased:
+            continue
+        if step.candidate.carrier:
+            if not path.steps[-1].candidate.carrier:  # a later map may be what makes the pixels differ
+                _drop_unless_missed(path, step)
+            continue
+        if step.fluctuates:  # the squares of residuals do not judge a fluctuating step
+            _drop_unless_missed(path, step)
+            continue
+        rest = {k: v for k, v in path.values.items() if k not in keys_of(step.candidate, path)}
+        sensors = Model.same(replicates.start).changed(rest, path.scan.phases)
+        if any(s.candidate.carrier for s in path.steps):
+            continue  # a map would have to be fitted anew
+        (signature,) = signatures(replicates, path.evaluation, [sensors], FEW)
+        if isinstance(signature, str):
+            continue
+        others = tuple(d for s in path.steps if s is not step for d in s.coordinates)
+        z = residuals_at(replicates, path.evaluation, signature)
+        loss = square(z) - square(path.evaluation.residuals)
+        if loss > 30 and not others:
+            continue
+        point = {d.key: rest[d.key] for d in others}
+        closer = gauss_newton(replicates, path.evaluation, others, point, sensors.changed, 2) if others else None
+        if isinstance(closer, Fit):
+            loss = closer.square - square(path.evaluation.residuals)
+        if loss < _NEEDLESS:
+            replicates.say(f"{title(step.candidate)} is no longer needed")
+            path.steps.remove(step)
+            path.scan.accepted.remove(step.candidate)
+            path.values = rest
+            fit_all(path)
+            path.rung(f"- {title(step.candidate)}")
+
+
+def _drop_unless_missed(path: ModelPath, step: Step) -> None:
+    """Drop a step, unless more checks fail without it.
+
+    A fluctuating step also stays where the likelihood is larger with it: its signature may be all that showed it.
+    """
+    before, failed = path.kept(), len(path.failed)
+    path.replicates.say(f"is {title(step.candidate)} still needed?")
+    path.steps = [s for s in path.steps if s is not step]
+    path.scan.accepted = [c for c in path.scan.accepted if c is not step.candidate]
+    kept = set().union(*(keys_of(s.candidate, path) for s in path.steps))
+    path.values = {k: x for k, x in path.values.items() if k in kept}
+    fit_all(path)
+    missed = len(path.failed) > failed
+    if step.fluctuates and not missed:
+        template = {cell: step.template.get(cell, np.zeros_like(z)) for cell, z in before[0].residuals.items()}
+        missed = log_likelihood_ratio(path.evaluation, before[0], template, fluctuates=True) > _NEEDLESS
+    if missed:
+        path.back_to(before)
+    else:
+        path.rung(f"- {title(step.candidate)}")
+
+
+def drop_mimics(path: ModelPath, start: Evaluation, totals: bool) -> None:
+    """Drop the steps that only resemble what is there, where something remains.
+
+    A step is judged by its own cells, see `left_in_own_cells`; signatures in other cells do not matter.
+
+    Args:
+        start: the evaluation without any step.
+        totals: the totals belong to the model, not to the set-up.
+    """
+    while path.steps and any(totals or block.cell[0] for block in path.failed):
+        # what one step leaves, another one cannot explain: the worst goes first, and the others are judged again
+        left = {id(s): left_in_own_cells(s, path.held_out, totals) for s in path.steps}
+        worst = max(path.steps, key=lambda s: left[id(s)])
+        now, then = (
+            mean_misfit(evaluation.replicate_residuals, evaluation.residuals) for evaluation in (path.evaluation, start)
+        )
+        mostly = len(path.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
+        kept = [s for s in path.steps if s is not worst or left[id(s)] < 1 or mostly]
+        if now > then:
+            kept = []
+        if len(kept) == len(path.steps):
+            return
+        path.nearest += [step for step in path.steps if all(step is not s for s in kept)]
+        path.steps = kept
+        path.scan.accepted = [c for c in path.scan.accepted if any(c is s.candidate for s in kept)]
+        known = set().union(*(keys_of(s.candidate, path) for s in kept))
+        path.values = {k: v for k, v in path.values.items() if k in known}
+        listed = {effect.name for effect in path.replicates.start.effects}
+        swinging = listed | {candidate.effect for candidate in path.scan.accepted}
+        path.scan.phases = {at: p for at, p in path.scan.phases.items() if at[1][0] in swinging}
+        if kept:
+            fit_all(path)
+            path.rung("without what only looks alike")
+        else:
+            path.evaluation, path.fit = start, None
+
+
+def in_vain(path: ModelPath, totals: bool) -> bool:
+    """Whether several steps only resemble what is there, so that no effect here is the right one.
+
+    Args:
+        totals: see `drop_mimics`.
+    """
+    left = [left_in_own_cells(step, path.held_out, totals) for step in path.steps]
+    return len(left) >= _VAIN and bool(path.failed) and all(1 <= x < math.inf for x in left)
+
+
+def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: bool) -> float:
+    """The excess misfit left in a step's own cells, relative to the most that a finding may leave.
+
+    Its own cells carry most of its expected score. From 1 on the step only resembles what is there.
+
+    Args:
+        residuals: (cells,) by block, of data that the step was not fitted to.
+        totals: the totals are among its cells.
+    """
+    cells = [
+        (t, residuals[cell], step.before[cell], np.full(len(t), cell != TOTALS))
+        for cell, t in step.template.items()
+        if (totals or cell != TOTALS)
+        and cell in residuals
+        and cell in step.before
+        and len(t) == len(residuals[cell]) == len(step.before[cell])
+    ]
+    if not cells:
+        return math.inf
+    t, now, before, shapes = (np.concatenate(parts) for parts in zip(*cells, strict=True))
+    score = t**2
+    if score.sum() <= 0:
+        return math.inf
+    fell = before**2 - now**2
+    # of totals alone, any effect may be the cause
+    if fell[shapes].sum() < LEAST_GAIN or score[shapes].sum() < 0.5 * score.sum():
+        return math.inf
+    order = np.argsort(-score, kind="stable")
+    own = order[: int(np.searchsorted(np.cumsum(score[order]), OWN_CELLS * score.sum())) + 1]
+    left, excess = float(np.mean(now[own] ** 2)) - 1, float(np.mean(before[own] ** 2)) - 1
+    return left / max((1 - LEAST_FALL) * excess, _CHANCE * math.sqrt(2 / len(own)))

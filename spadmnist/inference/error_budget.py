@@ -1,0 +1,141 @@
+"""The error budget (ladder): one row for each model, its misfit and its physical errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .candidates import Candidate
+from .coordinates import Key
+from .evaluation import Evaluation, mean_misfit
+from .gauss_newton import Fit
+from .light_levels import level_error, log_levels, totals_space
+from .replicates import TOTALS, Cell, Replicates
+from .results import Step, plain, title
+from .signature import Signature, residuals_at
+from .trial import Phases, Trial
+
+_CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model
+
+
+@dataclass(frozen=True)
+class HeldMaps:
+    """What the maps of pixels are fitted from, besides the data: see `map_fits.models_with_maps`."""
+
+    values: dict[Key, Any]
+    held: list[Candidate]
+    phases: Phases
+    chips: bool
+
+
+@dataclass
+class Rung:
+    """A row of the error budget.
+
+    Attributes:
+        errors: relative, by name; see `physical_errors`.
+        left: (cells,) the residuals by which the model is judged, by block.
+        fit: of its coordinates, where it has any.
+        steps: those that the model adds.
+        maps: how its maps are fitted.
+        placebo: the values that a placebo sets in the model of `evaluation`; None of all other models.
+    """
+
+    model: str
+    evaluation: Evaluation = field(repr=False)
+    misfit: float
+    errors: dict[str, float]
+    left: dict[Cell, np.ndarray] = field(repr=False)
+    fit: Fit | None = field(default=None, repr=False)
+    steps: list[Step] = field(default_factory=list, repr=False)
+    maps: HeldMaps | None = None
+    placebo: dict[Key, Any] | None = None
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The row for the JSON data."""
+        placebo = self.placebo is not None
+        return {"model": self.model, "misfit": plain(self.misfit), "errors": self.errors, "placebo": placebo}
+
+
+def physical_errors(
+    replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray], shift: Signature | None = None
+) -> dict[str, float]:
+    """The physical errors of a model, relative, by name.
+
+    The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates.
+    linearity: the largest deviation of a lit one from the others. map: rms error of the pixels. intervals: share of
+    the intervals in wrong cells. neighbours: share of the detections whose neighbours fire too often or too seldom.
+
+    Args:
+        residuals: (cells,) by block.
+        shift: the signature of a model that was not simulated itself.
+    """
+    ids, elasticities, _, common = totals_space(replicates, evaluation)
+    errors = {"mean_rate": 0.0, "linearity": 0.0}
+    if ids:
+        logs = {i: math.log(max(s.total, 0.5)) for i, s in replicates.seen.items()}
+        x = log_levels(replicates, evaluation, ids, logs)
+        if shift is not None:
+            x = x + np.array([shift.logs.get(i, 0.0) for i in ids])
+        lit = np.array([not replicates.seen[i].capture.light.dark for i in ids], bool)
+        width = float(common.max())
+        if lit.any() and width > 0:
+            weight = (
+                1
+                / np.array([level_error(replicates, evaluation, i) for i, on in zip(ids, lit, strict=True) if on]) ** 2
+            )
+            light = float(weight @ x[lit]) / float(weight.sum() + 1 / width**2)
+            x = x - light * lit
+        errors["mean_rate"] = float(np.sqrt(np.mean((x * elasticities) ** 2)))
+        if lit.any():
+            errors["linearity"] = float(np.max(np.abs((x[lit] - np.median(x[lit])) * elasticities[lit])))
+    shares: dict[str, list[float]] = {"map": [], "intervals": [], "neighbours": []}
+    for cell, z in residuals.items():
+        if cell == TOTALS:
+            continue
+        id, name = cell
+        seen, null = replicates.seen[id], evaluation.nulls[cell]
+        expected = null.expected(seen.total)[0] + (shift.shifts.get(cell, 0.0) if shift else 0.0)
+        values = seen.summaries[name].values
+        if name == "pixel_map":
+            beyond = max(0.0, float(np.mean(z**2)) - 1) / max(float(np.mean(values)), 1.0)
+            shares["map"].append(math.sqrt(beyond))
+        elif name == "intervals":
+            raw = np.abs(values - expected).sum() - 0.8 * np.sqrt(np.maximum(expected, 0)).sum()
+            shares["intervals"].append(max(0.0, float(raw)) / 2 / max(float(values.sum()), 1.0))
+        elif name == "neighbours":
+            k = int(np.argmax(np.abs(z)))
+            far = abs(float(values[k] - expected[k])) if abs(z[k]) > _CLEAR else 0.0
+            shares["neighbours"].append(far / max(seen.total, 1.0))
+    whole = errors | {k: float(np.mean(v)) if v else 0.0 for k, v in shares.items()}
+    return {k: plain(v) for k, v in whole.items()}
+
+
+def placebo_of(
+    replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial], best: Trial, named: set[str]
+) -> Rung | None:
+    """The row of a placebo: an unrelated effect with as many coordinates as the best one, at its best strength.
+
+    Args:
+        named: effects that were found, or are a tie; of the others, the one in the middle of the ranking is taken.
+    """
+    usable = [
+        t
+        for t in tried
+        if t.candidate.effect not in named and t.candidate.kind == "add" and (t.signature.shifts or t.signature.logs)
+    ]
+    alike = [t for t in usable if len(t.candidate.coordinates) == len(best.candidate.coordinates)] or usable
+    if not alike:
+        return None
+    one = alike[len(alike) // 2]
+    times = one.times if one.gain > 0 else 0.0
+    residuals = residuals_at(replicates, evaluation, one.signature, times)
+    errors = physical_errors(replicates, evaluation, residuals, one.signature.at(times))
+    values = one.scaled() if times else {}
+    misfit = mean_misfit(evaluation.replicate_residuals, residuals)
+    return Rung(f"placebo: {title(one.candidate)}", evaluation, misfit, errors, residuals, placebo=values)

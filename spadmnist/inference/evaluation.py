@@ -1,0 +1,355 @@
+"""The evaluation of a model: residuals of the data, likelihood ratio, checks of the goodness of fit.
+
+Every statistic of every capture is a check. Holm's correction keeps false alarms to one comparison in a hundred.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..errors import UNABLE, SpadError, why
+from ..statistics import Summary
+from . import replicate_cache
+from .candidates import with_values
+from .coordinates import Key, Values
+from .levels import FALSE_ALARM, SHARE_OF_TOTALS
+from .light_levels import CaptureNull, central_level, law_of, of_mean, own_totals, totals_residuals
+from .null_distribution import Judgement, Null, learn, powers_of, replicate_residuals, scatter_of
+from .replicates import TOTALS, CaptureReplicates, Cell, Model, Replicates, T, joined, no_size
+
+_GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
+_PIECES = 4  # tasks of one capture: the number of workers that share it
+_SEEN = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
+# of the log of the ratio of two scatters: the most that counts, and the least that is significant
+_WIDEST, _WIDER = 2.3, 0.5
+_FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
+
+
+@dataclass
+class Evaluation:
+    """The evaluation of a model: null distributions, residuals of the data and of the model's replicates.
+
+    Attributes:
+        values: parameters that the model sets, SI.
+        sensors: the model.
+        made: the replicates, by capture.
+        nulls: null distributions, by (capture, statistic).
+        rates: null distributions of the totals, by capture.
+        factors: (replicates,) on the light level, by capture.
+        residuals: (cells,) standard deviations; `TOTALS` is a block of its own.
+        replicate_residuals: (replicates, cells), the same of the replicates.
+        judgements: p-values and more, by (capture, statistic).
+    """
+
+    values: dict[Key, Any]
+    sensors: Model
+    made: dict[str, CaptureReplicates]
+    nulls: dict[Cell, Null]
+    rates: dict[str, CaptureNull]
+    factors: dict[str, np.ndarray]
+    residuals: dict[Cell, np.ndarray]
+    replicate_residuals: dict[Cell, np.ndarray]
+    judgements: dict[Cell, Judgement]
+    space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `totals_space`
+    _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)  # see `once`
+
+    def before(self, cell: Cell, few: int) -> tuple[np.ndarray, np.ndarray]:
+        """((few, cells) deviations of the first replicates from the expectation, (cells,) scatter)."""
+
+        def make() -> tuple[np.ndarray, np.ndarray]:
+            null, made = self.nulls[cell], self.made[cell[0]]
+            beyond = made.values[cell[1]][:few] - null.expected_all(made.totals[:few])[0]
+            return beyond, scatter_of(null, made)
+
+        return self.once(("before", cell, few), make)
+
+    @property
+    def exact(self) -> list[Cell]:
+        """Statistics of law "exact" whose measured value is not that of the replicates."""
+        return [
+            cell for cell, found in self.judgements.items() if self.nulls[cell].law == "exact" and found.p_value < 0.5
+        ]
+
+    @property
+    def fluctuates(self) -> bool:
+        """Whether the light fluctuates: the totals of the replicates scatter far more than counts alone do."""
+        simulated = (self.rates[id] for id in self.made)
+        return any(far_wider(r.scatter, 1 / math.sqrt(max(r.expected(r.level), 1.0))) for r in simulated)
+
+    def usual(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
+        """The expectation of a statistic for this total of detections, see `Null.expected`."""
+        return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
+
+    def square(self, cell: Cell) -> float:
+        """The sum of squared residuals of the data in one statistic."""
+        return self.once(("square", cell), lambda: float(self.residuals[cell] @ self.residuals[cell]))
+
+    def once(self, name: tuple[Any, ...], make: Callable[[], T]) -> T:
+        """The result of `make`, which is called once for each name and then kept."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        found: T = self._kept[name]
+        return found
+
+
+def evaluate(
+    replicates: Replicates,
+    values: Values,
+    sensors: Model | None = None,
+    number: int | None = None,
+    known: Evaluation | None = None,
+    remember: bool = False,
+) -> Evaluation:
+    """The evaluation of a model: null distributions of all captures, residuals of the data and of the replicates.
+
+    Args:
+        values: parameters that the model sets, SI.
+        sensors: the model, where it is more than these.
+        number: of replicates of each capture; by default that of `replicates`.
+        known: an evaluation of the same model by fewer replicates, which are the first of these.
+        remember: the cache on disk is read and written.
+    Raises:
+        SpadError: where the model cannot be simulated.
+    """
+    try:
+        return _evaluate(replicates, values, sensors, number, known, remember)
+    except SpadError:
+        raise
+    except UNABLE as error:
+        raise SpadError(why(error)) from error
+
+
+def _evaluate(
+    replicates: Replicates,
+    values: Values,
+    sensors: Model | None,
+    number: int | None,
+    known: Evaluation | None,
+    remember: bool,
+) -> Evaluation:
+    sensors = sensors or Model.same(with_values(replicates.start, values))
+    n = number or replicates.number
+    # evenly spread for any number of them, for the first of them, and for every fourth
+    spread = 2 * np.modf((np.arange(n) + 0.5) * _GOLDEN)[0] - 1
+    about, wanted, entries = {}, [], dict[str, str]()
+    before = dict(known.made) if known else {}
+    evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {})
+    for id, seen in replicates.seen.items():
+        if seen.counts is None:
+            evaluation.rates[id], evaluation.factors[id] = of_mean(sensors.usual(id), seen.capture, seen.total, n)
+            continue
+        centre, stated, expected, half = central_level(replicates, sensors.usual(id), seen)
+        factors = np.exp(half * spread)
+        about[id] = centre, stated, expected, factors
+        # the entry does not depend on the data
+        if remember and sensors.alike and centre == stated and id not in before:
+            sensor = sensors.of(id, 0)
+            entries[id] = replicate_cache.entry_name(sensor, seen.capture, half, replicates.seed, replicates.dead)
+            if (found := replicate_cache.recall(entries[id])) is not None:
+                before[id] = found.first(n)
+        here = len(before[id].numbers) if id in before else 0
+        if here < n:
+            wanted.append((sensors, id, centre * factors[here:], np.arange(here, n, dtype=np.uint64)))
+    results = dict(zip((id for _, id, _, _ in wanted), replicates.simulate(wanted, pieces=_PIECES), strict=True))
+    for id, (centre, stated, expected, factors) in about.items():
+        more = results.get(id)
+        if isinstance(more, str):
+            raise SpadError(f"{id}: {more}")
+        made = before[id] if more is None else joined([before[id], more]) if id in before else more
+        if id in entries and more is not None:
+            replicate_cache.keep(entries[id], made)
+        evaluation.made[id] = made
+        law, scatter = law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
+        evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter)
+        evaluation.factors[id] = factors
+        for name, summary in replicates.seen[id].summaries.items():
+            if name not in made.values:
+                continue
+            kind, scale = made.laws[name]
+            null = learn([Summary(v, kind, str, no_size, scale) for v in made.values[name]], made.totals)
+            cell = id, name
+            evaluation.nulls[cell] = null
+            evaluation.judgements[cell] = judged = null.judge(summary.values, replicates.seen[id].total)
+            if null.law != "exact":
+                evaluation.residuals[cell] = judged.residuals
+                evaluation.replicate_residuals[cell] = replicate_residuals(null, made, made.values[name])
+    evaluation.residuals[TOTALS] = totals_residuals(
+        replicates, evaluation, {id: math.log(max(s.total, 0.5)) for id, s in replicates.seen.items()}
+    )
+    draws = np.random.Generator(np.random.Philox(key=replicates.seed + 1)).standard_normal(n)
+    evaluation.replicate_residuals[TOTALS] = np.stack(
+        [own_totals(replicates, evaluation, k, float(draws[k])) for k in range(n)]
+    )
+    return evaluation
+
+
+def far_wider(scatter: float, expected: float) -> bool:
+    """Whether totals with this scatter are those of a light that fluctuates.
+
+    Args:
+        scatter, expected: standard deviation of the log of the totals, and that without fluctuations.
+    """
+    return scatter > _FLUCTUATES * expected
+
+
+def square(residuals: Mapping[Cell, np.ndarray]) -> float:
+    """The sum of all squared residuals."""
+    return sum(float(z @ z) for z in residuals.values())
+
+
+def log_likelihood_ratio(
+    evaluation: Evaluation,
+    other: Evaluation,
+    template: Mapping[Cell, np.ndarray] | None = None,
+    fluctuates: bool = False,
+) -> float:
+    """Twice the log quasi-likelihood ratio of another model to this one, each cell by its own model's scatter.
+
+            sum z^2 - z'^2 - 2 log(s' / s)
+
+    z, s: residual and scatter of a cell under this model; z', s': under the other. A model with more scatter has
+    smaller squares even if it is wrong; the log of the scatter is the price.
+
+    Args:
+        evaluation, other: of the two models.
+        template: of the other model (`template_of`); statistics without a signature are left out, because their noise
+            over thousands of cells would decide.
+        fluctuates: the other model fluctuates from replicate to replicate; then the cells that scatter more, and the
+            totals, count.
+    """
+    out = 0.0
+    for cell in other.residuals.keys() & evaluation.residuals.keys():
+        z, there = evaluation.residuals[cell], other.residuals[cell]
+        if cell == TOTALS and fluctuates:
+            out += float(z @ z - there @ there) + 2 * (_log_precision(other) - _log_precision(evaluation))
+            continue
+        seen = template is None or float(template[cell] @ template[cell]) > _SEEN
+        if not (seen or fluctuates):
+            continue
+        if cell not in other.nulls or cell not in evaluation.nulls:
+            out += float(z @ z - there @ there)
+            continue
+        null, new = evaluation.nulls[cell], other.nulls[cell]
+        if null.law == "exponential":  # the scatter of a power is its mean
+            powers, relative = powers_of(z * null.factor), powers_of(there * new.factor)
+            fall, wider = 2 * (powers - relative), np.log(powers / relative)
+        else:
+            fall, wider = z**2 - there**2, np.log(new.breadth / null.breadth)
+        # a cell that never varies has no scatter: the log of its ratio is bounded
+        gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
+        if fluctuates and template is not None:
+            gain = gain[(seen & (template[cell] != 0)) | np.broadcast_to(wider > _WIDER, z.shape)]
+        out += float(np.sum(gain))
+    return out
+
+
+def _log_precision(evaluation: Evaluation) -> float:
+    """The log determinant of the inverse root of the totals' covariance."""
+    return float(np.linalg.slogdet(evaluation.space[2])[1]) if evaluation.space is not None else 0.0
+
+
+def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:
+    """The cells of several blocks in one vector, (cells,), in the order of `keys`."""
+    return np.concatenate([blocks[k] for k in keys]) if keys else np.zeros(0)
+
+
+def misfits(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+    """The mean squared residual of each block, relative to that of the model's replicates.
+
+    Args:
+        own: (replicates, cells) residuals of the replicates, by block.
+        residuals: (cells,) by block.
+    """
+    return {
+        cell: float(np.mean(z**2)) / max(float(np.mean(own[cell] ** 2)), 0.05)
+        for cell, z in residuals.items()
+        if cell != TOTALS and len(z)
+    }
+
+
+def mean_misfit(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
+    """The mean misfit over the blocks; where only means were measured, that of the totals.
+
+    Args:
+        own, residuals: as in `misfits`.
+    """
+    all_ = list(misfits(own, residuals).values())
+    if not all_ and len(residuals[TOTALS]):
+        return float(np.mean(residuals[TOTALS] ** 2))
+    return float(np.mean(all_)) if all_ else 1.0
+
+
+def misfit_null_95(own: Mapping[Cell, np.ndarray]) -> float:
+    """The 95 % quantile of the mean misfit under the null.
+
+    Args:
+        own: (replicates, cells) residuals of the replicates, by block; the number that all blocks have is used.
+    """
+    squares = [np.mean(z**2, axis=1) for cell, z in own.items() if cell != TOTALS]
+    if not squares:
+        return 1.2
+    n = min(map(len, squares))
+    return float(np.quantile(np.mean([x[:n] / max(x[:n].mean(), 1e-30) for x in squares], axis=0), 0.95))
+
+
+@dataclass(frozen=True)
+class BlockCheck:
+    """A check: a block of cells, or the totals.
+
+    Attributes:
+        p: two-sided p-value, of its sum of squares or its worst cell.
+        worst: that cell; z: its residual.
+    """
+
+    cell: Cell
+    p: float
+    worst: int
+    z: float
+
+
+def block_checks(
+    replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray]
+) -> list[BlockCheck]:
+    """The checks of an evaluation with these residuals of the data, by p-value.
+
+    Args:
+        residuals: (cells,) by block.
+    """
+    out = []
+    for cell, z in residuals.items():
+        if cell == TOTALS:
+            out += [
+                BlockCheck(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)
+            ]
+            continue
+        p, worst = evaluation.nulls[cell].chance(z)
+        out.append(BlockCheck(cell, p, worst, float(z[worst])))
+    out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
+    return sorted(out, key=lambda b: (b.p, -abs(b.z)))
+
+
+def failing(checks: Sequence[BlockCheck], level: float = FALSE_ALARM) -> list[BlockCheck]:
+    """The checks that fail by Holm's correction at a familywise level, by p-value.
+
+    The totals together have the same share of the level as in `compare`; all other checks have the rest.
+
+    Args:
+        level: probability that a right model fails any.
+    """
+    totals = sum(block.cell[0] == "" for block in checks)
+    others = len(checks) - totals
+    share = SHARE_OF_TOTALS if totals and others else float(bool(totals))
+    weights = [share / totals if block.cell[0] == "" else (1 - share) / others for block in checks]
+    out, left = [], 1.0
+    for block, weight in sorted(zip(checks, weights, strict=True), key=lambda pair: pair[0].p / pair[1]):
+        if block.p > level * weight / max(left, weight):
+            break
+        out.append(block)
+        left -= weight
+    return sorted(out, key=lambda block: (block.p, -abs(block.z)))

@@ -1,0 +1,294 @@
+"""Fits by the exact likelihood of the data, where it has a closed form (`point_process`).
+
+Where the coordinates change no rate, each pixel of each capture has a rate of its own, which is maximized, so that no
+map is needed. Otherwise the rates follow from the model, and the light level has the uncertainty that the measurement
+states. Intervals are by profile likelihood: twice the log-likelihood falls by 3.84, all else maximized again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .. import twin
+from ..effects import Effect
+from ..effects._traps import Traps
+from ..recording import Capture, Recording
+from ..sensor import Sensor
+from .candidates import Candidate, templates, with_values
+from .coordinates import Coordinate, Key
+from .light_levels import closed_form, level_for
+from .point_process import DENSE, Bits, Law, Stamps, blur_of
+from .profile_likelihood import by_simplex, maximum, profile_end
+
+FALL = 3.84  # of twice the log-likelihood, at the ends of a 95 % interval
+EDGE_FALL = 5.99  # the same for an edge sharper than the intervals are dense: its law is exponential, not normal
+_FAR = 100.0  # of the log-likelihood: a start that is lower than the maximum by more is dropped
+_HIGHER = 0.05  # of the log-likelihood: a value that is higher by more shows that a maximum is none
+_ROUGH = 0.3, 0.5  # tolerances of `by_simplex`: near enough for a parabola
+_SHARP = 0.1  # of a lifetime: the blur of the stamps must be smaller
+
+
+@dataclass(frozen=True)
+class MaximumLikelihood:
+    """Maximum-likelihood estimates with 95 % intervals.
+
+    Attributes:
+        values, intervals: by (effect, parameter), SI.
+        gains: twice the log-likelihood ratio of each change.
+        free: the fitted parameters.
+        correlations: (n, n) of these, by the curvature at the maximum.
+    """
+
+    values: dict[Key, float]
+    intervals: dict[Key, tuple[float, float]]
+    gains: list[float]
+    free: tuple[Key, ...]
+    correlations: np.ndarray
+
+
+def not_in_likelihood(sensor: Sensor, capture: Capture) -> str:
+    """The name of what a capture's likelihood does not describe of a sensor; "" where it describes all that matters."""
+    if capture.mean is not None or capture.modality not in ("tr", "qis"):
+        return f"{capture.modality} of {capture.id}" if capture.mean is None else f"the mean of {capture.id}"
+    stamped = capture.modality == "tr"
+    conditions = capture.conditions
+    for effect in sensor.effects:
+        known = {
+            "light": True,
+            "detection": True,
+            "dark": True,
+            "arrival": False,
+            "gate": not stamped and conditions.frame_time == conditions.frame_period,
+            "correlated": stamped and sensor.rules == "device" and getattr(type(effect), "spawn", None) is Traps.spawn,
+            "dead_time": not (hasattr(effect, "sensitivity") or getattr(effect, "extends", False))
+            if stamped
+            else not (hasattr(effect, "carried") and effect.carried() > 0),
+            "timing": True,
+            "readout": not hasattr(effect, "apply"),
+        }[effect.stage]
+        if not (known or _idle(effect)):
+            return effect.name
+    if not stamped:
+        return ""
+    blur = blur_of(sensor)
+    if blur is None:
+        return "the stamps"
+    width = math.hypot(sensor.tick / math.sqrt(6), blur)
+    traps = [e for e in sensor.at("correlated") if isinstance(e, Traps)]
+    return next((e.name for e in traps if width > _SHARP * float(e.lifetime)), "")
+
+
+def _idle(effect: Effect) -> bool:
+    """Whether an effect is listed at the value at which it vanishes."""
+    offs = [np.all(np.asarray(getattr(effect, n)) == p.off) for n, p in effect.parameters.items() if p.off is not None]
+    return bool(offs) and all(offs)
+
+
+class Likelihood:
+    """The log-likelihood of a measurement as a function of coordinates; all nuisance parameters are maximized.
+
+    Attributes:
+        blur: s, see `blur_of`.
+        own: every pixel of every capture has a rate of its own.
+    """
+
+    def __init__(
+        self, sensor: Sensor, data: Sequence[Recording], coordinates: Sequence[Coordinate], fixed: Mapping[Key, Any]
+    ):
+        self.sensor, self.coordinates, self.fixed = sensor, tuple(coordinates), dict(fixed)
+        self.laws = [Stamps(r) if r.modality == "tr" else Bits(r) for r in data]
+        captures = [r.capture for r in data]
+        self.levels, columns, precision = [], [], []
+        common = np.zeros(len(data))
+        for i, capture in enumerate(captures):
+            light = capture.light
+            stated = twin.photons_at(capture, sensor.layout)
+            if stated is None:
+                total = float(data[i].totals.sum())
+                stated = level_for(closed_form(sensor, capture), total, None)
+                columns.append(np.eye(len(data))[i])
+                precision.append(1e-9)
+            elif not light.dark:
+                common[i] = light.relative_uncertainty
+                if light.own_uncertainty:
+                    columns.append(light.own_uncertainty * np.eye(len(data))[i])
+                    precision.append(1.0)
+            self.levels.append(stated)
+        if common.any():
+            columns.append(common)
+            precision.append(1.0)
+        # (captures, nuisance parameters): the derivative of the log levels by the light's deviations, in sigmas
+        self.light = np.array(columns).reshape(-1, len(data)).T
+        self.precision = np.array(precision)
+        self.shifts = np.zeros(len(precision))
+        self.highest = -math.inf, np.zeros(len(coordinates))  # the highest value so far, and where
+
+    def sensor_at(self, u: np.ndarray) -> Sensor:
+        """The sensor at coordinates (n,)."""
+        turned = {d.key: d.value(float(x)) for d, x in zip(self.coordinates, u, strict=True)}
+        return with_values(self.sensor, {**self.fixed, **turned})
+
+    def begin(self, u: np.ndarray) -> None:
+        """Find out which parts of the model the coordinates change about the start: rates, jitter, dead times.
+
+        Args:
+            u: (n,) the start.
+        """
+        points = [u, *(u + h * np.eye(len(u))[i] for i in range(len(u)) for h in (-0.3, 0.3))]
+        sensors = [self.sensor_at(p) for p in points]
+        rates = [[law.rates(s, x) for law, x in zip(self.laws, self.levels, strict=True)] for s in sensors]
+        self.own = all(np.array_equal(a, b) for one in rates for a, b in zip(one, rates[0], strict=True))
+        self.blur = blur_of(sensors[0]) or 0.0
+        self.jittered = any(blur_of(s) != self.blur for s in sensors)
+        self.edges = [
+            any(not np.array_equal(s.dead_times, sensors[0].dead_times) for s in sensors[1 + 2 * i : 3 + 2 * i])
+            for i in range(len(u))
+        ]
+
+    def fall(self, i: int, u: np.ndarray) -> float:
+        """The fall of twice the log-likelihood at the ends of a coordinate's 95 % interval.
+
+        Where the intervals do not resolve the edge, its law is that of the shortest one.
+
+        Args:
+            i: index of the coordinate.
+            u: (n,) coordinates.
+        """
+        if not self.edges[i]:
+            return FALL
+        dead = self.sensor_at(u).dead_times
+        return FALL if sum(law.near_edge(dead, self.blur) for law in self.laws) > DENSE else EDGE_FALL
+
+    def __call__(self, u: np.ndarray) -> float:
+        sensor = self.sensor_at(u)
+        blur = (blur_of(sensor) or 0.0) if self.jittered else self.blur
+        parts = [law.of(sensor, blur, self.own) for law in self.laws]
+        value = sum(value for value, _ in parts)
+        value = value if self.own else value + self._lit(sensor, [law for _, law in parts])
+        if value > self.highest[0]:
+            self.highest = value, u.copy()
+        return value
+
+    def _lit(self, sensor: Sensor, laws: Sequence[Law]) -> float:
+        """The log-likelihood of the rates, the light's nuisance parameters maximized by Newton steps."""
+        step, z = 1e-4, self.shifts
+        for _ in range(30):
+            values, first, second = np.zeros((3, len(laws)))
+            for i, (data, law) in enumerate(zip(self.laws, laws, strict=True)):
+                x = float(self.light[i] @ z)
+                rate, more = (data.rates(sensor, self.levels[i] * math.exp(y)) for y in (x, x + step))
+                slope = (more - rate) / step
+                value, by_rate, curvature = law(rate)
+                values[i] = value.sum()
+                first[i], second[i] = by_rate @ slope, curvature @ slope**2
+            total = float(values.sum() - 0.5 * self.precision @ z**2)
+            if not len(z):
+                break
+            gradient = self.light.T @ first - self.precision * z
+            move = np.linalg.solve(self.light.T @ (second[:, None] * self.light) + np.diag(self.precision), gradient)
+            if gradient @ move < 1e-4:
+                total += 0.5 * float(gradient @ move)
+                break
+            z = z + move * min(1.0, 1.0 / float(np.abs(self.light @ move).max()))
+        self.shifts = z
+        return total
+
+
+def maximise(
+    sensor: Sensor,
+    data: Sequence[Recording],
+    candidates: Sequence[Candidate],
+    *,
+    start: Mapping[Key, float] | None = None,
+    errors: Mapping[Key, float] | None = None,
+    mapped: bool = False,
+) -> MaximumLikelihood | str:
+    """The maximum-likelihood fit of some changes to recordings, or the name of what stands in its way.
+
+    Args:
+        sensor: the model.
+        data: the recordings.
+        candidates: the changes whose coordinates are fitted.
+        start: values near the best ones; without them, the templates are tried.
+        errors: approximate standard errors of coordinates.
+        mapped: pixels have rates of their own that are not exactly known; then no coordinate that changes a rate is
+            fitted.
+    Returns:
+        The estimates; a coordinate that the likelihood does not depend on has its search range as interval.
+    """
+    coordinates = tuple(d for candidate in candidates for d in candidate.coordinates)
+    fixed = {key: value for candidate in candidates for key, value in candidate.fixed}
+    if not coordinates or any(
+        candidate.carrier or candidate.phases or not candidate.coordinates for candidate in candidates
+    ):
+        return "a map, a phase or a switch"
+    values = {**fixed}
+    for candidate in candidates:
+        for key, value in templates(candidate)[0].items():
+            listed = sensor.effect(key[0])
+            values[key] = value if listed is None else getattr(listed, key[1])
+    changed = with_values(sensor, values)
+    # the start of a listed parameter may be where its effect vanishes; its effect elsewhere must be in the
+    # likelihood, too
+    elsewhere = with_values(sensor, {**values, **{key: v for c in candidates for key, v in templates(c)[0].items()}})
+    for one in data:
+        for model in (changed, elsewhere):
+            if word := not_in_likelihood(model, one.capture):
+                return word
+    function = Likelihood(sensor, data, coordinates, fixed)
+    ends = np.array([d.ends for d in coordinates]).T
+    given = {d.key: float(values[d.key]) for d in coordinates}
+    widths = {d.key: 0.3 if d.log else 0.1 * (d.ends[1] - d.ends[0]) for d in coordinates}
+
+    def placed(there: Mapping[Key, float]) -> np.ndarray:
+        return np.clip([d.coordinate(there[d.key]) for d in coordinates], *ends)
+
+    function.begin(placed({**given, **(start or {})}))
+    if mapped and not function.own:
+        return "maps beside what changes the rates"
+    top = None
+    if start is not None:
+        u, scales = placed({**given, **start}), {**widths, **(errors or {})}
+        top = maximum(function, u, np.array([scales[d.key] for d in coordinates]), ends, _FAR)
+    if top is None:
+        u, scale = placed(given), np.array([widths[d.key] for d in coordinates])
+        function.begin(u)
+        for candidate in candidates:
+            if candidate.kind == "add":
+                there = {d.key: d.value(x) for d, x in zip(coordinates, u, strict=True)}
+                u = max((placed({**there, **template}) for template in templates(candidate)), key=function)
+        _, u = by_simplex(function, u, scale, ends, _ROUGH)
+        top = maximum(function, u, scale, ends)
+        assert top is not None
+    for _ in range(3):
+        profiles = [
+            [profile_end(function, top, i, sign, function.fall(i, top.u), ends) for sign in (-1, 1)]
+            if top.tells[i]
+            else list(map(float, ends[:, i]))
+            for i in range(len(coordinates))
+        ]
+        if function.highest[0] < top.value + _HIGHER:
+            break
+        # this was not the maximum
+        top = maximum(function, function.highest[1], top.spreads, ends)
+        assert top is not None
+    best, u = top.value, top.u
+    intervals = {d.key: d.interval(*profile) for d, profile in zip(coordinates, profiles, strict=True)}
+    found = {d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}
+    gains = []
+    for candidate in candidates:
+        # the others stay
+        own = {*dict(candidate.fixed), *(d.key for d in candidate.coordinates)}
+        rest = {key: value for key, value in {**fixed, **found}.items() if key not in own}
+        without = Likelihood(sensor, data, (), rest)
+        without.begin(np.zeros(0))
+        without.own = function.own
+        gains.append(2 * (best - without(np.zeros(0))))
+    inverse = np.linalg.inv(top.curved)
+    spread = np.sqrt(np.diag(inverse))
+    return MaximumLikelihood({**fixed, **found}, intervals, gains, tuple(found), inverse / np.outer(spread, spread))

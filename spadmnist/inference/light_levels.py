@@ -1,0 +1,410 @@
+"""Light levels: the nuisance parameter of every capture, from its total, by the closed forms of the effects.
+
+The total of a capture gives its level. A separate test compares the level with the stated one, within its
+uncertainty.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+
+from .. import twin
+from ..effects import Conditions
+from ..recording import Capture
+from ..sensor import Sensor
+from .null_distribution import poisson_scores
+from .replicates import InTheDark, ReducedCapture, Replicates
+
+if TYPE_CHECKING:
+    from .evaluation import Evaluation
+
+SPREAD = 3.0  # standard deviations of the stated level: half the range over which the light of the replicates varies
+LEAST_SPREAD = 0.01  # of a logarithm: the least half range of the light of the replicates
+# of a logarithm: the noise of a level beyond which it counts, and the most that it counts
+_MUCH, _MOST_CHANCE = 0.05, 0.7
+_DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
+_CLOSED = 5e-4  # relative error of the closed forms, at most
+LEAST_ELASTICITY = 0.01  # the least elasticity of a total that informs the light level
+# of a logarithm, lit and dark: the most that a level is changed for the same number of detections
+_MOST_LIGHT, _MOST_DARK = 1.5, 9.0
+# expected detections: the least that inform the level; below the other, none are expected
+_LEAST_TOTAL, _NEVER = 5.0, 0.5
+_SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
+_FAINT = 1e-6  # of the stated light: as good as none
+
+
+@dataclass(frozen=True)
+class CaptureNull:
+    """The total of a capture under the model, as a function of the light level.
+
+    Attributes:
+        level: the level about which the replicates were made: photons/s on a pixel, in the dark a factor on the
+            rates.
+        stated: the level of the measurement file, in the same unit; None where it states none.
+        totals: (replicates,) detections of each.
+        expected: level -> detections of the array, by the closed forms.
+        law: (offset, slope) of the log of the total as a function of the log of `expected`.
+        scatter: standard deviation of the log of the total about that law.
+    """
+
+    level: float
+    stated: float | None
+    totals: np.ndarray
+    expected: Callable[[float], float]
+    law: tuple[float, float]
+    scatter: float
+
+    def total_at(self, level: float) -> float:
+        """Expected detections of the whole array at a level."""
+        return math.exp(self.law[0] + self.law[1] * math.log(self.expected(level)))
+
+    def level_of(self, total: float) -> tuple[float, float, float]:
+        """(level that gives this total, standard error of its log, elasticity of the total there)."""
+        low, high = self.level * 1e-6, self.level * 1e6
+        for _ in range(200):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
+        found = math.sqrt(low * high)
+        elasticity = self.elasticity_at(found)
+        return found, self._scatter / max(elasticity, 1e-3), elasticity
+
+    def elasticity_at(self, level: float) -> float:
+        """Elasticity of the total: d log(total) / d log(level)."""
+        step = 1.01
+        return math.log(self.total_at(level * step) / self.total_at(level / step)) / (2 * math.log(step))
+
+    @property
+    def _scatter(self) -> float:
+        return self.scatter * math.sqrt(1 + 2 / len(self.totals))
+
+    def drowned(self, total: float) -> bool:
+        """Whether a total is so small that it hardly depends on the light, though it would at the stated level.
+
+        The level that gives such a total is meaningless; `score` applies.
+        """
+        if self.stated is None or total >= self.total_at(self.stated):
+            return False
+        _, _, elasticity = self.level_of(max(total, 0.5))
+        return elasticity < _DROWNED * self.elasticity_at(self.stated)
+
+    def score(self, total: float, uncertainty: float = 0.0, mean: float | None = None) -> float:
+        """The deviation of a total from the expected one, in standard deviations, as the normal score of its counts.
+
+        Args:
+            total: detections.
+            uncertainty: relative, of the stated level.
+            mean: the expectation; by default that of the stated level.
+        """
+        assert self.stated is not None
+        mean = self.total_at(self.stated) if mean is None else mean
+        level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
+        wider = max(1.0, math.hypot(self._scatter, level) * math.sqrt(max(mean, 1.0)))
+        return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider
+
+
+def law_of(totals: np.ndarray, closed: np.ndarray) -> tuple[tuple[float, float], float]:
+    """((offset, slope), scatter) of the regression of log totals on the log of the closed form.
+
+    The slope has a prior of 1 with a standard deviation of 0.02.
+
+    Args:
+        totals: (replicates,) detections.
+        closed: (replicates,) detections by the closed form.
+    """
+    x, y = np.log(closed), np.log(np.maximum(totals, 0.5))
+    apart = x - x.mean()
+    deviation = y - y.mean() - apart
+    noise = float(np.var(deviation, ddof=1)) / 0.02**2
+    slope = 1 + float(apart @ deviation) / (float(apart @ apart) + max(noise, 1e-12))
+    offset = float(y.mean() - slope * x.mean())
+    return (offset, slope), float(np.std(y - offset - slope * x, ddof=2))
+
+
+def levels_about(
+    expected: Callable[[float], float], total: float, stated: float | None, capture: Capture
+) -> tuple[float, float]:
+    """(level about which a capture is simulated, half the range of its logarithm).
+
+    The measurement's own level lies within that range, or outside by no more than its noise.
+
+    Args:
+        expected: level -> detections.
+        total: detections of the measurement.
+        stated: the stated level; None where there is none.
+    """
+    centre = level_for(expected, total, stated)
+    half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
+    if stated is not None:
+        chance = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_CHANCE)
+        if total == 0 or abs(math.log(centre / stated)) < half + chance:
+            # the same replicates then serve every measurement of this model; where detections are few, their range
+            # reaches the data
+            return stated, half + chance if chance > _MUCH else half
+    return centre, half
+
+
+def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
+    """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
+
+    It is by the closed forms of the effects, without a simulation. Its scatter is that of the counts, of the last
+    digit of the mean, and of the closed forms.
+
+    Args:
+        total: detections of the whole array.
+        replicates: their number.
+    """
+    dark = capture.light.dark
+    stated = 1.0 if dark else twin.photons_at(capture, sensor.layout)
+    expected = closed_form(InTheDark.of(sensor) if dark else sensor, capture)
+    level = stated if stated is not None else level_for(expected, total, None)
+    mean = max(expected(level), 1e-9)
+    share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
+    digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
+    rounding = _last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
+    scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2)
+    normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
+    order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
+    totals = mean * np.exp(scatter * normal[order])
+    return CaptureNull(level, stated, totals, expected, (0.0, 1.0), scatter), np.ones(replicates)
+
+
+def _last_digit(value: float) -> float:
+    """The last decimal place of a number as written: 0.1 of 2.6, 1 of 470."""
+    text = f"{value:.10g}"
+    return 10.0 ** -len(text.partition(".")[2]) if "." in text else 1.0
+
+
+def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
+    """The function level -> detections of the whole array, by the effects' closed forms."""
+    conditions = capture.conditions
+
+    @functools.lru_cache(maxsize=4096)
+    def detections(level: float) -> float:
+        light = np.full((1, sensor.layout.pixels), level)
+        if capture.counts_events:
+            return max(float(sensor.expected(light, conditions)[1].sum()), 1e-9)
+        return max(float(conditions.frames * in_frames(sensor, light, conditions).sum()), 1e-9)
+
+    return detections
+
+
+def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The expected share of frames with a detection, (images, pixels).
+
+    Args:
+        light: (images, pixels) photons/s.
+    """
+    # without gaps between frames: nothing is recorded in them
+    live = replace(conditions, frame_period=conditions.frame_time, exposure=conditions.frames * conditions.frame_time)
+    candidates, _ = sensor.expected(light, live)
+    return np.asarray(-np.expm1(-candidates / conditions.frames))
+
+
+def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
+    """The level at which this total is expected; the stated one where there is none."""
+    low, high = 1e-6, 1e12
+    for _ in range(100):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if expected(middle) < total else (low, middle)
+    found = math.sqrt(low * high)
+    return found if 1e-5 < found < 1e11 else stated or 1.0
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """The estimate of a nuisance parameter.
+
+    Attributes:
+        capture: None for a parameter that all captures share.
+        value: relative to the stated value; low, high: its 95 % interval.
+        pull: deviation from the stated value, in standard deviations.
+        stated: relative standard deviation that the measurement states.
+    """
+
+    capture: str | None
+    name: str
+    value: float
+    low: float
+    high: float
+    pull: float
+    stated: float = 0.0
+
+
+def expected_total(replicates: Replicates, sensor: Sensor, id: str) -> Callable[[float], float]:
+    """The function level -> detections of the array in a capture; in the dark the level is a factor on the rates."""
+    capture = replicates.seen[id].capture
+    return closed_form(InTheDark.of(sensor) if capture.light.dark else sensor, capture)
+
+
+def matched_light(replicates: Replicates, evaluation: Evaluation, sensor: Sensor, id: str) -> float:
+    """The factor on the light at which a sensor gives as many detections as the evaluated model.
+
+    It is 1 where there is none. Statistics are compared at the same total; they must not be extrapolated to another.
+    """
+    null, form = evaluation.rates[id], expected_total(replicates, sensor, id)
+    wanted = math.log(null.expected(null.level))
+    x = 0.0
+    # in the dark all rates are scaled; light saturates, so that a large factor is another regime
+    most = _MOST_DARK if replicates.seen[id].capture.light.dark else _MOST_LIGHT
+    for _ in range(6 + round(2 * most)):
+        here = math.log(form(null.level * math.exp(x)))
+        if abs(wanted - here) < 1e-7:
+            break
+        slope = (math.log(form(null.level * math.exp(x + 0.01))) - here) / 0.01
+        if slope < 0.02:
+            return 1.0
+        x += max(-0.5, min(0.5, (wanted - here) / slope))
+    return math.exp(x) if abs(x) < most else 1.0
+
+
+def needed_light(replicates: Replicates, evaluation: Evaluation, sensor: Sensor, id: str) -> float:
+    """The log of the factor on the light (dark: on the rates) at which a sensor gives as many detections."""
+    ratio = matched_light(replicates, evaluation, sensor, id)
+    if ratio != 1.0:
+        return math.log(ratio)
+    null = evaluation.rates[id]
+    here = null.expected(null.level)
+    slope = math.log(null.expected(null.level * 1.01) / here) / math.log(1.01)
+    return -math.log(expected_total(replicates, sensor, id)(null.level) / here) / max(slope, 0.05)
+
+
+def central_level(
+    replicates: Replicates, sensor: Sensor, seen: ReducedCapture
+) -> tuple[float, float | None, Callable[[float], float], float]:
+    """(level about which a capture is simulated, stated level, level -> detections, half the range of the log level).
+
+    Args:
+        sensor: the sensor whose closed forms hold.
+        seen: the reduced capture.
+    """
+    capture = seen.capture
+    if capture.light.dark:
+        sensor, stated = InTheDark.of(sensor), 1.0
+    else:
+        stated = twin.photons_at(capture, sensor.layout)  # type: ignore[assignment]
+    expected = closed_form(sensor, capture)
+    centre, half = levels_about(expected, seen.total, stated, capture)
+    return centre, stated, expected, half
+
+
+def _stated(replicates: Replicates, evaluation: Evaluation) -> list[str]:
+    return [
+        id
+        for id in replicates.seen
+        if evaluation.rates[id].stated is not None
+        and _informative(replicates, evaluation.rates[id], replicates.seen[id].total)
+    ]
+
+
+def _informative(replicates: Replicates, null: CaptureNull, total: float) -> bool:
+    """Whether a total informs the level: enough detections are expected, or some are expected and enough are there."""
+    stated = float(null.stated or 1.0)
+    # by the closed form: the law of the totals counts an empty replicate as half a detection
+    few = null.expected(stated) >= _NEVER and total >= _LEAST_TOTAL
+    return few or null.total_at(stated) >= _LEAST_TOTAL
+
+
+def totals_space(
+    replicates: Replicates, evaluation: Evaluation
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """(captures, elasticities, inverse root of the covariance of the log levels, the light's part in it).
+
+    The arrays have shapes (captures,), (captures, captures), (captures,).
+    """
+    if evaluation.space is not None:
+        return evaluation.space
+    ids = _stated(replicates, evaluation)
+    errors, elasticity, common = [], [], []
+    for id in ids:
+        light = replicates.seen[id].capture.light
+        _, _, slope = evaluation.rates[id].level_of(max(replicates.seen[id].total, 1.0))
+        errors.append(level_error(replicates, evaluation, id))
+        elasticity.append(max(slope, 1e-3))
+        common.append(0.0 if light.dark else light.relative_uncertainty)
+    c = np.array(common)
+    covariance = np.diag(np.array(errors) ** 2) + np.outer(c, c)
+    root = np.linalg.inv(np.linalg.cholesky(covariance)) if ids else np.zeros((0, 0))
+    evaluation.space = ids, np.array(elasticity), root, c
+    return evaluation.space
+
+
+def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> float:
+    """The standard deviation of the log of a capture's level (dark: of its rates), its own uncertainty included."""
+    null, light = evaluation.rates[id], replicates.seen[id].capture.light
+    level, error, slope = null.level_of(max(replicates.seen[id].total, 1.0))
+    if light.dark:
+        error = max(error, 1 / math.sqrt(null.total_at(1.0)) / max(slope, 1e-3))
+    stated = float(null.stated or 1.0)
+    z = _score(replicates, evaluation, id, replicates.seen[id].total, null.total_at(stated))
+    if z is not None:
+        level, _, _ = null.level_of(max(replicates.seen[id].total, 0.5))
+        apart = abs(math.log(level / stated))
+        error = apart / abs(z) if abs(z) > _SOME else max(error, apart / _SOME)
+    return max(math.hypot(error, light.own_uncertainty), 1e-6)
+
+
+def _score(replicates: Replicates, evaluation: Evaluation, id: str, total: float, expected: float) -> float | None:
+    """The deviation of a total in standard deviations; None where the log of the level is normal enough.
+
+    It is not normal for few dark counts, nor where the detections of the light are few compared with the dark ones.
+    """
+    null = evaluation.rates[id]
+    stated = float(null.stated or 1.0)
+    if replicates.seen[id].capture.light.dark:
+        wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
+        return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
+    if null.drowned(total):
+        return null.score(total, mean=expected)
+    if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):
+        return None
+    scatter = null.scatter * math.sqrt(1 + 2 / len(null.totals))
+    return math.log(max(total, 0.5) / expected) / max(scatter, 1e-9)
+
+
+def totals_residuals(replicates: Replicates, evaluation: Evaluation, logs: Mapping[str, float]) -> np.ndarray:
+    """The residuals of the totals: independent, of variance 1; the light's common factor is in their covariance.
+
+    Args:
+        logs: log of the total, detections, by capture.
+    """
+    ids, _, root, _ = totals_space(replicates, evaluation)
+    return root @ log_levels(replicates, evaluation, ids, logs) if ids else np.zeros(0)
+
+
+def log_levels(
+    replicates: Replicates, evaluation: Evaluation, ids: Sequence[str], logs: Mapping[str, float]
+) -> np.ndarray:
+    """The logs of the levels (dark: of the rates) that give these totals, relative to the stated ones, (captures,)."""
+    return np.array(
+        [
+            math.log(evaluation.rates[id].level_of(math.exp(logs[id]))[0] / float(evaluation.rates[id].stated or 1.0))
+            for id in ids
+        ]
+    )
+
+
+def own_totals(replicates: Replicates, evaluation: Evaluation, k: int, draw: float) -> np.ndarray:
+    """The residuals of the totals of one replicate, (captures,).
+
+    Args:
+        k: the number of the replicate.
+        draw: a standard normal number, the deviation of the light's common factor.
+    """
+    ids, elasticities, root, common = totals_space(replicates, evaluation)
+    x = []
+    for id, slope in zip(ids, elasticities, strict=True):
+        null = evaluation.rates[id]
+        mean_log = null.law[0] + null.law[1] * math.log(null.expected(float(null.level * evaluation.factors[id][k])))
+        z = _score(replicates, evaluation, id, float(null.totals[k]), math.exp(mean_log))
+        if z is not None:
+            x.append(z * level_error(replicates, evaluation, id))
+            continue
+        x.append((math.log(max(null.totals[k], 0.5)) - mean_log) / slope)
+    return root @ (np.array(x) + draw * common) if ids else np.zeros(0)

@@ -1,0 +1,205 @@
+"""Trials of maps: every map whose values differ beyond their noise; patterns before maps."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import UNABLE
+from ..sensor import Sensor
+from . import map_fits, pixel_maps
+from .candidates import Candidate, with_values
+from .coordinates import Key
+from .evaluation import Evaluation, square, stacked
+from .replicates import Model
+from .score_test import p_of_map
+from .signature import Signature, residuals_at, signatures, template_of
+from .trial import Trial, is_pattern, tie
+
+if TYPE_CHECKING:
+    from .scan import Scan
+
+MAKING_A_MAP = "making a map"  # the stage at which a map may fail
+# the largest p-value of a map that is tried, and of one with random odd pixels
+LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS = 1e-3, 0.05
+# of a logarithm: widths of the pixels' differences that counts do not show
+_SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)
+_TOLD = 50.0  # information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
+_LIKE = 0.4  # cosine of two signatures: below it they are not alike
+# p-values of a pattern in a map: of a significant one, and of one for which the p-value of the map is irrelevant
+_STANDS_OUT, _NO_DOUBT = 1e-3, 1e-4
+_MAYBE = 100.0  # times the p-value of the map: a pattern below it is significant, too
+# the least width of a map that is tried, and its least mean square relative to its noise
+_LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05
+
+
+def map_trials_of(
+    scan: Scan, evaluation: Evaluation, values: dict[Key, Any], least: float = LEAST_P_OF_MAP
+) -> list[Trial]:
+    """The trials of maps: of every map whose values differ beyond their noise, and of all that are needed together.
+
+    Args:
+        values: the values of the model, SI.
+        least: the largest p-value of a map that is tried.
+    """
+    if scan.only_rates(evaluation):
+        return []
+    levels = map_fits.light_levels_of(scan.replicates, evaluation)
+    held = [c for c in scan.accepted if c.carrier]
+    wanted = candidate_maps(scan, evaluation)
+    groups = [[c] for c in wanted]
+    pixels = [c for c in wanted if c.per == "pixel" and pixel_maps.by_counts(c)]
+    if len(pixels) > 1 and all(c.per == "pixel" for c in held):
+        with contextlib.suppress(*UNABLE):  # each is tried by itself, too
+            together = map_fits.maps_needed(scan.replicates, values, held, pixels, levels)
+            if len(together) > 1:
+                groups.insert(0, together)
+    out = []
+    for group in groups:
+        made: tuple[Any, ...] = ()
+        with scan.if_possible(group[0], MAKING_A_MAP):
+            made = map_fits.models_with_maps(scan.replicates, values, [*held, *group], levels)
+        if not made:
+            continue
+        sensors, found, mapped = made
+        map_ = found[group[0].carrier]  # type: ignore[index]
+        spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
+        if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
+            continue
+        sensors = sensors.changed({}, scan.phases)
+        chance = min(p_of_map(scan.replicates, evaluation, c, values, levels) for c in group)
+        if chance > least:
+            continue
+        nothing = Signature({}, {}, {})
+        out.append(
+            Trial(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), chance=chance)
+        )
+    return out
+
+
+def candidate_maps(scan: Scan, evaluation: Evaluation) -> list[Candidate]:
+    """Every map that may be tried: of no parameter that an earlier step fits as one number."""
+    fit = {coordinate.key for candidate in scan.accepted for coordinate in candidate.coordinates}
+    return [c for c in scan._beside(evaluation.sensors.one) if c.carrier and c.carrier not in fit]
+
+
+def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> list[Trial]:
+    """The trials, a pattern first where it is significant in the map; patterns that are not are dropped.
+
+    A few random odd pixels may lie in a row, if seldom. A pattern whose p-value is far above that of the map is none.
+    """
+    maps = [
+        t
+        for t in tried
+        if t.maps and t.candidate.per == "pixel" and pixel_maps.acts_on_light(evaluation.sensors.one, t.candidate)
+    ]
+    patterns = [t for t in tried if is_pattern(t)]
+    if not maps or not patterns:
+        return tried
+    assert maps[0].maps is not None
+    free = maps[0].maps[maps[0].candidate.carrier]  # type: ignore[index]
+    chance = 1.0 if maps[0].chance is None else maps[0].chance
+    doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
+    layout = evaluation.sensors.one.layout
+    place = layout.centred.T
+    radius = (place**2).sum(axis=0)
+    designs = {}
+    for one in patterns:
+        if one.candidate.per == "row":
+            designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "row"))
+        elif one.candidate.per == "column":
+            designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "column"))
+        else:
+            designs[one.candidate.name] = np.stack([*place, radius], axis=1)
+    found = pixel_maps.pattern_tests(free, designs)
+    real = [t for t in patterns if found[t.candidate.name][0] < doubtful]
+    dropped = [t for t in patterns if t not in real]
+    rest = [t for t in tried if t not in dropped]
+    if real and (rest[0] in maps or rest[0] in real):
+        first = min(real, key=lambda t: found[t.candidate.name][1])
+        rest.remove(first)
+        rest.insert(0, first)
+    return rest
+
+
+def unseen_maps(
+    scan: Scan, evaluation: Evaluation, values: dict[Key, Any], like: Trial, faint: bool = False
+) -> list[Trial]:
+    """Trials of random maps: maps that no pixel's counts inform, but whose signature is that of a candidate.
+
+    The pixels of every replicate are drawn anew. A trial is returned where its gain is that of `like`, within a tie.
+
+    Args:
+        values: the values of the model, SI.
+        like: the trial of the candidate.
+        faint: see `Scan.again`.
+    """
+    levels = map_fits.light_levels_of(scan.replicates, evaluation)
+    out = []
+    for candidate in scan._beside(evaluation.sensors.one):
+        if candidate.per != "pixel" or candidate.carrier is None or candidate.effect == like.candidate.effect:
+            continue
+        information: Any = None
+        with scan.if_possible(candidate, MAKING_A_MAP):
+            information = sum(map_fits.information(scan.replicates, values, candidate, levels).values())
+        if information is None:
+            continue
+        # the intervals inform each dead time, but jitter may be what scatters them
+        if float(np.median(information)) > _TOLD and not candidate.blinds:
+            continue
+        best: Trial | None = None
+        about, sigmas = 0.0, np.array(_SIGMAS)
+        (wide,) = signatures(
+            scan.replicates, evaluation, [_with_random_map(evaluation.sensors, candidate, _SIGMAS[-2])]
+        )
+        if isinstance(wide, str) or _cosine(scan, evaluation, wide, like.signature) < _LIKE:
+            continue
+        for _ in range(3):  # ever closer to the best width
+            models = [_with_random_map(evaluation.sensors, candidate, float(sigma)) for sigma in sigmas]
+            for sigma, sensors, signature in zip(
+                sigmas, models, signatures(scan.replicates, evaluation, models), strict=True
+            ):
+                if isinstance(signature, str):
+                    continue
+                residuals = residuals_at(scan.replicates, evaluation, signature)
+                gain = square(evaluation.residuals) - square(residuals)
+                one = Trial(candidate, {}, signature, gain, 1.0, sensors, residuals=residuals)
+                one = scan._marked(evaluation, one) if faint else one
+                if best is None or one.gain > best.gain:
+                    best, about = one, float(sigma)
+            if best is None or best.gain < like.gain / 2:
+                break
+            sigmas = about * np.exp(math.log(sigmas[1] / sigmas[0]) * np.array([-0.6, -0.3, 0.3, 0.6]))
+        if best is not None and best.gain > like.gain - tie(like.gain):
+            out.append(best)
+    return out
+
+
+def _cosine(scan: Scan, evaluation: Evaluation, one: Signature, other: Signature) -> float:
+    """The cosine of two signatures, over the statistics in which the other one is not 0."""
+    templates = [template_of(scan.replicates, evaluation, signature) for signature in (one, other)]
+    keys = [cell for cell in evaluation.residuals if templates[1][cell].any()]
+    a, b = (stacked(template, keys) for template in templates)
+    return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
+
+
+def _with_random_map(sensors: Model, candidate: Candidate, sigma: float) -> Model:
+    """The model with random differences of width `sigma` in the logarithm of a parameter, drawn for each replicate."""
+    effect, parameter = candidate.carrier  # type: ignore[misc]
+
+    def of(capture: str, number: int) -> Sensor:
+        sensor = sensors.of(capture, number)
+        rng = np.random.Generator(np.random.Philox(key=[number, 11]))
+        values = np.asarray(getattr(sensor.effect(effect), parameter), np.float64)
+        draws = np.exp(sigma * rng.standard_normal(sensor.layout.pixels))
+        return with_values(sensor, {(effect, parameter): values * draws})
+
+    return Model(of, sensors.one, alike=False, typical=sensors.usual)
+
+
+def _indicators(groups: np.ndarray) -> np.ndarray:
+    one = np.eye(int(groups.max()) + 1)[groups]
+    return np.asarray(one[:, 1:])

@@ -1,0 +1,612 @@
+"""Model selection: which physical effect does a model lack? Forward selection, then backward elimination.
+
+Candidates are tried only where a model fails (as `compare` judges): every registered effect that it lacks, every
+listed parameter at another value, every map (`candidates`). The best ones of the scan are fitted, the best of these
+is added, and everything is fitted anew, until nothing significant is left. What the set-up explains is not attributed
+to the sensor (`setups`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..effects import Mimic
+from ..errors import UNABLE, why
+from ..factory import pool
+from ..measurement import Measurement
+from ..sensor import Sensor
+from . import experiment_design, setups, time_blocks, upper_limits
+from .budget import FITS, STEPS, Budget, OutOfBudget, clock
+from .candidates import Candidate
+from .comparison import Comparison, comparison_of, comparison_with
+from .elimination import drop_mimics, drop_needless, in_vain, left_in_own_cells
+from .error_budget import Rung, placebo_of
+from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, misfit_null_95, square
+from .findings import mimicked, nuisances, remainder, traces
+from .levels import FALSE_ALARM, LEAST_GAIN
+from .map_trials import patterns_first, unseen_maps
+from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
+from .ranking import best_of, compare_by_squares, gain_against, least_probable, worth_fitting
+from .replicates import REPLICATES, TOTALS, Replicates
+from .results import Diagnosis, Step, Value, plain, title
+from .scan import Scan
+from .score_test import explains_its_signature, p_of_any, p_of_best
+from .signature import residuals_at
+from .trial import Trial, at_end, tie
+from .trial_fits import fit_trial
+
+MAX_STEPS = 12  # of one diagnosis, by default
+_QUICK = 32  # replicates of each capture in a quick diagnosis
+# p-value of a signature that is followed where no check fails; it is below the false-alarm rate of the checks
+_TRACE = 4e-3
+_MAYBE, _CLOSER = 100.0, REPLICATES  # times that p-value: worth more replicates; their number
+_PLAIN = 1e-6  # p-value of a check that needs no closer look
+_NAMED = 4  # alternatives of a step
+# of the gain of a shape at the end of its range: a candidate with as much is confused with it, because another law
+# may be the right one
+_ALMOST = 0.8
+_LATER_TRACE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed
+
+
+def diagnose(
+    sensor: Sensor,
+    measurement: Measurement,
+    seed: int = 0,
+    max_steps: int = MAX_STEPS,
+    quick: bool = False,
+    jobs: int = 2,
+    progress: Callable[[str], None] | None = None,
+    within: float = math.inf,
+    keep: Callable[[Diagnosis], None] | None = None,
+) -> Diagnosis:
+    """The diagnosis of a model: the effects, values and maps that it lacks, added one by one.
+
+    Args:
+        sensor: the model.
+        seed: of the replicates.
+        max_steps: the largest number of steps.
+        quick: fewer replicates.
+        jobs: number of workers.
+        progress: called with a line about what is being done.
+        within: the budget of the search, s of two idle cores, see `budget`.
+        keep: called with the diagnosis so far after each step; its verdict and misfits are those of that moment.
+    Raises:
+        InputError: where sensor and measurement do not belong together.
+    """
+    report, budget = progress or (lambda what: None), Budget(within)
+
+    def say(what: str) -> None:
+        left = budget.left
+        report(what if budget.spent == 0 or left in (0, math.inf) else f"{what} (at most {clock(left)} of steps left)")
+
+    with pool(jobs, "generator") as parallel:
+        number = _QUICK if quick else REPLICATES
+        replicates = Replicates(sensor, measurement, seed, parallel, number, say, budget=budget)
+        short = setups.stopped_early(replicates)
+        if short:
+            exposures = {
+                id: replicates.seen[id].capture.conditions.exposure * share for id, (share, _) in short.items()
+            }
+            replicates = Replicates(sensor, measurement, seed, parallel, number, say, exposures, budget=budget)
+        return _diagnosed(replicates, max_steps, quick, short, keep or (lambda found: None))
+
+
+@dataclass
+class _Notes:
+    """What a diagnosis reports in addition to its steps.
+
+    Attributes:
+        setup: entries of the set-up.
+        explained: the set-up explains the totals that fail.
+        bent: a nonlinearity that no effect here has may explain them as well.
+        advice: captures that would separate explanations.
+        rival: a change of the sensor that is a tie with the set-up.
+        placebo: the row of the placebo.
+        tried: the last trials of the candidates.
+        looked: the evaluation under which they were tried in all captures.
+    """
+
+    setup: list[dict[str, Any]]
+    explained: bool = False
+    bent: bool = False
+    advice: list[dict[str, Any]] = field(default_factory=list)
+    rival: Trial | None = None
+    placebo: Rung | None = None
+    tried: list[Trial] = field(default_factory=list)
+    looked: Evaluation | None = None
+
+
+def _diagnosed(
+    replicates: Replicates,
+    max_steps: int,
+    quick: bool,
+    short: Mapping[str, tuple[float, float]],
+    keep: Callable[[Diagnosis], None],
+) -> Diagnosis:
+    path = begin(replicates)
+    start, notes = path.evaluation, _Notes(_too_short(short))
+    replicates.budget.until = STEPS
+    while len(path.steps) < max_steps and not in_vain(path, not notes.explained) and _possible(path, notes):
+        if path.steps:
+            keep(_so_far(path, start, notes))
+    replicates.budget.until = FITS
+    if path.steps:
+        with _or_as_before(path, "taking out what is needless"):
+            drop_needless(path)
+        with _or_as_before(path, "taking out what only looks alike"):
+            drop_mimics(path, start, not notes.explained)
+    if path.steps and not short:
+        with _or_as_before(path, "the fit by likelihood"):
+            sharpen(path, replicates.measurement)
+    with _or_as_before(path, "the intervals"):
+        scale_errors(path)
+    with _or_as_before(path, "the intervals"):
+        open_ends(path)
+    replicates.budget.until = math.inf
+    if path.steps:
+        with _or_as_before(path, "the last comparison"):
+            path.last_rung()
+    verdict = _verdict(path, _left(path, notes), notes)
+    if not path.steps:
+        path.evaluation, path.fit, path.values = start, None, {}
+        path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
+    rungs = [path.ladder[0], *([notes.placebo] if notes.placebo else []), *path.ladder[1:]]
+    null_95 = _measured(path, rungs)
+    if verdict == "explained":
+        replicates.budget.until = 1.0
+        verdict = _or_confused(path, notes)
+    if notes.rival is not None:
+        path.steps.append(_rival_step(path, notes.rival))
+    for step in path.steps:
+        for other in step.alternatives:
+            other.pop("confused", None)
+            other.pop("tried", None)
+    limits: _Limits = ([], [], [])
+    replicates.budget.until = 1.0
+    if verdict == "adequate" or (verdict == "explained" and not quick):
+        replicates.say("what would have been seen")
+        with _or_as_before(path, "the upper limits"):
+            if notes.looked is not path.evaluation:  # the last step was the last one allowed, or its values have moved
+                notes.tried = path.scan.scan(path.evaluation, everywhere=True, known=notes.tried)
+            limits = upper_limits.upper_limits(path.scan, path.evaluation, notes.tried)
+    replicates.budget.until = math.inf
+    in_sample: Comparison | None = None
+    with _or_as_before(path, "the last comparison"):
+        replicates.say("the comparison of the model with its steps")
+        own = None if path.steps else path.evaluation
+        in_sample = (
+            comparison_of(replicates, own) if own else comparison_with(replicates, path.values, path.scan.phases)
+        )
+    return _answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
+
+
+# as `upper_limits.upper_limits` returns them
+_Limits = tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]
+
+
+def _left(path: ModelPath, notes: _Notes) -> list[BlockCheck]:
+    """The checks that fail with all steps; none where these are totals that the set-up explains."""
+    left = path.failed
+    return [] if left and notes.explained and all(b.cell[0] == "" for b in left) else left
+
+
+def _so_far(path: ModelPath, start: Evaluation, notes: _Notes) -> Diagnosis:
+    """The diagnosis while the search goes on."""
+    verdict = _verdict(path, _left(path, notes), notes)
+    null_95 = misfit_null_95(path.ladder[0].evaluation.replicate_residuals)
+    found = _answer(path, start, notes, verdict, path.ladder, null_95, ([], [], []), None)
+    found.steps = [replace(step, alternatives=[_public(other) for other in step.alternatives]) for step in path.steps]
+    found.finished = False
+    found.untried = [*found.untried, _not_done("further steps", "the search goes on")]
+    return found
+
+
+def _nearest(step: Step) -> dict[str, Any]:
+    """The entry of a step that explains too little of its own cells, as an alternative of what is unexplained."""
+    c = step.candidate
+    misfit = plain(step.misfit)
+    return {"change": c.kind, "effect": c.effect, "parameter": c.parameter, "misfit": misfit, "nearest": True}
+
+
+def _public(alternative: dict[str, Any]) -> dict[str, Any]:
+    return {key: x for key, x in alternative.items() if key not in ("confused", "tried")}
+
+
+def _not_done(where: str, why: str) -> dict[str, Any]:
+    """An entry of `not_tried` that is of no candidate."""
+    return {"change": None, "effect": None, "parameter": None, "where": where, "why": why}
+
+
+def _answer(
+    path: ModelPath,
+    start: Evaluation,
+    notes: _Notes,
+    verdict: str,
+    rungs: Sequence[Rung],
+    null_95: float,
+    limits: _Limits,
+    in_sample: Comparison | None,
+) -> Diagnosis:
+    replicates = path.replicates
+    remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
+    excluded, invisible, unlimited = limits
+    unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
+    if unexplained and verdict == "unexplained" and path.nearest:
+        unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]
+    return Diagnosis(
+        sensor=replicates.start.name,
+        measurement=replicates.measurement.name,
+        verdict=verdict,
+        before=rungs[0].misfit,
+        after=(path.ladder[-1] if path.steps else path.ladder[0]).misfit,
+        null_95=null_95,
+        nuisances=nuisances(replicates, path.evaluation),
+        steps=path.steps,
+        setup=notes.setup,
+        unexplained=unexplained,
+        ladder=[rung.row for rung in rungs],
+        advice=notes.advice,
+        excluded=excluded,
+        invisible=invisible,
+        unlimited=unlimited,
+        traces=traces(replicates, start, path.evaluation),
+        values=path.values,
+        simulations=replicates.simulations,
+        dark=replicates.dark,
+        crop=str(replicates.start.window) if replicates.start.window else None,
+        untried=path.scan.untried,
+        in_sample=in_sample,
+        finished=path.finished,
+    )
+
+
+@contextlib.contextmanager
+def _or_as_before(path: ModelPath, where: str) -> Iterator[None]:
+    """A context that restores the steps where a model in it cannot be simulated, or the budget is spent."""
+    before, earlier = path.kept(), [(step, dict(step.values)) for step in path.steps]
+    try:
+        yield
+    except OutOfBudget:
+        path.back_to(before)
+        for step, values in earlier:
+            step.values = values
+        _end(path, where)
+    except UNABLE as error:
+        path.back_to(before)
+        for step, values in earlier:
+            step.values = values
+        for candidate in [step.candidate for step in path.steps[-1:]]:
+            path.scan.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
+
+
+def _end(path: ModelPath, where: str) -> None:
+    """Record what the budget has ended."""
+    path.finished = False
+    path.scan.untried.append(_not_done(where, "the budget of work was spent; give a longer --within, or none"))
+
+
+def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:
+    """As `time_blocks.measure`; where halves cannot be simulated, all rows are judged by whole captures."""
+    before = [(rung, rung.left, rung.misfit) for rung in rungs]
+    with _or_as_before(path, "the last comparison"):
+        return time_blocks.measure(path.replicates, rungs)
+    for rung, left, misfit in before:
+        rung.left, rung.misfit = left, misfit
+        for step in rung.steps:
+            step.misfit = misfit
+    return misfit_null_95(rungs[0].evaluation.replicate_residuals)
+
+
+def _possible(path: ModelPath, notes: _Notes) -> bool:
+    """As `_another`; False where the steps so far cannot be simulated often enough."""
+    before = path.kept()
+    try:
+        return _another(path, notes)
+    except OutOfBudget:
+        path.back_to(before)
+        _end(path, f"step {len(path.steps) + 1}")
+        return False
+    except UNABLE as error:
+        if not path.steps:
+            raise
+        path.back_to(before)
+        last = path.steps[-1].candidate
+        path.scan.not_tried(last.kind, last.effect, last.parameter, "another step", why(error))
+        return False
+
+
+def _another(path: ModelPath, notes: _Notes) -> bool:
+    """Whether a step was added, or the model was simulated more often, so that another step may follow."""
+    replicates, scan, failed = path.replicates, path.scan, path.failed
+    number = len(path.steps) + 1
+    if failed and not path.steps and min(b.p for b in failed) > _PLAIN and _few(path):
+        path.evaluation = _closer(path)  # lest the scatter of few replicates decide
+        failed = path.failed
+    if not failed:
+        # no check fails: a score test along each signature
+        replicates.say(f"step {number}: no check fails; looking for the trace of every candidate")
+        notes.tried = scan.scan(path.evaluation, everywhere=True, known=notes.tried)
+        before = notes.looked = path.evaluation
+        largest_p = _LATER_TRACE if path.steps else _TRACE
+        if _stands_out(path, notes.tried, largest_p):
+            closer = path.evaluation
+            if closer is not before:  # more replicates may show lines that few did not
+                notes.tried = scan.scan(closer, everywhere=True, known=notes.tried)
+            if _added(path, notes, failed, largest_p):
+                return True
+            if path.evaluation is not closer:
+                return False
+        path.evaluation = before  # under this evaluation no check fails: nothing is left
+        return False
+    if scan.only_rates(path.evaluation) and _by_setup(path, notes):
+        return False
+    first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
+    replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
+    notes.tried = scan.scan(path.evaluation, known=notes.tried)
+    return _added(path, notes, failed)
+
+
+class _NoCandidate(Exception):
+    """The best candidate cannot be simulated, so that it is excluded."""
+
+
+def _added(path: ModelPath, notes: _Notes, failed: Sequence[BlockCheck], least: float = FALSE_ALARM) -> bool:
+    """Whether the best candidate was added, or another attempt is worth it.
+
+    A candidate that cannot be simulated makes room for the next best.
+
+    Args:
+        failed: the checks that fail.
+        least: the largest p-value of a step.
+    """
+    while True:
+        before = path.kept()
+        try:
+            return _best_added(path, notes, failed, least)
+        except _NoCandidate as none:
+            names = none.args[0]
+        except UNABLE as error:  # not attributable to one candidate: the one with the largest gain is excluded
+            most = max(notes.tried, key=lambda t: t.gain, default=None)
+            if most is None:
+                raise
+            path.scan.exclude(most.candidate, "choosing the best", why(error))
+            names = {most.candidate.name}
+        path.back_to(before)
+        notes.tried = [t for t in notes.tried if t.candidate.name not in names]
+
+
+@contextlib.contextmanager
+def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Iterator[None]:
+    """A context without which candidates are excluded.
+
+    Raises:
+        _NoCandidate: where they cannot be simulated.
+    """
+    try:
+        yield
+    except UNABLE as error:
+        for candidate in candidates:
+            path.scan.exclude(candidate, where, why(error))
+        raise _NoCandidate({candidate.name for candidate in candidates}) from error
+
+
+def _best_added(path: ModelPath, notes: _Notes, failed: Sequence[BlockCheck], least: float) -> bool:
+    replicates, scan, faint = path.replicates, path.scan, not failed
+    number = len(path.steps) + 1
+    # a value that a step has set is fitted anew with every other one: it is no finding of its own
+    notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
+    replicates.say(f"step {number}: the best of them on all captures")
+    second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
+    if not second:
+        return False
+    worth = worth_fitting(scan, second)
+    replicates.say(f"step {number}: fitting " + ", ".join(title(t.candidate) for t in worth))
+    refined = []
+    for one in worth:
+        with scan.if_possible(one.candidate, "fitting its numbers"):
+            refined.append(fit_trial(replicates, path.evaluation, one))
+    if not refined:
+        raise _NoCandidate({one.candidate.name for one in worth})
+    if not faint:
+        compare_by_squares(scan, path.evaluation, refined)
+    judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in refined}
+    if faint:
+        for one in refined:
+            one.gain = judged[id(one)][0] ** 2
+        refined = [one for one in refined if explains_its_signature(replicates, path.evaluation, one)]
+        if not refined:
+            return False
+        best, significance, p = least_probable(scan, path.evaluation, refined, lambda t: judged[id(t)])
+    else:
+        with _needed(path, [one.candidate for one in refined if one.scatters], "comparing the best"):
+            best = best_of(scan, refined, lambda t: t.gain)
+        significance, p = judged[id(best)]
+    # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
+    if p > least or (best.gain < LEAST_GAIN and not faint):
+        if faint or not _few(path):
+            return False
+        path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
+        return True
+    before, earlier, fell = path.evaluation, path.kept(), path.misfit
+    with _needed(path, best.candidates, "fitting all numbers together"):
+        new = accept(path, best, significance)
+    if best.maps is None and not best.phases:
+        with _or_as_before(path, "looking for what looks alike"):
+            unseen = unseen_maps(scan, before, path.values, best, faint)
+            refined, second = refined + unseen, second + unseen
+    new[0].alternatives = _alternatives(scan, before, best, refined, second)
+    named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
+    if notes.placebo is None:
+        with contextlib.suppress(*UNABLE):  # no result depends on it
+            notes.placebo = placebo_of(replicates, before, notes.tried, best, named)
+    if not failed and path.failed and _few(path):
+        with _needed(path, best.candidates, "a closer look"):
+            path.evaluation = _closer(path)  # with as many replicates as the model without the step
+    if not failed and path.failed:
+        path.back_to(earlier)  # no check failed before, now one does
+        return False
+    # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
+    explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
+    if not explains and len(path.failed) >= max(len(failed), 1) and fell - path.misfit < 0.05 * (fell - 1):
+        if path.misfit > fell:
+            path.back_to(earlier)
+        return False
+    return True
+
+
+def _stands_out(path: ModelPath, tried: Sequence[Trial], largest_p: float) -> bool:
+    """Whether the score of any candidate is significant.
+
+    Where it may be, the model is simulated more often, so that a few replicates do not decide.
+
+    Args:
+        largest_p: the largest p-value that is followed.
+    """
+    p = p_of_any(path.replicates, path.evaluation, tried, path.values, path.scan.lines(path.evaluation))
+    if p >= min(_MAYBE * largest_p, 1.0):
+        return False
+    if _few(path):
+        path.evaluation = _closer(path)
+        p = p_of_any(path.replicates, path.evaluation, tried, path.values, path.scan.lines(path.evaluation))
+    return p <= largest_p
+
+
+def _few(path: ModelPath) -> bool:
+    """Whether the model has fewer replicates than a closer look."""
+    return len(path.evaluation.replicate_residuals[TOTALS]) < _CLOSER
+
+
+def _closer(path: ModelPath) -> Evaluation:
+    """The evaluation of the model with more replicates."""
+    path.replicates.say("a closer look at what may be there")
+    return evaluate(path.replicates, path.evaluation.values, path.evaluation.sensors, _CLOSER, path.evaluation)
+
+
+def _verdict(path: ModelPath, left: Sequence[BlockCheck], notes: _Notes) -> str:
+    if notes.rival is not None:
+        return "confused"
+    if left:
+        return "partly_explained" if path.steps else "unexplained"
+    if path.steps:
+        return "explained"
+    if notes.bent:
+        return "confused"
+    return "setup" if notes.setup else "adequate"
+
+
+def _or_confused(path: ModelPath, notes: _Notes) -> str:
+    """The verdict on steps that leave nothing: "explained", or "confused" where something else is a tie.
+
+    The advice is added.
+    """
+    verdict = "explained"
+    near = [(s.candidate, a["tried"]) for s in path.steps for a in s.alternatives if a.get("confused")]
+    if near:
+        verdict = "confused"
+        with _or_as_before(path, "advice"):
+            notes.advice += experiment_design.between(path.scan, path.evaluation, *near[-1])
+    for step in path.steps:
+        unlisted = mimicked(step)
+        if unlisted is not None:
+            verdict = "confused"
+            step.alternatives.insert(0, _outside(unlisted, path.ladder[-1].misfit))
+            notes.advice.append(experiment_design.on_mimic(step, unlisted))
+    return verdict
+
+
+def _too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
+    """The entries of captures that stopped early.
+
+    Args:
+        short: (share that was exposed, its standard deviation) by capture.
+    """
+    out = []
+    for id, (share, error) in short.items():
+        factor = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
+        out.append({"capture": id, "quantity": "exposure", "factor": factor, "confused": False})
+    return out
+
+
+def _by_setup(path: ModelPath, notes: _Notes) -> bool:
+    """Whether the set-up explains the totals that fail; adds its entries, a rival of the sensor, and the advice."""
+    replicates, evaluation = path.replicates, path.evaluation
+    likely = setups.explanations(replicates, evaluation)
+    cost = likely[0].cost if likely else float(evaluation.residuals[TOTALS] @ evaluation.residuals[TOTALS])
+    others = setups.rivals(path.scan, evaluation, cost)
+    own = others[0].cost(evaluation) if others else math.inf
+    if not likely or own < cost - setups.ALIKE:
+        return False  # the sensor explains it better
+    near = [e for e in likely if e.cost < cost + setups.ALIKE and len(e.factors) == len(likely[0].factors)]
+    found = setups.entries(replicates, evaluation, near)
+    if not found:
+        return False
+    if own < cost + setups.ALIKE:
+        found = [{**entry, "confused": True} for entry in found]
+        notes.rival = others[0]
+        with path.scan.if_possible(others[0].candidate, "advice", wholly=False):
+            notes.advice += experiment_design.between_totals(path.scan, evaluation, likely[0], others[0])
+    else:
+        notes.advice += experiment_design.on_setup(replicates, evaluation, found)
+        bright = setups.brightest(replicates, likely[0])
+        if bright is not None:
+            notes.bent = True
+            notes.advice.append(experiment_design.on_brightest(replicates, evaluation, likely[0], found[0]))
+    notes.setup = found + notes.setup
+    notes.explained = True
+    return True
+
+
+def _rival_step(path: ModelPath, rival: Trial) -> Step:
+    coordinate = rival.candidate.strengths[0]
+    low, high = rival.intervals.get(coordinate.key, (None, None))
+    value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
+    left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
+    return Step(
+        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike"
+    )
+
+
+def _outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
+    """A mimic as an alternative."""
+    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": mimic.what}
+
+
+def _alternatives(
+    scan: Scan, evaluation: Evaluation, best: Trial, refined: Sequence[Trial], second: Sequence[Trial]
+) -> list[dict[str, Any]]:
+    """The other candidates with the misfit that each leaves, ties first, for the JSON data."""
+    out: list[dict[str, Any]] = []
+    for one in second:
+        if (
+            one is best
+            or one.candidate in best.candidates
+            or any(o["tried"].candidate.name == one.candidate.name for o in out)
+        ):
+            continue
+        with scan.if_possible(one.candidate, "comparing it with the best", wholly=False):
+            out.append(_alternative(scan.replicates, evaluation, best, one))
+    return sorted(out, key=lambda other: not other["confused"])[:_NAMED]
+
+
+def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, one: Trial) -> dict[str, Any]:
+    residuals = one.residuals or residuals_at(replicates, evaluation, one.signature, one.times, noisy=True)
+    judged, left = evaluation, residuals
+    if one.scatters and one.evaluation is not None:
+        judged, left = one.evaluation, one.evaluation.residuals
+    failed = failing(block_checks(replicates, judged, left))
+    most, gain = gain_against(best, one), gain_against(one, best)
+    if one.chips and judged is not evaluation:  # by the likelihood ratio a few odd pixels may gain little
+        gain = max(gain, square(evaluation.residuals) - square(residuals))
+    near = most - gain < tie(most) or (at_end(best) and gain > _ALMOST * most)
+    return {
+        "change": one.candidate.kind,
+        "effect": one.candidate.effect,
+        "parameter": one.candidate.parameter,
+        "misfit": plain(mean_misfit(evaluation.replicate_residuals, residuals)),
+        "confused": one.residuals is not None and near and not failed,
+        "tried": one,
+    }

@@ -1,0 +1,247 @@
+"""The fit of named parameters: by the exact likelihood where there is one, otherwise by simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from ..effects import Effect
+from ..errors import InputError, did_you_mean
+from ..factory import pool
+from ..measurement import Measurement
+from ..sensor import Sensor
+from . import counts_in_the_dark, map_fits, time_blocks
+from .candidates import Candidate, candidates
+from .comparison import comparison_with
+from .coordinates import Key, point_of
+from .evaluation import log_likelihood_ratio
+from .exact_likelihood import MaximumLikelihood, maximise
+from .findings import nuisances, remainder, traces
+from .gauss_newton import Fit, gauss_newton_step, profile_intervals
+from .model_path import ModelPath, accept, begin, edge_errors, fit_all, material, scale_errors
+from .replicates import FEW, REPLICATES, Replicates
+from .results import Diagnosis, Step, Value, title
+from .score_test import LEAST_P, p_of_map
+from .signature import Signature, signature_of_totals, template_of
+from .trial import Trial
+from .trial_fits import evaluation_of, fit_trial
+
+
+def fit_named(
+    sensor: Sensor,
+    measurement: Measurement,
+    add: Sequence[str] = (),
+    free: Sequence[str] = (),
+    per_pixel: Sequence[str] = (),
+    seed: int = 0,
+    jobs: int = 2,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """The fit of what the caller names.
+
+    A map of a dark rate is fitted by the pixels' counts where captures without light inform it
+    (`counts_in_the_dark`). Other fits are by the exact likelihood where it describes the model and all its changes,
+    otherwise by simulation.
+
+    Args:
+        add: names of effects that are added.
+        free: "effect.parameter" of listed effects.
+        per_pixel: "effect.parameter" of maps.
+        seed: of the replicates.
+        jobs: number of workers.
+        progress: called with a line about what is being done.
+    Raises:
+        InputError: where there is no such effect or parameter.
+    """
+    say = progress or (lambda what: None)
+    every, listed = candidates(sensor.settled(), measurement.captures), {e.name for e in sensor.effects}
+    wanted = [
+        *(_named(every, listed, "add", name, None) for name in add),
+        *(_named(every, listed, "set", *_halves(name)) for name in free),
+        *(_named(every, listed, "per_pixel", *_halves(name)) for name in per_pixel),
+    ]
+    if not wanted:
+        raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
+    with pool(jobs, "generator") as parallel:
+        if counts_in_the_dark.may_fit(sensor.settled(), wanted):
+            replicates = Replicates(sensor, measurement, seed, parallel, REPLICATES, say, reduced=False)
+            answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
+            if not isinstance(answer, str):
+                say("by the counts in the dark alone; compare sets all else beside the new model")
+                return answer
+            say(f"not by counts in the dark alone, for there is {answer}")
+        replicates = Replicates(sensor, measurement, seed, parallel, REPLICATES, say)
+        path = begin(replicates)
+        start, wrong = path.evaluation, bool(path.failed)
+        say("fitting " + ", ".join(title(candidate) for candidate in wanted))
+        data = [measurement.recording(c.id, replicates.start) for c in measurement.captures if c.mean is None]
+        exact = maximise(replicates.start, data, wanted) if len(data) == len(replicates.seen) else "a mean alone"
+        if isinstance(exact, str):
+            say(f"by simulation, for there is no likelihood of {exact}")
+            _by_simulation(path, wanted)
+        else:
+            _by_likelihood(path, wanted, exact)
+        scale_errors(path)
+        null_95 = time_blocks.measure(replicates, path.ladder)
+        right = "explained" if wrong else "adequate"
+        return Diagnosis(
+            replicates.start.name,
+            measurement.name,
+            "partly_explained" if path.failed else right,
+            path.ladder[0].misfit,
+            path.ladder[-1].misfit,
+            null_95,
+            nuisances(replicates, path.evaluation),
+            path.steps,
+            [],
+            remainder(replicates, path.evaluation, path.evaluation.residuals),
+            [rung.row for rung in path.ladder],
+            [],
+            [],
+            [],
+            [],
+            traces(replicates, start, path.evaluation),
+            path.values,
+            None,
+            replicates.simulations,
+            replicates.dark,
+            str(replicates.start.window) if replicates.start.window else None,
+            covariance=_covariance(path, exact),
+            in_sample=comparison_with(replicates, path.values, path.scan.phases),
+            asked="fit",
+        )
+
+
+def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[str], np.ndarray]:
+    """(names "effect.parameter" of the fitted parameters, their covariance in SI).
+
+    Its diagonal is that of the 95 % intervals, taken as symmetric. The correlations are those of the likelihood, or
+    of the last fit by simulation.
+    """
+    free: tuple[Key, ...] = ()
+    correlations = np.zeros((0, 0))
+    if not isinstance(exact, str):
+        free, correlations = exact.free, exact.correlations
+    elif path.fit is not None:
+        free, matrix = tuple(coordinate.key for coordinate in path.fit.coordinates), path.fit.covariance
+        spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        correlations = matrix / np.outer(spread, spread)
+    results = {
+        (s.candidate.effect, name): v for s in path.steps if not s.candidate.carrier for name, v in s.values.items()
+    }
+    at, errors = [], []
+    for i, key in enumerate(free):
+        value = results.get(key)
+        if value is not None and value.low is not None and value.high is not None:
+            at.append(i)
+            errors.append((value.high - value.low) / (2 * 1.96))
+    return [".".join(free[i]) for i in at], correlations[np.ix_(at, at)] * np.outer(errors, errors)
+
+
+def _by_likelihood(path: ModelPath, wanted: Sequence[Candidate], exact: MaximumLikelihood) -> None:
+    """Add steps with the maximum-likelihood values; their misfit is that of a simulation."""
+    replicates, before = path.replicates, path.evaluation
+    for candidate, gain in zip(wanted, exact.gains, strict=True):
+        intervals = {d.key: exact.intervals[d.key] for d in candidate.coordinates}
+        own = {**dict(candidate.fixed), **{key: exact.values[key] for key in intervals}}
+        signature = signature_of_totals(replicates, before, before.sensors.changed(own))
+        change = material(Trial(candidate, own, signature, gain, 1.0))
+        step = Step(candidate, {}, 0.0, math.sqrt(max(gain, 0.0)), change, intervals=intervals)
+        step.template, step.before = template_of(replicates, before, signature), dict(before.residuals)
+        path.steps.append(step)
+    path.scan.accepted += wanted
+    path.values = {**path.values, **exact.values}
+    fit_all(path)
+    for step in path.steps:
+        step.values = {name: replace(v, method="likelihood") for name, v in step.values.items()}
+    path.rung("+ " + " + ".join(title(candidate) for candidate in wanted), path.steps)
+
+
+def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
+    """Add a step for each candidate, maps last; the intervals of all coordinates are by profile."""
+    replicates = path.replicates
+    for candidate in sorted(wanted, key=lambda c: bool(c.carrier)):
+        if candidate.carrier:
+            p = p_of_map(
+                replicates,
+                path.evaluation,
+                candidate,
+                path.values,
+                map_fits.light_levels_of(replicates, path.evaluation),
+            )
+            best = Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, chance=p)
+            accept(path, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
+            continue
+        best = fit_trial(replicates, path.evaluation, _started(path, candidate), 5)
+        if not candidate.coordinates:  # a switch, which may be right as it is
+            best.gain = log_likelihood_ratio(
+                path.evaluation,
+                evaluation_of(replicates, best),
+                template_of(replicates, path.evaluation, best.signature),
+            )
+            if best.gain <= 0:
+                _kept(path, candidate)
+                continue
+        accept(path, best, math.sqrt(max(best.gain, 0.0)))
+    ends: dict[Key, tuple[float, float]] = {}
+    coordinates = tuple(d for step in path.steps for d in step.coordinates)
+    if coordinates:
+        replicates.say("intervals")
+        # the values of the evaluation, one step away from the fitted ones
+        here = {d.key: path.evaluation.values.get(d.key, path.values[d.key]) for d in coordinates}
+        sensors, few = path.evaluation.sensors.changed, 2 * FEW
+        fit = gauss_newton_step(replicates, path.evaluation, coordinates, here, sensors, few, edge_errors(path))
+        if isinstance(fit, Fit):
+            fit = replace(fit, point=point_of(coordinates, path.values))
+            ends = profile_intervals(replicates, path.evaluation, fit, sensors, few)
+    for step in path.steps:
+        for name, value in step.values.items():
+            low, high = ends.get((step.candidate.effect, name), (value.low, value.high))
+            how = "simulation"
+            if step.candidate.carrier:
+                how = "intervals" if step.candidate.blinds else "counts"
+            step.values[name] = replace(value, low=low, high=high, method=how)
+
+
+def _kept(path: ModelPath, candidate: Candidate) -> None:
+    """Add a step for a switch that stays as it is listed."""
+    values: dict[str, Value] = {}
+    for (effect, name), _ in candidate.fixed:
+        values[name] = Value(float(getattr(path.replicates.start.effect(effect), name)), None, None)
+    path.steps.append(Step(candidate, values, path.misfit, 0.0, "mean rate +0.00%"))
+    path.rung(f"{title(candidate)} as it was", path.steps[-1:])
+
+
+def _started(path: ModelPath, candidate: Candidate) -> Trial:
+    """The trial of the template with the largest gain, at its best strength."""
+    found = path.scan.looked_at(path.evaluation, candidate, path.scan.begun(path.evaluation, candidate))
+    if not found:
+        raise InputError(f"{title(candidate)} cannot be simulated in these captures")
+    return max(found, key=lambda t: t.gain)
+
+
+def _halves(name: str) -> tuple[str, str]:
+    effect, dot, parameter = name.partition(".")
+    if not dot or not parameter:
+        raise InputError(f"{name!r} is not EFFECT.PARAMETER, for example dead_time.duration")
+    return effect, parameter
+
+
+def _named(
+    every: Sequence[Candidate], known: Collection[str], kind: str, effect: str, parameter: str | None
+) -> Candidate:
+    listed = effect in known
+    for candidate in every:
+        if (candidate.kind, candidate.effect) == (kind, effect) and (kind == "add" or candidate.parameter == parameter):
+            return candidate
+    name = effect + (f".{parameter}" if parameter else "")
+    if kind == "add" and listed:
+        raise InputError(f"--add {name}: the sensor lists it already; fit its numbers, --free {effect}.PARAMETER")
+    if kind == "set" and not listed and effect in Effect.registry:
+        raise InputError(f"--free {name}: the sensor does not list {effect}; --add {effect} adds it and fits it")
+    able = sorted({c.effect + (f".{c.parameter}" if c.parameter else "") for c in every if c.kind == kind})
+    raise InputError(f"{name} cannot be fitted here; those that can: {', '.join(able)}.{did_you_mean(name, able)}")

@@ -1,0 +1,54 @@
+"""The next step: what a user does with an answer, in one sentence with the command to type."""
+
+from __future__ import annotations
+
+from .comparison import Comparison
+from .results import Diagnosis, named
+
+# what commands name; a terminal puts the paths that it was given in their places
+SENSOR, MEASUREMENT = "SENSOR", "MEASUREMENT"
+_ANOTHER = "a measurement that it was not fitted to tests it"
+
+
+def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str = MEASUREMENT) -> str:
+    """What follows a comparison. sensor, measurement: as the command named them, quoted for a shell."""
+    if found.verdict == "adequate":
+        return (
+            f"spadmnist diagnose {sensor} {measurement} says how much of each effect could be there unseen; a "
+            "brighter, a darker or a longer capture tests the model further."
+        )
+    return f"spadmnist diagnose {sensor} {measurement} -o next finds what the model lacks."
+
+
+def after_diagnosis(found: Diagnosis, sensor: str = SENSOR, measurement: str = MEASUREMENT) -> str:
+    """What follows a diagnosis or a fit; arguments as of `after_comparison`."""
+    new = found.file or "next/sensor.yaml"
+    if not found.finished:
+        return f"spadmnist diagnose {sensor} {measurement} -o next --within none goes on to the end."
+    if found.asked == "fit":
+        return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
+    if found.verdict == "adequate":
+        return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
+    if found.verdict == "setup":
+        entry = found.setup[0]
+        return (
+            f"measure the {entry['quantity']} of {entry['capture'] or 'all captures'} again, correct measurement.yaml, "
+            f"and type spadmnist compare {sensor} {measurement}."
+        )
+    if found.advice and found.verdict == "confused":
+        return f"take the capture {found.advice[-1]['capture']!r}, add it to the measurement, and diagnose again."
+    if found.verdict == "unexplained":
+        near = [named(other) for other in (found.unexplained or [{}])[0].get("alternatives", [])]
+        like = f", perhaps like {near[0]}" if near else ""
+        return (
+            f"spadmnist effects --new NAME writes the file of a new effect{like}; then spadmnist diagnose {sensor} "
+            f"{measurement} --plugin NAME.py tries it."
+        )
+    if found.verdict == "partly_explained":
+        return (
+            f"spadmnist compare {new} {measurement} shows what remains; spadmnist effects --new NAME writes the file "
+            "of an effect for it."
+        )
+    return (
+        f"spadmnist compare {new} {measurement} checks the new model; a measurement that it was not fitted to tests it."
+    )

@@ -1,0 +1,285 @@
+"""Maps of a parameter over pixels, rows, columns or codes: estimates, odd pixels, tests for patterns."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special, stats
+
+from ..effects import Effect
+from ..sensor import Sensor
+from . import blind_times
+from .candidates import Candidate
+from .coordinates import Key
+from .results import Value
+
+TAILS = 3.0  # degrees of freedom of the prior
+# of the information on a map, in the mean over its pixels: a capture with a larger share is needed to fit it
+ALONE = 0.6
+# of a logarithm: the noise of an estimate below which a pixel is informed by itself; the least width of the prior
+TELLING, LEAST_WIDTH = 0.2, 1e-3
+# relative standard error of the variance of many pixels by the median of their distances, times the root of their
+# number
+_DOUBT = 2.34
+TURNS = 16  # iterations of a fit of maps
+MOST = 10.0  # of a logarithm: the most that a value deviates
+# standard deviations beyond which a pixel is odd; of a logarithm, the width of the prior of odd pixels
+ODD, WIDE = 3.5, 2.0
+CODES = "codes"  # the statistic of the codes
+_PERIODS = (256, 140, 100)  # the periods that `statistics.codes` folds codes with
+# the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law
+GRID, ROUNDS = (-4.0, 8.0, 97), 100
+_FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off
+HALF_95 = 1.96  # standard deviations: half of a 95 % interval
+
+
+@dataclass(frozen=True)
+class PixelMap:
+    """A map in logarithms: its values are base * exp(estimate), as random effects with an empirical prior.
+
+    Attributes:
+        carrier: the parameter that holds the map.
+        base: the value that the logarithms are relative to, SI.
+        group: (pixels,) the index of each pixel's value (the pixels of a row or column share one).
+        estimate, error: (groups,) mean and standard deviation under the prior.
+        raw, raw_error: (groups,) the same without the prior.
+        sigma: width of the prior.
+        low, high: bounds of the values.
+    """
+
+    carrier: Key
+    base: float
+    group: np.ndarray
+    estimate: np.ndarray
+    error: np.ndarray
+    raw: np.ndarray
+    raw_error: np.ndarray
+    sigma: float
+    low: float = 0.0
+    high: float = math.inf
+    likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) posterior weights
+    certain: float = TELLING  # raw_error below which a value is the estimate, whatever the others are
+    width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
+
+    @property
+    def price(self) -> float:
+        """The fall of the squares with the values at their estimates, less that of -2 log L of a random effect."""
+        # an odd value has the wider prior of its own
+        ratio = 1 / np.maximum(self._pulled, (np.minimum(self.raw_error, MOST) / WIDE) ** 2)
+        return float(np.sum(ratio / (1 + ratio) + np.log1p(ratio)))
+
+    @property
+    def _pulled(self) -> np.ndarray:
+        """(groups,) the ratio of the prior's information on each value to that of its data."""
+        return np.maximum(np.minimum(self.raw_error**2, MOST) / np.maximum(self.error**2, 1e-30) - 1, 0.0)
+
+    def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
+        """The values of the map, (groups,), SI; or a draw of the posterior.
+
+        Args:
+            draw: (groups,) standard normal numbers of the values; None for the estimate.
+            width: a standard normal number of the prior's width.
+        """
+        logs = self.estimate
+        if draw is not None:
+            scale, middle = self._as_wide(width), median_of(self.estimate)
+            error = self.error * np.sqrt(scale)
+            # the mean of the drawn values is the estimate in the value itself
+            logs = middle + (self.estimate - middle) * scale + draw * error - error**2 / 2
+        relative = np.exp(np.clip(logs, -MOST, MOST))
+        if self.likely is not None:  # a pixel that is informed by itself has its own estimate
+            relative = np.where(self.raw_error < self.certain, relative, self._one_of(draw))
+        return np.clip(self.base * relative, self.low, self.high)
+
+    def _as_wide(self, draw: float) -> np.ndarray:
+        """(groups,) factor on the deviation and the variance of each estimate, if the prior had another width.
+
+        Args:
+            draw: a standard normal number, for a width within its standard error.
+        """
+        noise = np.minimum(self.raw_error**2, MOST)
+        typical = float(np.median(noise))
+        if typical >= TELLING**2:
+            return np.ones(noise.size)  # these have a law of their own
+        doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + typical)
+        other = max(self.sigma**2 + draw * doubt, min(LEAST_WIDTH, self.sigma) ** 2)
+        # by the prior's influence on each value: an odd one has none
+        pulled = self._pulled
+        return np.asarray((1 + pulled) / (1 + pulled * self.sigma**2 / other))
+
+    @functools.cached_property
+    def _running(self) -> np.ndarray:
+        """(groups, grid) the cumulative posterior of each value."""
+        assert self.likely is not None
+        return np.asarray(np.cumsum(self.likely[1], axis=1))
+
+    def _one_of(self, draw: np.ndarray | None) -> np.ndarray:
+        assert self.likely is not None
+        grid, weights = self.likely
+        if draw is None:
+            return np.asarray(weights @ np.exp(grid))
+        place = (self._running < special.ndtr(draw).astype(weights.dtype)[:, None]).sum(axis=1)
+        return np.asarray(np.exp(grid[np.minimum(place, grid.size - 1)]))
+
+
+def groups_of(sensor: Sensor, per: str) -> np.ndarray:
+    """The index of each pixel's value in a map over pixels, rows or columns, (pixels,)."""
+    pixels = np.arange(sensor.layout.pixels)
+    if per == "row":
+        return pixels // sensor.layout.columns
+    if per == "column":
+        return pixels % sensor.layout.columns
+    return pixels
+
+
+def mean_of(weights: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(mean, standard deviation) of each row of weights (rows, grid) over a grid, (rows,) each."""
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    mean = weights @ grid
+    return mean, np.sqrt(np.maximum(weights @ grid**2 - mean**2, 0.0))
+
+
+def outside_bulk(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Which logarithms are outliers of a normal law, (groups,) bool, by a mixture with a uniform law.
+
+    Args:
+        apart: (groups,) deviations from the middle.
+        variance: (groups,) of the normal law.
+    """
+    density = np.exp(-(apart**2) / (2 * variance)) / np.sqrt(2 * math.pi * variance)
+    share = 0.01
+    for _ in range(5):
+        odd = share / (2 * MOST) > (1 - share) * density
+        share = (float(odd.sum()) + 1) / (odd.size + 2)
+    return np.asarray(odd)
+
+
+def median_of(x: np.ndarray) -> float:
+    """The median of an array."""
+    return float(np.median(x))
+
+
+def odd_pixels(map_: PixelMap) -> tuple[np.ndarray, np.ndarray]:
+    """((groups,) bool far below all others, (groups,) bool far above)."""
+    inner = map_.estimate - median_of(map_.estimate)
+    # of most pixels: beyond their noise, without the odd ones
+    width = 1.4826 * float(np.median(np.abs(map_.raw - np.median(map_.raw))))
+    noise = float(np.median(map_.raw_error))
+    bulk = math.sqrt(max(width**2 - noise**2, 0.0))
+    beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
+    return inner < -beyond, inner > beyond
+
+
+def low_ratio(map_: PixelMap) -> tuple[float, float]:
+    """(mean of the values far below all others, relative to the middle, its standard deviation).
+
+    It is (1, inf) if there are none.
+    """
+    low, _ = odd_pixels(map_)
+    if not low.any():
+        return 1.0, math.inf
+    # pixels that are informed by themselves: the prior pulls an estimate to the others
+    informed = map_.raw_error < TELLING
+    logs = np.where(informed, map_.raw, map_.estimate)[low] - median_of(map_.estimate)
+    own = float(np.mean(np.where(informed, map_.raw_error, map_.error)[low] ** 2))
+    apart = float(np.var(logs, ddof=1)) if low.sum() > 1 else 0.0
+    mean = float(np.exp(logs).mean())
+    return mean, mean * math.sqrt(max(own, apart) / int(low.sum()))
+
+
+def summary(map_: PixelMap) -> dict[str, float]:
+    """The statistics of a map by name: sigma, low_fraction, low_ratio, high_fraction."""
+    low, high = odd_pixels(map_)
+    rest = ~(low | high)
+    spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
+    return {
+        "sigma": math.sqrt(max(float(spread), 0.0)),
+        "low_fraction": float(low.mean()),
+        "low_ratio": low_ratio(map_)[0],
+        "high_fraction": float(high.mean()),
+    }
+
+
+def pattern_tests(map_: PixelMap, designs: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """The test of each pattern in a map over pixels, by name: (p-value, Schwarz criterion).
+
+    The p-value is that of an F test of the pattern against the scatter of the rest. The criterion compares patterns
+    that are all significant (Schwarz, Ann. Statist. 6, 1978).
+
+    Args:
+        designs: (pixels, k) columns of each pattern, without the mean.
+    """
+    y = np.exp(np.clip(map_.raw, -MOST, MOST))
+    middle, width = median_of(y), 1.4826 * median_of(np.abs(y - median_of(y)))
+    y = np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)  # odd pixels do not make a pattern
+    out = {}
+    ones = np.ones((len(y), 1))
+    for name, design in designs.items():
+        full = np.linalg.lstsq(np.hstack([ones, design]), y, rcond=None)[0]
+        left = y - np.hstack([ones, design]) @ full
+        k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
+        free = len(y) - k - 1
+        if free < 1:  # the columns of a line are its pixels: no pattern, but the map itself
+            out[name] = 1.0, math.inf
+            continue
+        explained = float(((y - y.mean()) ** 2).sum() - (left**2).sum())
+        square = max(float((left**2).sum()), 1e-30)
+        p = float(stats.f.sf(explained / max(k, 1) / (square / free), k, free))
+        out[name] = p, len(y) * math.log(square) + k * math.log(len(y))
+    return out
+
+
+def spread_p(map_: PixelMap) -> float:
+    """The p-value of a map under the null that all pixels are alike."""
+    informed = map_.raw_error < 3.0  # pixels without information are left out
+    if informed.sum() < 3 or float(np.std(map_.estimate)) < LEAST_WIDTH:  # all at a bound: no differences
+        return 1.0
+    r, weight = map_.raw[informed], 1 / map_.raw_error[informed] ** 2
+    z = (r - float(np.average(r, weights=weight))) ** 2 * weight
+    return float(stats.chi2.sf(float(z.sum()), int(informed.sum()) - 1))
+
+
+def code_periods(cells: int) -> dict[int, slice]:
+    """The cells of the statistic `codes` that hold each period."""
+    out: dict[int, slice] = {}
+    start = 0
+    for period in _PERIODS:
+        if start + period <= cells:
+            out[period] = slice(start, start + period)
+            start += period
+    return out
+
+
+def by_counts(candidate: Candidate) -> bool:
+    """Whether the counts of the pixels inform a map."""
+    return candidate.per != "code" and not candidate.blinds
+
+
+def acts_on_light(sensor: Sensor, candidate: Candidate) -> bool:
+    """Whether a parameter acts on the light alone; its mean is then confused with the light level."""
+    kind = Effect.registry.find(candidate.effect)
+    return getattr(kind, "stage", "") in ("light", "detection")
+
+
+def map_values(map_: PixelMap) -> dict[str, Value]:
+    """The results of a map by name, with 95 % intervals."""
+    results = {name: Value(number, None, None) for name, number in summary(map_).items()}
+    sigma, noise = results["sigma"].value, float(np.median(map_.raw_error))
+    # sigma^2 is the variance of the differences less that of the noise
+    half = HALF_95 * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
+    ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
+    results["sigma"] = Value(sigma, ends[0], ends[1])
+    if map_.width is not None:
+        results["sigma"] = Value(map_.width.sigma, map_.width.low, map_.width.high)
+    for name in ("low_fraction", "high_fraction"):
+        n, k = len(map_.raw), results[name].value * len(map_.raw)
+        low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
+        high = float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+        results[name] = Value(results[name].value, low, high)
+    ratio, error = low_ratio(map_)
+    if math.isfinite(error):  # without low pixels there is no ratio
+        results["low_ratio"] = Value(ratio, max(ratio - HALF_95 * error, 0.0), ratio + HALF_95 * error)
+    return results

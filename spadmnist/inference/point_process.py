@@ -1,0 +1,332 @@
+# mypy: disable-error-code="no-untyped-def"
+"""Exact likelihoods of captures: the point process of time stamps (TR), the binomial law of single frames (QIS).
+
+After a detection a pixel is blind for the dead time. Then its hazard is its rate plus, for every kind of trap, the
+release of what earlier detections left there: of the last detection exactly, of those before it to first order in the
+probability. The tick and the jitter blur the edge at the end of the dead time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from .. import kernels
+from ..effects._traps import Traps
+from ..events import Events
+from ..recording import Recording
+from ..sensor import Sensor
+from ..streams import Draws
+
+DENSE = 4.0  # intervals within the width of an edge, beyond which its estimate is normal
+_LEAST = 1e-9  # the least probability that an interval ends before the dead time: a wrong stamp is not impossible
+_PROBES = 4096  # events that are stamped to measure the blur, at least
+_LONG = 20.0  # lifetimes after which a trap is empty
+_FOLLOWS, _LAST = 1, 2  # kinds of gaps: after another short one; to the end of the exposure
+# (pixels,) rates -> (log-likelihood, its derivative by the rate, minus about the second one), (pixels,) each
+Law = Callable[[np.ndarray], tuple[np.ndarray, ...]]
+
+
+def blur_of(sensor: Sensor) -> float | None:
+    """The blur of an interval by jitter, s, one standard deviation; None if it is not normal.
+
+    A few events are stamped for it.
+    """
+    sensor = sensor.chip or sensor  # the effects are made for the whole chip
+    pixels = sensor.layout.pixels
+    each = -(-_PROBES // pixels)
+    offsets = np.arange(pixels + 1, dtype=np.int64) * each
+    true = np.tile((1 + np.arange(each)) * 1.000123e-5, pixels)
+    events = Events(true, offsets, pixels, end=1.0)
+    rng = Draws(np.zeros(3, np.uint64), np.zeros(1, np.uint64))
+    square = 0.0
+    for effect in sensor.at("timing"):
+        if not effect.counted:
+            return None
+        after = effect.apply(Events(true, offsets, pixels, end=1.0), rng)  # type: ignore[attr-defined]
+        if len(after) != len(events):
+            return None
+        late = after.times - true
+        late = late - late.mean()
+        width = float(np.ptp(late))
+        if hasattr(effect, "converter"):
+            tick = effect.converter()[0]
+            if width > tick * (1 + 1e-4) and width > 1e-15:
+                return None  # ticks of unequal length
+        elif width > 0:
+            sigma = float(late.std())
+            if np.abs(late).max() > 6 * sigma:
+                return None
+            square += 2 * sigma**2
+    return math.sqrt(square)
+
+
+@kernels.inline
+def _risen(x, tick, sigma):
+    """The probability that an interval x s beyond an edge has reached it, both stamps rounded and jittered."""
+    if sigma == 0.0:
+        if tick == 0.0 or abs(x) >= tick:
+            return 1.0 if x > 0 else 0.0
+        y = x / tick
+        return 0.5 * (1 + y) * (1 + y) if y < 0 else 1 - 0.5 * (1 - y) * (1 - y)
+    if x > tick + 8 * sigma:
+        return 1.0
+    total = 0.0
+    if tick < 0.05 * sigma:
+        return 0.5 * math.erfc(-x / (sigma * 1.4142135623730951))
+    for k in range(8):  # the mean over the triangular law, at its quantiles
+        q = (k + 0.5) / 16
+        e = tick * (1 - math.sqrt(2 * q))
+        total += math.erfc(-(x - e) / (sigma * 1.4142135623730951)) + math.erfc(-(x + e) / (sigma * 1.4142135623730951))
+    return total / 32
+
+
+@kernels.jit
+def _followed(gaps, kinds, offsets, counts, end, dead, chance, lifetime, rate, tick, sigma, hazard, used):
+    """(log-probability of all that does not depend on the rate, time awake in s), (pixels,) each.
+
+    Args:
+        gaps, kinds, offsets: the gaps that may be short, as `Stamps.near` has them.
+        counts: (pixels,) events.
+        end: exposure, s.
+        dead: (pixels,) dead time, s.
+        chance: (traps, pixels) probability that a detection fills a trap.
+        lifetime: (traps,) s.
+        rate: (pixels,) 1/s, approximate, for the probability that a trap caused an event.
+        tick, sigma: s, of the stamps.
+        hazard: (gaps,) output: the hazard of traps at events, 1/s; from a pixel's offset on, the first `used`.
+        used: (pixels,) output: the number of those.
+    """
+    pixels, traps = counts.size, lifetime.size
+    base, awake = np.zeros(pixels), np.zeros(pixels)
+    full, old, own, emptied, blind = np.zeros((5, traps))
+    for i in range(pixels):
+        # as if all gaps were long, and every trap empty at their ends; the short ones are corrected below
+        awake[i] = end - counts[i] * dead[i]
+        used[i] = 0
+        for k in range(traps):
+            # full: probability that the last detection has filled the trap; old: the sum over those before
+            full[k] = chance[k, i]
+            emptied[k], blind[k] = math.log1p(-chance[k, i]), math.exp(-dead[i] / lifetime[k])
+            base[i] += counts[i] * emptied[k]
+            old[k] = 0.0
+        none = 1.0  # a product, because logarithms are slow
+        for m in range(offsets[i], offsets[i + 1]):
+            if not kinds[m] & _FOLLOWS:
+                for k in range(traps):
+                    base[i] -= old[k]
+                    old[k] = 0.0
+            v = gaps[m] - dead[i]
+            last = kinds[m] & _LAST
+            if not last and dead[i] > 0.0 and v < tick + 8 * sigma:
+                base[i] += math.log(max(_risen(v, tick, sigma), _LEAST))
+            if v < 0.0:
+                awake[i] -= v
+                v = 0.0
+            here = 0.0
+            for k in range(traps):
+                if v > _LONG * lifetime[k]:
+                    base[i] -= old[k]
+                    own[k] = old[k] = 0.0
+                    continue
+                left = math.exp(-v / lifetime[k])
+                still = 1.0 - full[k] * (1.0 - left)
+                none *= still
+                base[i] -= emptied[k] + old[k] * (1.0 - left)
+                own[k] = full[k] * left / still
+                old[k] *= left
+                here += (own[k] + old[k]) / lifetime[k]
+            if none < 1e-200:
+                base[i] += math.log(none)
+                none = 1.0
+            if last:
+                old[:] = 0.0  # no later event depends on it
+                break
+            if here > 0.0:
+                hazard[offsets[i] + used[i]] = here
+                used[i] += 1
+            for k in range(traps):
+                # unless this trap fired; a release during the dead time is lost
+                kept = own[k] * (1.0 - own[k] / (lifetime[k] * (rate[i] + here)))
+                old[k] = (old[k] + kept) * blind[k]
+        base[i] += math.log(none)
+        for k in range(traps):
+            base[i] -= old[k]
+    return base, awake
+
+
+@kernels.inline
+def _of_rate(hazard, start, used, count, awake, rate):
+    """(log-likelihood, its derivative by the rate, minus the second one) of a pixel with `count` events.
+
+    Args:
+        hazard: of traps at events, 1/s; `used` of them from `start` on.
+        awake: s.
+        rate: 1/s.
+    """
+    unit = 1.0 / rate
+    value, product = count * math.log(rate) - rate * awake, 1.0
+    first = second = np.float64(count - used)
+    for j in range(start, start + used):
+        more = 1.0 + hazard[j] * unit
+        product *= more
+        if product > 1e200:
+            value += math.log(product)
+            product = 1.0
+        share = 1.0 / more
+        first += share
+        second += share * share
+    return value + math.log(product), first * unit - awake, second * unit * unit
+
+
+@kernels.jit
+def _of_rates(hazard, offsets, used, counts, awake, rate):
+    """(log-likelihood, its derivative by the rate, minus the second one), (pixels,) each."""
+    value, first, second = np.zeros((3, counts.size))
+    for i in range(counts.size):
+        value[i], first[i], second[i] = _of_rate(hazard, offsets[i], used[i], counts[i], awake[i], rate[i])
+    return value, first, second
+
+
+@kernels.jit
+def _at_best(hazard, offsets, used, counts, awake, rate):
+    """The log-likelihood of all pixels at their maximum-likelihood rates, by Newton steps; it is concave.
+
+    Args:
+        rate: (pixels,) 1/s, the start, 0 for any; overwritten by the maximum.
+    """
+    total = 0.0
+    for i in range(counts.size):
+        if counts[i] == 0:
+            continue
+        if rate[i] <= 0.0 or used[i] == 0:
+            rate[i] = counts[i] / awake[i]
+        for _ in range(60):
+            value, first, second = _of_rate(hazard, offsets[i], used[i], counts[i], awake[i], rate[i])
+            step = first / second
+            gain = 0.5 * first * step  # of one more step
+            rate[i] = max(rate[i] + step, 0.2 * rate[i])
+            if gain < 1e-7:
+                break
+        total += value + gain
+    return total
+
+
+class Stamps:
+    """The law of the time stamps of a capture."""
+
+    def __init__(self, recording: Recording):
+        assert recording.events is not None
+        self.capture = recording.capture
+        times, offsets = recording.events.times, recording.events.offsets.astype(np.int64)
+        self.tick = recording.tick or 0.0
+        self.counts = np.diff(offsets)
+        pixels = len(self.counts)
+        # for each pixel: the gaps between its events, then the one to the end; before its first one nothing has
+        # happened
+        lit = np.flatnonzero(self.counts)
+        self.gaps = np.diff(np.append(times, 0.0))
+        self.gaps[offsets[lit + 1] - 1] = self.capture.conditions.exposure - times[offsets[lit + 1] - 1]
+        self.last = np.zeros(len(times), bool)
+        self.last[offsets[lit + 1] - 1] = True
+        self.first = np.zeros(len(times), bool)
+        self.first[offsets[lit]] = True
+        self.offsets = offsets
+        self.reach, self.near = -1.0, (np.zeros(0), np.zeros(0, np.uint8), np.zeros(pixels + 1, np.int64))
+        self.hazard, self.used = np.zeros(0), np.zeros(pixels, np.int64)
+        self.best = np.zeros(pixels)
+        self.given: list[np.ndarray] = []
+        self.parts = np.zeros((2, pixels))
+
+    def rates(self, sensor: Sensor, level: float) -> np.ndarray:
+        """The rates of the pixels at a light level, (pixels,), 1/s."""
+        return sensor.rates(np.full((1, sensor.layout.pixels), level), self.capture.conditions)[0][0]
+
+    def _look(self, reach: float) -> None:
+        """Set `near` to the gaps of at most `reach` s, and not many more.
+
+        near: (gaps in s, kinds, (pixels + 1,) offsets of the pixels).
+        """
+        if reach <= self.reach < 3 * reach:
+            return
+        self.reach = 1.5 * reach
+        short = self.gaps <= self.reach
+        kinds = np.where(self.last, _LAST, 0).astype(np.uint8)
+        kinds[1:] |= np.where(short[:-1] & ~self.first[1:], _FOLLOWS, 0).astype(np.uint8)
+        kept = np.append(0, np.cumsum(short))
+        self.near = self.gaps[short], kinds[short], kept[self.offsets]
+        self.hazard = np.zeros(len(self.near[0]))
+
+    def of(self, sensor: Sensor, blur: float, own: bool) -> tuple[float, Law]:
+        """(log-likelihood without what depends on the rates, the rest as a law of the rates).
+
+        Args:
+            blur: s, of an interval.
+            own: the first number includes the rest at each pixel's maximum-likelihood rate.
+        """
+        dead = np.ascontiguousarray(np.broadcast_to(sensor.dead_times, len(self.counts)), np.float64)
+        end = self.capture.conditions.exposure
+        chances = [(e, -np.expm1(-e.hazards(len(dead)))) for e in sensor.at("correlated") if isinstance(e, Traps)]
+        filled = [(float(e.lifetime), p) for e, p in chances if p.any()]
+        chance = np.array([p for _, p in filled]).reshape(len(filled), len(dead))
+        lifetime = np.array([x for x, _ in filled])
+        given = [dead, chance, lifetime, np.array([blur])]
+        if not (self.given and all(np.array_equal(a, b) for a, b in zip(given, self.given, strict=True))):
+            self._look(float(dead.max(initial=0.0)) + max(_LONG * lifetime.max(initial=0.0), self.tick + 8 * blur))
+            about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
+            what = self.counts, end, dead, chance, lifetime, about, self.tick, blur
+            self.parts = np.array(_followed(*self.near, *what, self.hazard, self.used))
+            self.given = given
+        base, awake = self.parts
+        rest = self.hazard, self.near[2], self.used, self.counts, awake
+
+        def law(rate: np.ndarray) -> tuple[np.ndarray, ...]:
+            return _of_rates(*rest, np.maximum(rate, 1e-12))
+
+        whole = float(base.sum())
+        return whole + (_at_best(*rest, self.best) if own else 0.0), law
+
+    def near_edge(self, dead: np.ndarray, blur: float) -> int:
+        """The number of intervals within the width of the edge at the end of the dead time.
+
+        Args:
+            dead: (pixels,) s.
+            blur: s.
+        """
+        beyond = self.gaps - np.repeat(dead, self.counts)
+        return int(np.count_nonzero(np.abs(beyond[~self.last]) <= self.tick + 2 * blur))
+
+
+class Bits:
+    """The law of the bits of a capture: for each pixel, the number of frames with a detection."""
+
+    tick = 0.0
+
+    def __init__(self, recording: Recording):
+        self.capture = recording.capture
+        self.ones = recording.totals.astype(np.float64)
+        self.frames = recording.n_frames
+
+    def rates(self, sensor: Sensor, level: float) -> np.ndarray:
+        """The expected number of candidates for a detection in a frame, (pixels,)."""
+        c = self.capture.conditions
+        candidates = sensor.expected(np.full((1, sensor.layout.pixels), level), c)[0][0]
+        return candidates / c.frames * (c.frame_time / c.frame_period)
+
+    def of(self, sensor: Sensor, blur: float, own: bool) -> tuple[float, Law]:
+        """As `Stamps.of`; the first number is 0, because all depends on the rates."""
+
+        def law(mean: np.ndarray) -> tuple[np.ndarray, ...]:
+            mean = np.maximum(mean, 1e-12)
+            share, none = -np.expm1(-mean), self.frames - self.ones
+            odds = np.exp(-mean) / share
+            value = self.ones * np.log(share) - none * mean
+            return value, self.ones * odds - none, self.frames * odds
+
+        return 0.0, law
+
+    def near_edge(self, dead: np.ndarray, blur: float) -> int:
+        """The number of intervals near an edge: 0, there are none."""
+        return 0

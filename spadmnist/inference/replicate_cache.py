@@ -1,0 +1,118 @@
+"""The cache of replicates on disk: another measurement of the same model then costs one reduction.
+
+The name of an entry is a digest of everything that it is a function of: sensor, capture, light, seed, the program's
+own sources and the user's plug-ins. An entry ends with the digest of its content. An entry that cannot be read, or is
+damaged, is simulated again. The oldest entries are removed when there are too many.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import disk, plugins
+from ..compiled import digest_of_sources
+from ..errors import SpadError
+from ..foreign import from_json
+from ..images import cache_folder
+from ..recording import Capture
+from ..sensor import Sensor
+from .replicates import CaptureReplicates
+
+_MOST_BYTES = 1 << 30  # bytes of all entries together
+
+
+def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str:
+    """The name of the cache entry of a capture under a model.
+
+    Args:
+        more: numbers and words that the replicates depend on as well.
+    """
+    digest = hashlib.sha256(digest_of_sources().encode())
+    for _, text in sorted(plugins.loaded_files().items()):
+        digest.update(text.encode())
+    # of a part of a chip: the whole chip, whose other pixels may matter, and the part's place
+    chip = sensor.chip or sensor
+    places = None if chip.layout.positions is None else chip.layout.positions.tobytes()
+    digest.update(repr((chip.layout, places, chip.rules, chip.chip_seed, sensor.window, capture, more)).encode())
+    for effect in chip.effects:
+        digest.update(effect.name.encode())
+        for name in effect.parameters:
+            value = getattr(effect, name)
+            digest.update(name.encode() + (value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()))
+    return digest.hexdigest()[:32]
+
+
+def recall(name: str) -> CaptureReplicates | None:
+    """The replicates of an entry; None where no such entry can be read."""
+    path = _folder() / f"{name}.npz"
+    try:
+        with np.load(_intact(path.read_bytes()), allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        facts = from_json(arrays.pop("facts").tobytes())
+        laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts.items()}
+        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in facts}
+        found = CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
+        os.utime(path)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        return None
+    return found
+
+
+def keep(name: str, made: CaptureReplicates) -> None:
+    """Write an entry. An error of the disk is ignored: the cache is no part of the result."""
+    arrays = {"numbers": made.numbers, "totals": made.totals}
+    for statistic, (_, scale) in made.laws.items():
+        arrays[f"values/{statistic}"] = _narrow(made.values[statistic])
+        if scale is not None:
+            arrays[f"scale/{statistic}"] = scale
+    header = np.frombuffer(json.dumps({statistic: law for statistic, (law, _) in made.laws.items()}).encode(), np.uint8)
+    folder = _folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        whole = io.BytesIO()
+        np.savez(whole, allow_pickle=False, facts=header, **arrays)
+        data = whole.getvalue()
+        disk.put_file(folder / f"{name}.npz", data + hashlib.sha256(data).digest())
+        _make_room(folder)
+    except (OSError, SpadError):  # what is not in the cache is simulated again
+        return
+
+
+def _narrow(values: np.ndarray) -> np.ndarray:
+    """The same numbers; whole ones as unsigned integers of as few bytes as hold them."""
+    if values.size and float(values.min()) >= 0 and float(values.max()) < 2**32 and not np.any(values % 1):
+        return values.astype(np.min_scalar_type(int(values.max())))
+    return values
+
+
+def _intact(data: bytes) -> io.BytesIO:
+    """The archive of an entry.
+
+    Raises:
+        ValueError: where its digest is not that of its content.
+    """
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(data[:-size]).digest() != data[-size:]:
+        raise ValueError("damaged")
+    return io.BytesIO(data[:-size])
+
+
+def _make_room(folder: Path) -> None:
+    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    total = 0
+    for path in entries:
+        total += path.stat().st_size
+        if total > _MOST_BYTES:
+            path.unlink(missing_ok=True)
+
+
+def _folder() -> Path:
+    return cache_folder() / "nulls"

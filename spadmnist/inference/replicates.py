@@ -1,0 +1,481 @@
+"""Replicates: recordings that a model makes of each capture, with common random numbers.
+
+Each replicate is simulated at a light level that gives about as many detections as were measured. The replicate of
+one number draws the same random numbers in every model, so that differences between models are nearly free of noise.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import pickle
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from .. import plugins, twin
+from ..effects import Conditions
+from ..errors import UNABLE, EffectError, why
+from ..heap import keep_freed_memory
+from ..measurement import Measurement
+from ..recording import Capture, Recording
+from ..sensor import Sensor
+from ..statistics import Statistic, Summary
+from ..streams import Streams
+from .blind_times import ShortestIntervals
+from .budget import Budget, work_of
+from .candidates import Candidate, candidates, on_chip, with_values
+from .coordinates import Key, Values
+
+T = TypeVar("T")
+Cell = tuple[str, str]  # (capture, statistic)
+TOTALS = ("", "rates")  # the block of the totals of all captures
+FEW = 4  # replicates of each capture that give the difference between two models
+REPLICATES = 96  # replicates of each capture, by default
+_EVENTS_AT_ONCE = 4_000_000  # detections that are simulated at a time, in as many replicates as hold them
+_SCALES = 8  # replicates whose scales are averaged, however many there are
+
+
+def halves_of(id: str) -> tuple[str, str]:
+    """The names of the two halves of a capture (`Replicates.halves`)."""
+    return f"{id}, odd blocks", f"{id}, even blocks"
+
+
+class Fault(str):
+    """The reason why a model cannot be simulated, where an effect's own code has failed."""
+
+
+def why_not(error: BaseException) -> str:
+    """The reason why a model cannot be simulated, as text; a `Fault` where an effect's own code has failed."""
+    return (Fault if isinstance(error, EffectError) else str)(why(error))
+
+
+@dataclass(frozen=True)
+class ReducedCapture:
+    """A measured capture, reduced: its total, the counts of its pixels, its summaries.
+
+    Attributes:
+        total: detections of the whole array.
+        counts: (pixels,) detections; None where the mean alone is known.
+        summaries: by statistic.
+        last: the last detection that has a stamp of its own, s.
+        waited: (pixels,) of first stamps, the time before them, in frames.
+        shortest: the shortest intervals, of time stamps.
+        half_of: (the whole capture, whether this is its second, fourth, ... block of time); None where it is no half.
+    """
+
+    capture: Capture
+    total: float
+    counts: np.ndarray | None
+    summaries: Mapping[str, Summary]
+    last: float | None = None
+    waited: np.ndarray | None = None
+    shortest: ShortestIntervals | None = None
+    half_of: tuple[Capture, bool] | None = None
+
+    @classmethod
+    def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
+        """The reduction of a recording.
+
+        Args:
+            reduced: with its statistics; without them only the counts are there.
+        """
+        summaries = {}
+        for statistic in statistics_for(recording.capture) if reduced else ():
+            summary = reduce_with(statistic, recording)
+            if summary is not None:
+                summaries[statistic.name] = summary.apart()
+        counts = np.asarray(recording.totals, float)
+        last = None
+        if recording.events is not None and len(recording.events.times):
+            last = float(recording.events.times.max())
+        waited = None if recording.waited is None else recording.waited[0]
+        shortest = ShortestIntervals.of(recording)
+        capture = replace(recording.capture, tick=recording.tick)
+        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest)
+
+
+@dataclass
+class CaptureReplicates:
+    """The replicates of one capture under a model.
+
+    Attributes:
+        numbers: (replicates,) the numbers that seed each of them.
+        totals: (replicates,) detections of the whole array.
+        values: (replicates, cells) by statistic.
+        laws: (law, scale of the cells) by statistic, as in `Summary`.
+    """
+
+    numbers: np.ndarray
+    totals: np.ndarray
+    values: dict[str, np.ndarray]
+    laws: dict[str, tuple[str, np.ndarray | None]]
+
+    def first(self, number: int) -> CaptureReplicates:
+        """The first `number` replicates, or all of them where there are fewer."""
+        values = {name: x[:number] for name, x in self.values.items()}
+        return CaptureReplicates(self.numbers[:number], self.totals[:number], values, self.laws)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model: one sensor, or one for each capture, or one for each replicate (maps that are known with errors).
+
+    Attributes:
+        of: (capture, number of a replicate) -> sensor.
+        one: a single sensor that stands for all.
+        alike: all replicates of a capture have the same sensor.
+        typical: capture -> the sensor whose closed forms hold in the mean over the replicates; None where all are
+            alike.
+    """
+
+    of: Callable[[str, int], Sensor]
+    one: Sensor
+    alike: bool = True
+    typical: Callable[[str], Sensor] | None = None
+
+    def usual(self, capture: str) -> Sensor:
+        """The sensor whose closed forms hold in the mean over the replicates of a capture."""
+        return self.typical(capture) if self.typical else self.of(capture, 0)
+
+    @staticmethod
+    def same(sensor: Sensor) -> Model:
+        """The model of one sensor for every replicate of every capture."""
+        return Model(lambda capture, number: sensor, sensor)
+
+    def under(self, name_of: Callable[[str], str]) -> Model:
+        """The same sensors for captures of other names.
+
+        Args:
+            name_of: new name -> name of the capture here.
+        """
+        typical = self.typical
+        return Model(
+            lambda capture, number: self.of(name_of(capture), number),
+            self.one,
+            self.alike,
+            None if typical is None else lambda capture: typical(name_of(capture)),
+        )
+
+    def changed(
+        self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None, chips: bool = False
+    ) -> Model:
+        """The model with some values set in each of its sensors.
+
+        Args:
+            values: by (effect, parameter), SI units.
+            phases: by (capture, parameter), rad.
+            chips: every replicate is of a chip of its own, because the random properties of the pixels are not known.
+        """
+
+        def own(capture: str) -> dict[Key, Any]:
+            return {**values, **{key: x for (id, key), x in (phases or {}).items() if id == capture}}
+
+        def of(capture: str, number: int) -> Sensor:
+            sensor = self.of(capture, number)
+            return with_values(on_chip(sensor, number + 1) if chips else sensor, own(capture))
+
+        def usual(capture: str) -> Sensor:
+            return with_values(self.usual(capture), own(capture))
+
+        typical = functools.lru_cache(maxsize=64)(usual)
+        known = typical if self.typical or chips else None
+        return Model(of, with_values(self.one, values), self.alike and not chips, known)
+
+
+def _task(
+    models: Sequence[Packed],
+    capture: Capture,
+    photons: np.ndarray,
+    numbers: np.ndarray,
+    seed: int,
+    dead: float,
+    hasty: bool = False,
+    second: bool | None = None,
+) -> CaptureReplicates | str:
+    """The replicates of one capture, reduced: the task of a worker; a reason where there are none.
+
+    Args:
+        models: one for all replicates, or one for each.
+        photons: (replicates,) photons/s on each pixel.
+        dead: dead time for the reduction, s.
+        hasty: without costly statistics.
+        second: of a half, whether it is of the second, fourth, ... blocks of time; None for a whole capture.
+    """
+    keep_freed_memory()
+    totals: list[int] = []
+    found: dict[str, list[Summary]] = {}
+    known = [s for s in statistics_for(capture) if not (hasty and s.costly)]
+
+    def take(recording: Recording) -> None:
+        if second is not None:
+            half = recording.every_other(second)
+            assert half is not None  # the measurement's own half is there
+            recording = half
+        recording = recording.beside(dead)
+        totals.append(int(recording.totals.sum()))
+        for statistic in known:
+            summary = reduce_with(statistic, recording)
+            if summary is not None:
+                found.setdefault(statistic.name, []).append(summary.apart())
+
+    try:
+        for k, model in enumerate(models):
+            some = slice(None) if len(models) == 1 else slice(k, k + 1)
+            sensor = model.sensor
+            if capture.light.dark:
+                sensor = InTheDark.of(sensor)
+            for recording in simulated(sensor, capture, photons[some], numbers[some], seed):
+                take(recording)
+    except UNABLE as error:
+        return why_not(error)
+    whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
+    return CaptureReplicates(
+        numbers,
+        np.array(totals, float),
+        {n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
+        {
+            n: (s[0].law, None if s[0].scale is None else np.mean([np.asarray(x.scale) for x in s[:_SCALES]], axis=0))
+            for n, s in whole.items()
+        },
+    )
+
+
+class Replicates:
+    """The measurement, reduced once, and the workers that simulate models of it."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        measurement: Measurement,
+        seed: int,
+        parallel: Parallel,
+        number: int,
+        say: Callable[[str], None] = lambda what: None,
+        exposures: Mapping[str, float] | None = None,
+        reduced: bool = True,
+        progress: Callable[[str, float], None] = lambda capture, share: None,
+        budget: Budget | None = None,
+    ):
+        """Reduce the measurement.
+
+        Args:
+            sensor: the stated model, which the measurement must fit.
+            number: replicates of each capture.
+            say: called with what is being done.
+            exposures: s, of captures whose exposure is not what the measurement states.
+            reduced: with all statistics of the captures; without them only counts can be compared.
+            progress: called with a capture and the share of the simulations under way that is done.
+            budget: of work; without it there is no end to it.
+        """
+        measurement.check_sensor(sensor)
+        self.start = sensor.settled()
+        self.seed, self.parallel, self.number, self.say, self.progress = seed, parallel, number, say, progress
+        self.dead = self.start.nominal_dead_time
+        self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
+        self.seen: dict[str, ReducedCapture] = {}
+        self.simulations, self.budget = 0, budget or Budget()
+        for capture in measurement.captures:
+            if capture.mean is not None:
+                self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
+            else:
+                self.seen[capture.id] = ReducedCapture.of(self.recording(capture.id), reduced)
+
+    def recording(self, id: str) -> Recording:
+        """The recording of a capture, with its corrected exposure where there is one."""
+        recording = self.measurement.recording(id, self.start)
+        if id not in self.exposures:
+            return recording
+        conditions = replace(recording.conditions, exposure=self.exposures[id])
+        return replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
+
+    def candidates(self, sensor: Sensor) -> list[Candidate]:
+        """Every candidate of a sensor that these captures can show."""
+        return candidates(sensor, (seen.capture for seen in self.seen.values()))
+
+    def halves(self, ids: Collection[str]) -> Replicates:
+        """Some captures alone, each as two: its blocks of time 1, 3, ... and its blocks 2, 4, ...
+
+        Their names are those of `halves_of`. Captures that are too short are left out.
+        """
+        other = copy.copy(self)
+        other.seen = {}
+        for id in (id for id in self.seen if id in ids and self.seen[id].counts is not None):
+            whole = self.recording(id)
+            parts = [whole.every_other(second) for second in (False, True)]
+            for name, part, second in zip(halves_of(id), parts, (False, True), strict=True):
+                if part is not None:
+                    seen = ReducedCapture.of(part, self.reduced)
+                    other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
+        return other
+
+    @property
+    def dark(self) -> list[str]:
+        """The captures without light."""
+        return [id for id, seen in self.seen.items() if seen.capture.light.dark]
+
+    def _work(self, id: str) -> float:
+        """The work of one replicate of a capture, s of two idle cores."""
+        seen = self.seen[id]
+        whole = 1 if seen.half_of is None else 2  # for a half the whole is simulated
+        return work_of(seen.capture, whole * seen.total, self.start.layout.pixels)
+
+    # --- simulating ----------------------------------------------------------------------------------------------
+
+    def simulate(
+        self,
+        wanted: Sequence[tuple[Model, str, np.ndarray, np.ndarray]],
+        pieces: int = 1,
+        hasty: bool = False,
+    ) -> list[CaptureReplicates | str]:
+        """The replicates of each (model, capture, photons, numbers), in their order; a reason where there are none.
+
+        Args:
+            wanted: photons in photons/s on a pixel, (replicates,); numbers (replicates,).
+            pieces: number of tasks for each capture.
+            hasty: without costly statistics.
+        Raises:
+            OutOfBudget: where the budget does not allow them.
+        """
+        tasks: list[list[tuple[Any, ...]]] = []
+        out: list[CaptureReplicates | str] = [""] * len(wanted)
+        for k, (sensors, id, photons, numbers) in enumerate(wanted):
+            tasks.append([])
+            parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
+            capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
+            try:
+                for part in parts:
+                    each = [0] if sensors.alike else [int(numbers[i]) for i in part]
+                    models = [Packed.of(sensors.of(id, number)) for number in each]
+                    rest = self.seed, self.dead, hasty, second
+                    tasks[k].append((models, capture, photons[part], numbers[part], *rest))
+            except UNABLE as error:
+                tasks[k], out[k] = [], why_not(error)
+        asked = [(id, len(numbers)) for some, (_, id, _, numbers) in zip(tasks, wanted, strict=True) if some]
+        self.budget.spend(sum(number * self._work(id) for id, number in asked))
+        self.simulations += sum(number for _, number in asked)
+        ids = [wanted[k][1] for k, some in enumerate(tasks) for _ in some]
+        simulated = []
+        for one in self.parallel(delayed(_task)(*task) for some in tasks for task in some):
+            simulated.append(one)
+            self.progress(ids[len(simulated) - 1], len(simulated) / len(ids))
+        results = iter(simulated)
+        for k, some in enumerate(tasks):
+            made = [next(results) for _ in some]
+            wrong = [p for p in made if isinstance(p, str)]
+            if some:
+                out[k] = wrong[0] if wrong else joined([p for p in made if isinstance(p, CaptureReplicates)])
+        return out
+
+
+def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:
+    """Replicates of one capture together: of the statistics that all of them have."""
+    names = [name for name in parts[0].values if all(name in part.values for part in parts)]
+    return CaptureReplicates(
+        np.concatenate([p.numbers for p in parts]),
+        np.concatenate([p.totals for p in parts]),
+        {name: np.concatenate([p.values[name] for p in parts]) for name in names},
+        {name: parts[0].laws[name] for name in names},
+    )
+
+
+def statistics_for(capture: Capture) -> list[Statistic]:
+    """Every registered statistic that applies to a capture: by its modality, and by its light."""
+    kinds = [Statistic.registry.find(name) for name in Statistic.registry]
+    scene = capture.light.scene is not None
+    return [kind() for kind in kinds if capture.modality in kind.modalities and not (kind.flat and scene)]
+
+
+def simulated(
+    sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
+) -> Iterator[Recording]:
+    """The recordings of a capture that a model makes, one for each number.
+
+    They are on the ticks of the measurement's file, whatever the sensor's own are, because all counting is in these.
+    They are yielded one by one; only a few of them are in memory together.
+
+    Args:
+        photons: (replicates,) photons/s on each pixel.
+        numbers: (replicates,) numbers that seed each recording.
+    """
+    expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
+    step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
+    for start in range(0, len(numbers), step):
+        some = slice(start, start + step)
+        streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
+        for one in twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True):
+            yield one if capture.tick is None else one.on_ticks(capture.tick)
+
+
+def swinging(sensor: Sensor) -> list[Key]:
+    """The parameters of a sensor that are phases."""
+    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.phase]
+
+
+class InTheDark(Sensor):
+    """A sensor without light, whose dark rates are scaled by the number that stands for photons/s.
+
+    A dark capture can so be simulated with as many detections as were measured. The test of their number is then
+    separate from the test of their pattern.
+    """
+
+    @staticmethod
+    def of(sensor: Sensor) -> Sensor:
+        """The same sensor, in the dark."""
+        own = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
+        return InTheDark(**own | {"chip": None if sensor.chip is None else InTheDark.of(sensor.chip)})
+
+    def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """The dark rates times the factors that stand for photons/s; arrays as in `Sensor.rates`."""
+        rate, light = super().rates(np.zeros_like(photons), conditions)
+        return rate * photons, light * photons
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A sensor on its way to a worker, which must load the user's plug-in files before it can unpack it."""
+
+    files: tuple[str, ...]
+    packed: bytes
+
+    @staticmethod
+    def of(sensor: Sensor) -> Packed:
+        """The packed sensor."""
+        return Packed(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
+
+    @property
+    def sensor(self) -> Sensor:
+        """The unpacked sensor."""
+        for file in self.files:
+            plugins.load_file(file)
+        return _unpacked(self.packed)
+
+
+@functools.lru_cache(maxsize=2)
+def _unpacked(packed: bytes) -> Sensor:
+    """The unpacked sensor; only what this program has packed itself is unpacked."""
+    sensor = pickle.loads(packed)
+    assert isinstance(sensor, Sensor)
+    return sensor
+
+
+def no_size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+    """No words: for a summary whose words are not needed."""
+    return "", 0.0
+
+
+def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
+    """The summary of a recording by a statistic; None where it does not apply.
+
+    Raises:
+        SpadError: where a user's own statistic fails; it names the file and line.
+    """
+    try:
+        return statistic.reduce(recording)
+    except Exception as error:
+        if type(statistic).__module__.startswith(f"{__package__.partition('.')[0]}."):
+            raise
+        raise plugins.blame(statistic, error) from error

@@ -1,0 +1,339 @@
+"""Results of `diagnose` and `fit`: steps, verdict, error budget; as JSON, for a terminal, for the next sensor file."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .. import units
+from ..effects import Effect, Mimic
+from ..foreign import visible
+from ..statistics import Statistic, Summary
+from .candidates import Candidate
+from .comparison import Comparison, headline
+from .coordinates import Coordinate, Key
+from .replicates import Cell
+
+NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
+# what remains, in words, by what a statistic compares (`Statistic.among`)
+_WHO = {
+    "far": "pixels far from each other share it",
+    "neighbours": "pixels that are close to each other share it",
+    "pixel": "it stays in its own pixel",
+    "array": "the whole array shares it",
+}
+
+
+def plain(value: float) -> float:
+    """A finite number of six digits."""
+    return float(f"{min(max(value, -1e300), 1e300):.6g}")
+
+
+def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """The lines of a table, its columns aligned."""
+    rows = [tuple(map(visible, row)) for row in rows]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A fitted value with its 95 % interval, SI.
+
+    Attributes:
+        low, high: None where there is no interval.
+        method: of the fit, where it was a choice.
+    """
+
+    value: float
+    low: float | None
+    high: float | None
+    unit: str = ""
+    method: str = ""
+
+    def as_data(self) -> dict[str, Any]:
+        out: dict[str, Any] = {"value": plain(self.value)}
+        if self.low is not None and self.high is not None:
+            out |= {"low": plain(self.low), "high": plain(self.high)}
+        return out | {"unit": self.unit} | ({"method": self.method} if self.method else {})
+
+
+@dataclass
+class Step:
+    """An accepted change of the model; see `formats`."""
+
+    candidate: Candidate
+    values: dict[str, Value]
+    misfit: float
+    significance: float
+    material: str
+    alternatives: list[dict[str, Any]] = field(default_factory=list)
+    coordinates: tuple[Coordinate, ...] = ()
+    phased: bool = False
+    chips: bool = False
+    fluctuates: bool = False
+    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+    before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+    # (cells, coordinates) by block, where the effect is faint
+    jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def as_data(self) -> dict[str, Any]:
+        kind = "per_pixel" if self.candidate.kind == "per_pixel" else self.candidate.kind
+        return {
+            "change": kind,
+            "effect": self.candidate.effect,
+            "parameter": self.candidate.parameter,
+            "values": {name: v.as_data() for name, v in self.values.items()},
+            "misfit": plain(self.misfit),
+            "significance": plain(self.significance),
+            "material": self.material,
+            "alternatives": self.alternatives,
+        }
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A check before and after, for a picture.
+
+    Attributes:
+        before, after: (cells,) the expectation of each model.
+        spread: (cells,) the scatter of the last model.
+        residuals_before, residuals_after: (cells,).
+    """
+
+    statistic: str
+    capture: str
+    summary: Summary
+    before: np.ndarray
+    after: np.ndarray
+    spread: np.ndarray
+    residuals_before: np.ndarray
+    residuals_after: np.ndarray
+
+
+@dataclass
+class Diagnosis:
+    """The result of `diagnose` or `fit`; see `formats`."""
+
+    sensor: str
+    measurement: str
+    verdict: str
+    before: float
+    after: float
+    null_95: float
+    nuisances: list[dict[str, Any]]
+    steps: list[Step]
+    setup: list[dict[str, Any]]
+    unexplained: list[dict[str, Any]]
+    ladder: list[dict[str, Any]]
+    advice: list[dict[str, Any]]
+    excluded: list[dict[str, Any]]
+    invisible: list[dict[str, Any]] = field(default_factory=list)
+    unlimited: list[dict[str, Any]] = field(default_factory=list)  # effects without a finding and without a limit
+    traces: list[Trace] = field(default_factory=list, repr=False)
+    values: dict[Key, Any] = field(default_factory=dict, repr=False)
+    file: str | None = None
+    simulations: int = 0
+    dark: list[str] = field(default_factory=list)  # captures without light
+    crop: str | None = None  # the part of the sensor that was measured: rows, columns
+    untried: list[dict[str, Any]] = field(default_factory=list)  # candidates that cannot be simulated
+    # (names "effect.parameter" of the fitted parameters, their covariance in SI) of a fit
+    covariance: tuple[list[str], np.ndarray] = field(default_factory=lambda: ([], np.zeros((0, 0))), repr=False)
+    asked: str = "diagnosis"  # or "fit"
+    in_sample: Comparison | None = field(default=None, repr=False)  # of the model with all steps, to all captures
+    finished: bool = True  # False: a budget ended it, and the verdict is that of the steps so far
+    unwritten: str = ""  # why there is no next sensor file where one was wanted
+
+    def as_data(self) -> dict[str, Any]:
+        """The result as JSON data: `formats`, spadmnist-diagnosis/1 or spadmnist-fit/1."""
+        return {
+            "format": f"spadmnist-{self.asked}/1",
+            "verdict": self.verdict,
+            "finished": self.finished,
+            **({"crop": self.crop} if self.crop else {}),
+            "misfit": {"before": plain(self.before), "after": plain(self.after)},
+            "misfit_in_sample": plain(self.after if self.in_sample is None else self.in_sample.misfit),
+            "misfit_null_95": plain(self.null_95),
+            "nuisances": self.nuisances,
+            "steps": [step.as_data() for step in self.steps],
+            "setup": self.setup,
+            "unexplained": self.unexplained,
+            "ladder": self.ladder,
+            "advice": self.advice,
+            "excluded": self.excluded,
+            "not_identifiable": self.invisible,
+            "no_limit": self.unlimited,
+            "not_tried": self.untried,
+            "sensor": self.file,
+            **({"not_written": self.unwritten} if self.unwritten else {}),
+        }
+
+
+def title(candidate: Candidate) -> str:
+    """The name of a candidate: of the effect, or of the parameter."""
+    if candidate.kind == "add":
+        return candidate.effect
+    return f"{candidate.effect}.{candidate.parameter}" + (" per pixel" if candidate.kind == "per_pixel" else "")
+
+
+def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
+    """One sentence on the kind of mechanism that remains unexplained.
+
+    Args:
+        found: the entries of what remains.
+        dark: captures without light.
+    """
+    kinds = {Statistic.registry.find(str(r["statistic"])).among for r in found if r["statistic"] in Statistic.registry}
+    who = next((words for kind, words in _WHO.items() if kind in kinds), "it is a matter of rates and maps")
+    in_dark = any(r["capture"] in dark for r in found)
+    return f"{who}; {'it is there in the dark, too' if in_dark else 'it shows in light alone'}"
+
+
+def mimic(candidate: Candidate) -> Mimic | None:
+    """The mimic of a candidate: what no effect describes and has the same signature; None where none is known."""
+    known = candidate.effect in Effect.registry
+    return Effect.registry.find(candidate.effect).mimic if candidate.kind == "add" and known else None
+
+
+def canonical(found: Diagnosis) -> str:
+    """The result as JSON text."""
+    return json.dumps(found.as_data(), indent=1, allow_nan=False)
+
+
+def table(found: Diagnosis) -> str:
+    """The result as text for a terminal: the verdict, the steps, the ladder."""
+    lines = [*textwrap.wrap(f"{found.verdict.upper().replace('_', ' ')}: {sentence(found)}", 100), ""]
+    for number, step in enumerate(found.steps, 1):
+        parts = [f"{name} {shown(v)}" for name, v in step.values.items()]
+        text = f"{number}. {title(step.candidate)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
+        text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
+        lines += textwrap.wrap(text, 100, subsequent_indent="   ")
+        but = mimic(step.candidate)
+        lines += textwrap.wrap(str(but or ""), 100, initial_indent="   But: ", subsequent_indent="   ")
+    for entry in found.setup:
+        f = entry["factor"]
+        where = entry["capture"] or "all"
+        either = " (or)" if entry["confused"] else ""
+        lines.append(
+            f"set-up{either}: {entry['quantity']} of {where} x {units.factor(f['value'])} "
+            f"(95 %: {units.factor(f['low'])} to {units.factor(f['high'])})"
+        )
+    if found.steps or found.setup:
+        lines.append("")
+    names = ("mean_rate", "map", "linearity", "intervals", "neighbours")
+    rows: list[tuple[str, ...]] = [("model", "misfit", *(n.replace("_", " ") + " %" for n in names))]
+    for row in found.ladder:
+        rows.append((row["model"], f"{row['misfit']:.3f}", *(f"{100 * row['errors'].get(n, 0.0):.3f}" for n in names)))
+    rows.append(("noise floor (95 %)", f"{found.null_95:.3f}", *("" for _ in names)))
+    lines += columns(rows)
+    if found.in_sample is not None:
+        text = f"In sample, misfit {found.in_sample.misfit:.3f}; worst check: {headline(found.in_sample)}."
+        lines += ["", *textwrap.wrap(text, 100)]
+    if found.unexplained:
+        lines += ["", "What remains:"]
+        lines += columns(
+            [
+                (r["statistic"], r["capture"] or "all", f"{r['significance']:.1f} sigma", r["where"])
+                for r in found.unexplained[:8]
+            ]
+        )
+        near = [named(other) for other in found.unexplained[0].get("alternatives", [])]
+        if near:
+            text = f"Nearest, but it leaves too much of what it should explain: {', '.join(near)}."
+            lines += textwrap.wrap(text, 100)
+    for one in found.advice:
+        text = (
+            f"To tell {' from '.join(one['separates'])}: take {one['capture']} "
+            f"(now {one['significance_now']:.1f} sigma, then {one['significance_then']:.1f})."
+        )
+        lines += ["", *textwrap.wrap(text, 100)]
+    if found.excluded:
+        lines += ["", "Would have been seen (95 % upper limits):"]
+        about = [f"{e['effect']}.{e['parameter']} {_limit(e)}" for e in found.excluded]
+        lines += textwrap.wrap("; ".join(about), 100, initial_indent="  ", subsequent_indent="  ")
+    if found.invisible:
+        about = [e["effect"] for e in found.invisible]
+        lines += textwrap.wrap(f"This measurement cannot show: {', '.join(about)}.", 100)
+    if found.unlimited:
+        about = [e["effect"] for e in found.unlimited]
+        lines += textwrap.wrap(f"Tried and not found, without a limit: {', '.join(about)}.", 100)
+    if found.untried:
+        lines += ["", "Not tried there:"]
+        for e in found.untried:
+            text = ", ".join(filter(None, (named(e), str(e["where"])))) + f": {e['why']}"
+            lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
+    if found.unwritten:
+        lines += ["", *textwrap.wrap(f"The next sensor file was not written: {found.unwritten}", 100)]
+    return "\n".join(lines)
+
+
+def named(entry: Mapping[str, Any]) -> str:
+    """The name of a candidate in the JSON data, as `title` has it; "" for none."""
+    if entry["effect"] is None:
+        return ""
+    name = str(entry["effect"]) + (f".{entry['parameter']}" if entry["parameter"] else "")
+    return name + (" per pixel" if entry["change"] == "per_pixel" else "")
+
+
+def shown(v: Value) -> str:
+    """A value with its unit and its interval as text."""
+    text = units.show(v.value, v.unit) if v.unit else f"{v.value:.4g}"
+    if v.low is not None and v.high is not None:
+        ends = [units.show(x, v.unit) if v.unit else f"{x:.4g}" for x in (v.low, v.high)]
+        text += f" ({ends[0]} to {ends[1]})"
+    return text
+
+
+def _limit(entry: Mapping[str, Any]) -> str:
+    unit = Effect.registry.find(entry["effect"]).parameters[entry["parameter"]].unit
+    return units.show(entry["upper_limit_95"], unit, 2) if unit else f"{entry['upper_limit_95']:.2g}"
+
+
+def sentence(found: Diagnosis) -> str:
+    """The verdict in words."""
+    if not found.finished:
+        return "not finished, what follows is of the steps so far: " + sentence(
+            dataclasses.replace(found, finished=True)
+        )
+    fitted = " and ".join(title(s.candidate) for s in found.steps)
+    if found.verdict == "adequate" and found.steps:
+        return f"{fitted}: fitted. No check failed before, and none fails now."
+    if found.verdict == "adequate":
+        return "nothing is missing that this measurement could show."
+    if found.verdict == "setup":
+        return "the set-up explains everything, the sensor nothing."
+    if found.verdict == "explained":
+        return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
+    if found.verdict == "confused" and found.setup and not found.steps:
+        return f"the set-up of {found.setup[0]['capture']}, or {NONLINEARITY}: it is the brightest capture."
+    if found.verdict == "confused":
+        return f"{fitted}, or something that looks the same here."
+    if found.verdict == "partly_explained":
+        return f"{fitted} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
+    return f"something is missing that no known effect explains: {mechanism(found.unexplained, found.dark)}."
+
+
+def notes(found: Diagnosis) -> dict[Key, str]:
+    """The comments on the new lines of the next sensor file, by (effect, parameter): data and 95 % intervals."""
+    out: dict[Key, str] = {}
+    today = datetime.date.today().isoformat()
+    for step in found.steps:
+        parts = []
+        for name, v in step.values.items():
+            if v.low is not None and v.high is not None:
+                ends = [units.show(x, v.unit) if v.unit else f"{x:.4g}" for x in (v.low, v.high)]
+                parts.append(f"{name} {ends[0]} to {ends[1]} (95 %)")
+        part = f" of rows and columns {found.crop}" if found.crop else ""
+        text = f"from {found.measurement}{part}, {today}" + (f": {', '.join(parts)}" if parts else "")
+        keys = [key for key in found.values if key[0] == step.candidate.effect]
+        for key in keys:
+            out[key] = text
+    return out

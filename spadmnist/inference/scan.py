@@ -1,0 +1,475 @@
+"""The scan over candidates: a first look at each with a few replicates, a second look at the best on all captures."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from .. import plugins
+from ..effects import Effect
+from ..errors import UNABLE, SpadError, why
+from ..sensor import Sensor
+from .candidates import Candidate, has_random_pixels, templates, with_values
+from .coordinates import Key, is_edge
+from .evaluation import Evaluation, block_checks, failing, square
+from .levels import COST_OF_A_NUMBER, PROMISING
+from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
+from .phases import NEAR, TIMES, simulate_phases
+from .ranking import gain_by_own_scatter
+from .replicates import FEW, Model, Replicates
+from .score_test import LEAST_P, best_direction, sigmas_of
+from .signature import Signature, gain_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
+from .spectral_lines import Line, spectral_lines
+from .trial import Trial, frequencies_of, further, is_same, shape_of, stronger, weaker
+from .trial_fits import STRONG
+
+_LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
+_SCAN = 2  # replicates of each capture for the first look
+_SECOND = 6  # candidates in the second look
+_NEARLY = 0.8  # of the largest gain
+_BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
+_FAR_OFF = 0.4  # of the logarithm of a strength
+_SILENT = 6.0  # standard deviations: a signature below it is none
+_LOUD = 300.0  # standard deviations: a signature beyond it says little of a smaller one
+_STEPS = 3  # how often a weaker or a stronger edge is tried
+_INSTANT = 0.03  # of a frame: shorter times are the same without stamps
+_SWINGS = (1.0, 4.0)  # times the strength at which a periodic candidate is tried: its power grows as the square
+
+
+class Scan:
+    """The scan for what the model lacks, step by step.
+
+    Attributes:
+        accepted: the candidates of the steps so far.
+        phases: of the periodic ones, by (capture, parameter), rad.
+    """
+
+    def __init__(self, replicates: Replicates, say: Callable[[str], None]):
+        self.replicates, self.say = replicates, say
+        self.accepted: list[Candidate] = []
+        self.phases: dict[tuple[str, Key], float] = {}
+        self._lines: tuple[Evaluation, list[Line]] | None = None
+
+        self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
+        self._out: set[str] = set()  # names of those that are excluded from now on
+        for name in Effect.registry:
+            plugged = plugins.is_from_file(Effect.registry.find(name)) and replicates.start.effect(name) is None
+            if plugged and all(candidate.effect != name for candidate in replicates.candidates(replicates.start)):
+                nowhere = "none of its parameters says where to look for it; give one off= and search="
+                self.not_tried("add", name, None, "choosing candidates", nowhere)
+
+    def not_tried(self, kind: str, effect: str, parameter: str | None, where: str, why: str) -> None:
+        """Record that a candidate cannot be simulated, where, and why; it is reported once for each effect."""
+        entry = {"change": kind, "effect": effect, "parameter": parameter, "where": where, "why": why}
+        if all(entry["effect"] != other["effect"] for other in self.untried):
+            self.say(f"not tried: {effect} ({why})")
+        which = ("change", "effect", "parameter", "where")
+        if all(any(entry[k] != other[k] for k in which) for other in self.untried):
+            self.untried.append(entry)
+
+    def exclude(self, candidate: Candidate, where: str, why: str) -> None:
+        """Exclude a candidate: it cannot be simulated with this model, or at its best values."""
+        self._out.add(candidate.name)
+        self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why)
+
+    def _beside(self, sensor: Sensor) -> list[Candidate]:
+        return [candidate for candidate in self.replicates.candidates(sensor) if candidate.name not in self._out]
+
+    @contextlib.contextmanager
+    def if_possible(self, candidate: Candidate, where: str, wholly: bool = True) -> Iterator[None]:
+        """A context in which a candidate that cannot be simulated is recorded.
+
+        Args:
+            wholly: the candidate is excluded, whatever its values.
+        """
+        try:
+            yield
+        except UNABLE as error:
+            if wholly:
+                self.exclude(candidate, where, why(error))
+            else:
+                self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
+
+    # --- looking -------------------------------------------------------------------------------------------------
+
+    def line_search(self, evaluation: Evaluation, signature: Signature, signed: bool) -> tuple[float, float]:
+        """(gain in chi square, factor on the strength at which it is largest).
+
+        Args:
+            signed: the strength may have either sign.
+        """
+        best = 0.0, 1.0
+        tries = [*TIMES, *([-t for t in TIMES] if signed else [])]
+        for _ in range(2):
+            for times in tries:
+                gain = gain_of(self.replicates, evaluation, signature, times)
+                if gain > best[0]:
+                    best = gain, times
+            if best[0] < PROMISING:
+                break
+            tries = [best[1] * x for x in NEAR if x != 1]
+        return best
+
+    def lines(self, evaluation: Evaluation) -> list[Line]:
+        """The spectral lines of the data under a model, by p-value."""
+        if self._lines is None or self._lines[0] is not evaluation:
+            self._lines = evaluation, spectral_lines(self.replicates, evaluation)
+        return self._lines[1]
+
+    def begun(self, evaluation: Evaluation, candidate: Candidate) -> list[dict[Key, Any]]:
+        """The values at which a candidate is tried first, SI; a periodic one at the frequencies of the lines."""
+        tries = self._told_apart(candidate, templates(candidate))
+        narrow = frequencies_of(candidate)
+        if len(narrow) != 1:
+            return tries
+        coordinate = narrow[0]
+        inside = [
+            line.frequency for line in self.lines(evaluation) if coordinate.low <= line.frequency <= coordinate.high
+        ]
+        default = float(Effect.registry.find(candidate.effect).parameters[coordinate.parameter].default)
+        strengths = [
+            {**tries[0], **{d.key: d.scaled(tries[0][d.key], x) for d in candidate.strengths}} for x in _SWINGS
+        ]
+        return [{**tried, coordinate.key: f} for f in inside or [default] for tried in strengths]
+
+    def _told_apart(self, candidate: Candidate, tries: Sequence[Mapping[Key, Any]]) -> list[dict[Key, Any]]:
+        """The templates, one of each set that differs only in times far below a frame: the same without stamps."""
+        captures = [seen.capture for seen in self.replicates.seen.values()]
+        frames = [c.conditions.frame_time if c.modality == "qis" else 0.0 for c in captures]
+        least = _INSTANT * min(frames, default=0.0)
+        times = [d.key for d in candidate.shapes if d.unit == "s"]
+        kept = {tuple(max(t[k], least) if k in times else x for k, x in t.items()): dict(t) for t in tries}
+        return list(kept.values())
+
+    def looked_at(
+        self, evaluation: Evaluation, candidate: Candidate, tries: Sequence[Mapping[Key, Any]], only: Sequence[str] = ()
+    ) -> list[Trial]:
+        """The trials of a candidate at some values, each with its best strength.
+
+        Args:
+            only: the captures that are simulated; all where it is empty.
+        """
+        return self._looked_at(evaluation, [(candidate, dict(tried)) for tried in tries], only)
+
+    def _looked_at(
+        self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]], only: Sequence[str] = ()
+    ) -> list[Trial]:
+        out = []
+        still: list[Trial] = []
+        for candidate, tried in tries:
+            if candidate.phases:
+                continue
+            with self.if_possible(candidate, _LOOKING, wholly=False):
+                chips = candidate.kind == "add" and has_random_pixels(with_values(evaluation.sensors.one, tried))
+                sensors = evaluation.sensors.changed(tried, chips=chips)
+                still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
+        for one in self._simulated(evaluation, still, _SCAN, only):
+            one.seen = set(only or evaluation.made)
+            one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+            out.append(one)
+        for candidate, tried in tries:
+            if not candidate.phases:
+                continue
+            swing: Any = None
+            with self.if_possible(candidate, _LOOKING, wholly=False):
+                swing = simulate_phases(self.replicates, evaluation, candidate.phases, tried, FEW)
+            if swing is None or isinstance(swing, str):
+                if swing is not None:
+                    self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
+                continue
+            gain, times, found = swing.suited(self.replicates, evaluation)
+            phases = {(id, key): p for id, p in found.items() for key in candidate.phases}
+            gain -= 2 * len(phases)
+            one = Trial(candidate, tried, swing.at(found), gain, times, phases=phases, seen=set(evaluation.made))
+            for coordinate in frequencies_of(candidate):
+                f = float(tried[coordinate.key])
+                line = next((line for line in self.lines(evaluation) if line.frequency == f), None)
+                error = line.error if line else coordinate.high
+                one.intervals[coordinate.key] = (
+                    max(f - 1.96 * error, coordinate.low),
+                    min(f + 1.96 * error, coordinate.high),
+                )
+                one.chance = line.p if line else None
+            out.append(one)
+        return out
+
+    def _simulated(
+        self, evaluation: Evaluation, tried: Sequence[Trial], few: int, only: Sequence[str] = ()
+    ) -> list[Trial]:
+        """The trials with their signatures; those that cannot be simulated are left out and recorded.
+
+        A strength that may have either sign is simulated with both, for the linear and the quadratic part.
+        """
+        down: dict[int, Model] = {}
+        for i, one in enumerate(tried):
+            with self.if_possible(one.candidate, _LOOKING, wholly=False):
+                if opposite := _opposite(evaluation, one):
+                    down[i] = opposite
+        models = [one.sensors for one in tried if one.sensors is not None]
+        made = signatures(self.replicates, evaluation, [*models, *down.values()], few, only, kept="sure")
+        downs = dict(zip(down, made[len(tried) :], strict=True))
+        out = []
+        for i, (one, up) in enumerate(zip(tried, made, strict=False)):
+            other = downs.get(i)
+            if isinstance(up, str) or isinstance(other, str):
+                said = up if isinstance(up, str) else str(other)
+                self.not_tried(one.candidate.kind, one.candidate.effect, one.candidate.parameter, _LOOKING, said)
+                continue
+            one.signature = up if other is None else odd_and_even(self.replicates, evaluation, up, other, few)
+            out.append(one)
+        return out
+
+    def scan(self, evaluation: Evaluation, everywhere: bool = False, known: Sequence[Trial] = ()) -> list[Trial]:
+        """The trials of every candidate at its templates, by gain.
+
+        Args:
+            everywhere: in all captures, not only in the most informative ones.
+            known: trials under an earlier model. Their signatures are used again where the data do not resemble them;
+                captures in which they were not simulated are added.
+        """
+        tries: list[tuple[Candidate, dict[Key, Any]]] = []
+        for candidate in self._beside(evaluation.sensors.one):
+            if candidate.phases and not self.lines(evaluation):
+                continue  # without a line nothing is periodic; and a phase for each capture would explain any totals
+            if candidate.strengths or candidate.fixed:
+                tries += [(candidate, tried) for tried in self.begun(evaluation, candidate)]
+        if not everywhere and self.only_rates(evaluation):
+            out = self._by_totals(evaluation, tries)
+        else:
+            some = [] if everywhere else self.telling(evaluation)
+            old = self._completed(
+                evaluation, self._still(evaluation, tries, [t for t in known if t.seen]), some or evaluation.made
+            )
+            tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
+            out = old + self._raised(evaluation, self._looked_at(evaluation, tries, some), some)
+            out += self._lowered(evaluation, out, some)
+            out += self._further(evaluation, out, some)
+        return sorted(out, key=lambda t: -t.gain)
+
+    def _by_totals(self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]]) -> list[Trial]:
+        """The trials by the closed forms of the totals, where nothing but totals fails; nothing is simulated."""
+        out = []
+        for candidate, tried in tries:
+            with self.if_possible(candidate, _LOOKING, wholly=False):
+                one = Trial(
+                    candidate,
+                    tried,
+                    signature_of_totals(self.replicates, evaluation, evaluation.sensors.changed(tried)),
+                    0.0,
+                    1.0,
+                )
+                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+                out.append(self._by_exact_totals(evaluation, one) if one.gain > PROMISING else one)
+        return out
+
+    def _by_exact_totals(self, evaluation: Evaluation, one: Trial) -> Trial:
+        """The trial at the strength whose totals fit best.
+
+        The totals are not proportional to a large strength. A gate of half the frame halves them, one of nothing
+        leaves nothing.
+        """
+        best = replace(one, gain=0.0, times=1.0)
+        for factors in ([*TIMES, *([-t for t in TIMES] if one.signed else [])], NEAR):
+            start = best
+            for factor in factors:
+                values = replace(start, times=factor).scaled()
+                with contextlib.suppress(SpadError):
+                    signature = signature_of_totals(self.replicates, evaluation, evaluation.sensors.changed(values))
+                    gain = gain_of(self.replicates, evaluation, signature)
+                    if gain > best.gain:
+                        best = replace(start, values=values, signature=signature, gain=gain)
+        return best
+
+    def _raised(self, evaluation: Evaluation, tried: list[Trial], some: Sequence[str]) -> list[Trial]:
+        """The trials, with stronger ones for those without a signature."""
+        faint = [
+            t for t in tried if not t.signature.nothing and size_of(self.replicates, evaluation, t.signature) < _SILENT
+        ]
+        silent = [(t.candidate, up) for t in faint if (up := stronger(t))]
+        found = self._looked_at(evaluation, silent, some) if silent else []
+        raised = {(one.candidate.name, shape_of(one)) for one in found}
+        # a faint one that the data resemble stays
+        again = [t for t in faint if t.gain < COST_OF_A_NUMBER and (t.candidate.name, shape_of(t)) in raised]
+        return [t for t in tried if not any(t is one for one in again)] + found
+
+    def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
+        """Weaker trials for those whose large signature says little of a smaller one."""
+        loud = self._onward(
+            evaluation, tried, some, weaker, lambda t: size_of(self.replicates, evaluation, t.signature) > _LOUD
+        )
+        return [t for t in loud if size_of(self.replicates, evaluation, t.signature) > _SILENT]
+
+    def _further(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
+        """Stronger trials for edges with a gain at a larger strength; a blur is not proportional to it."""
+        return self._onward(evaluation, tried, some, further, lambda t: t.gain > PROMISING and t.times > 1)
+
+    def _onward(
+        self,
+        evaluation: Evaluation,
+        tried: Sequence[Trial],
+        some: Sequence[str],
+        step: Callable[[Trial], dict[Key, Any] | None],
+        wanted: Callable[[Trial], bool],
+    ) -> list[Trial]:
+        """The trials one step on from those that are wanted, and from the new ones while they are."""
+        out: list[Trial] = []
+        here = [t for t in tried if wanted(t)]
+        for _ in range(_STEPS):
+            on = [(t.candidate, to) for t in here if (to := step(t)) and not _among(tried, t.candidate, to)]
+            found = self._looked_at(evaluation, on, some) if on else []
+            out += found
+            here = [t for t in found if wanted(t)]
+        return out
+
+    def _still(
+        self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]], known: Sequence[Trial]
+    ) -> list[Trial]:
+        """The known trials that are still candidates and that the data do not resemble, at their best strength."""
+        out, promising = [], set()
+        for one in known:
+            if one.candidate.phases or not any(is_same(one, *t) for t in tries):
+                continue
+            now = replace(one)
+            now.gain, now.times = self.line_search(evaluation, one.signature, one.signed)
+            out.append(now)
+            if now.gain >= PROMISING / 4:
+                promising.add((now.candidate.name, shape_of(now)))
+        return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
+
+    def _completed(self, evaluation: Evaluation, known: Sequence[Trial], wanted: Collection[str]) -> list[Trial]:
+        """The trials with their signatures completed in captures in which they were not simulated."""
+        out = [one for one in known if set(wanted) <= one.seen]
+        groups: dict[frozenset[str], list[Trial]] = {}
+        for one in known:
+            if set(wanted) <= one.seen:
+                continue
+            with contextlib.suppress(SpadError):  # what cannot be set in this model any more is tried anew
+                sensors = evaluation.sensors.changed(one.values, chips=one.chips)
+                groups.setdefault(frozenset(set(wanted) - one.seen), []).append(replace(one, sensors=sensors))
+        for missing, some in groups.items():
+            earlier = {id(one): one.signature for one in some}
+            for one in self._simulated(evaluation, some, _SCAN, sorted(missing)):
+                one.signature = earlier[id(one)].beside(one.signature, missing)
+                one.seen = one.seen | missing
+                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+                out.append(one)
+        return out
+
+    def only_rates(self, evaluation: Evaluation) -> bool:
+        """Whether only totals fail; with a line in the spectra, it may be what moves those of short captures."""
+        failed = failing(block_checks(self.replicates, evaluation, evaluation.residuals))
+        return bool(failed) and all(b.cell[0] == "" for b in failed) and not self.lines(evaluation)
+
+    def telling(self, evaluation: Evaluation) -> list[str]:
+        """Up to three captures that are most informative: a dark one, and those with the smallest p-values."""
+        worst = dict.fromkeys(evaluation.made, 0.0)
+        for block in block_checks(self.replicates, evaluation, evaluation.residuals):
+            if block.cell[0] in worst:  # a p-value above 1 % says little, but more than nothing
+                surprise = -math.log10(max(block.p, LEAST_P))
+                worst[block.cell[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
+        ids = sorted(worst, key=lambda id: -worst[id])
+        dark = [id for id in ids if self.replicates.seen[id].capture.light.dark][:1]
+        return list(dict.fromkeys([*ids[: 3 - len(dark)], *dark]))
+
+    def again(
+        self, evaluation: Evaluation, values: dict[Key, Any], tried: list[Trial], faint: bool = False
+    ) -> list[Trial]:
+        """The best trials at their best strength, on all captures, with the trials of maps.
+
+        Args:
+            values: the values of the model, SI.
+            tried: the trials of the scan.
+            faint: no check fails. Then the squares of all cells are more noise than effect, and the gain is the
+                square of the score.
+        """
+        best: list[Trial] = []
+        if faint:
+            tried = sorted((self._marked(evaluation, t) for t in tried), key=lambda t: -t.gain)
+        for one in tried:
+            if one.gain > 9 and all(b.candidate.name != one.candidate.name for b in best):
+                # of those with nearly the largest gain, the one simulated nearest to its best strength
+                alike = [t for t in tried if t.candidate.name == one.candidate.name and t.gain > _NEARLY * one.gain]
+                best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
+            if len(best) == _SECOND:
+                break
+        out: list[Trial] = []
+        kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
+        for one in best:
+            if one.phases:
+                continue
+            # noise hides the shape of a faint signature: it is simulated stronger, unless it is an edge
+            size = size_of(self.replicates, evaluation, one.signature)
+            edge = any(map(is_edge, one.candidate.strengths))
+            least = 0.0 if edge else min(STRONG / max(size, 1e-9), _BOLDER if faint else 1.0)
+            one.times = math.copysign(max(abs(one.times), least), one.times)
+            # an edge does not move in proportion: where it was simulated may be nearer to the best than where
+            # proportion leads
+            as_it_was = [replace(one, times=1.0)] if edge and abs(math.log(abs(one.times))) > _FAR_OFF else []
+            for start in [one, *as_it_was]:
+                with self.if_possible(one.candidate, _AGAIN):
+                    given = start.scaled()
+                    sensors = evaluation.sensors.changed(given, one.phases, one.chips)
+                    out.append(replace(start, values=given, gain=size, sensors=sensors))
+        # random odd pixels are a map as well, even where the map by itself would not be significant
+        least = LEAST_P_WITH_ODD_PIXELS if any(one.chips for one in best) else LEAST_P_OF_MAP
+        for one in self._simulated(evaluation, [*out, *map_trials_of(self, evaluation, values, least)], FEW):
+            if one.maps is None:
+                before, x, size = one.gain, abs(one.times), size_of(self.replicates, evaluation, one.signature)
+                if (
+                    min(size, before) > 5
+                    and not 0.7 < x < 1.4
+                    and one.candidate.kind == "add"
+                    and not one.signature.even
+                ):
+                    # linear or quadratic: noise hides any other power of a faint signature
+                    one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
+                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+                if one.chips and one.gain > PROMISING:
+                    gain: float | None = None
+                    with self.if_possible(one.candidate, _AGAIN):
+                        gain = gain_by_own_scatter(self, evaluation, one)
+                    if gain is None:
+                        continue
+                    one.fell, one.gain = one.gain, gain
+            else:
+                one.gain = square(evaluation.residuals) - square(
+                    residuals_at(self.replicates, evaluation, one.signature)
+                )
+                # the squares hardly show small differences of many pixels; those of edges they do
+                if one.chance is not None and not one.candidate.blinds:
+                    one.gain = max(one.gain, sigmas_of(one.chance) ** 2)
+            kept.append(self._marked(evaluation, one) if faint else one)
+        found: dict[int | str, Trial] = {}
+        for one in sorted(kept, key=lambda t: -t.gain):
+            found.setdefault(id(one) if one.maps else one.candidate.name, one)
+        return list(found.values())
+
+    def _marked(self, evaluation: Evaluation, one: Trial) -> Trial:
+        """The trial with the square of its score as gain."""
+        if one.chance is not None:
+            return replace(one, gain=sigmas_of(one.chance) ** 2)
+        significance, found, times = best_direction(self.replicates, evaluation, one)
+        suits = times * found.data / found.size if significance > 0 else one.times
+        return replace(one, gain=significance**2, times=one.times if one.gain > 0 and one.times * suits > 0 else suits)
+
+
+def _among(tried: Sequence[Trial], candidate: Candidate, values: Mapping[Key, Any]) -> bool:
+    """Whether a candidate has been tried at these values."""
+    return any(t.candidate.name == candidate.name and t.values == values for t in tried)
+
+
+def _opposite(evaluation: Evaluation, one: Trial) -> Model | None:
+    """The model with the opposite strength; None where there is none."""
+    if one.maps is not None or one.candidate.kind != "add":
+        return None
+    turned = {
+        d.key: d.scaled(float(one.values[d.key]), -1.0)
+        for d in one.candidate.strengths
+        if d.low < 0 and d.key in one.values
+    }
+    if all(one.values[key] == x for key, x in turned.items()):
+        return None
+    return evaluation.sensors.changed({**one.values, **turned}, one.phases, one.chips)

@@ -1,0 +1,429 @@
+"""Score tests: the data's projection on the signature of a candidate, and its p-value.
+
+The p-value is that of a Student t, or of Hotelling's law for several directions. The smallest one over all candidates
+is corrected for the number of trials on the same replicates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..errors import SpadError
+from . import map_fits, pixel_maps
+from .candidates import Candidate
+from .coordinates import Key
+from .evaluation import Evaluation, stacked
+from .null_distribution import scores_of_powers
+from .replicates import FEW, TOTALS, Cell, Replicates
+from .signature import Signature, signatures, template_of
+from .spectral_lines import Line
+from .trial import Trial, shape_of
+
+LEAST_P = 1e-300  # a p-value is never 0
+# statistics of the pixels' counts: each by itself, and their distribution
+_MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")
+_EDGES = "early_intervals"  # the statistic of the differences between the pixels' dead times
+_BY_CHANCE = 0.25  # of the data's projection on a signature: as much may be the noise of a few replicates
+_LITTLE = 0.1  # factor on the strength at which the quadratic part is negligible
+_HELD = 0.9  # shrinkage: the weight of the correlation between directions of a candidate, from few replicates
+_SMALL, _FOLDS = 32, 4  # cells of a statistic whose covariance can be estimated, at most; folds of the replicates
+_LEAST_VARIANCE = 0.3  # of a cell
+# the scatter beyond which the cells of a signature are dependent; the least degrees of freedom then
+_TOGETHER, _FEWEST = 1.25, 3.0
+_EVENTS = 25.0  # events in a cell that is nearly normal
+# safety factor on the variance of independent squares; the ratio to it from which on values are dependent
+_SURER, _JOINED = 1.1, 1.6
+_Weigh = Callable[[np.ndarray], np.ndarray]  # template (cells,) -> weights (cells,)
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """A score test, in null standard deviations.
+
+    Attributes:
+        size: the expected score of the whole signature.
+        data: the score of the data.
+        own: (replicates,) the scores of the replicates.
+        spread: their standard deviation, relative to that of independent cells.
+        freedom: degrees of freedom of the t distribution of the score.
+    """
+
+    size: float
+    data: float
+    own: np.ndarray
+    spread: float
+    freedom: float
+
+
+def p_of_any(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    tried: Sequence[Trial],
+    values: dict[Key, Any],
+    lines: Sequence[Line],
+) -> float:
+    """The p-value of the best score of any candidate, maps and lines included, if the model is right.
+
+    Args:
+        tried: the trials of the scan.
+        values: the values of the model, SI.
+        lines: the spectral lines of the data.
+    """
+    data, own = _p_values(replicates, evaluation, tried)
+    p = _trials_corrected(own, min(data, default=1.0))
+    levels = map_fits.light_levels_of(replicates, evaluation)
+    maps = [
+        p_of_map(replicates, evaluation, c, values, levels)
+        for c in replicates.candidates(evaluation.sensors.one)
+        if c.carrier
+    ]
+    swings = [line.p for line in lines]
+    return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
+
+
+def p_of_best(
+    replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial], best: Trial, large: bool = True
+) -> tuple[float, float]:
+    """(significance of the best trial in standard deviations, p-value with the trials factor of all candidates).
+
+    Args:
+        tried: all trials of the scan.
+        best: one of them.
+        large: the misfit is large, so that the gain may exceed what the linear signature gives.
+    """
+    if best.chance is not None:
+        others = sum(c.carrier is not None for c in replicates.candidates(evaluation.sensors.one)) if best.maps else 1
+        return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
+    directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
+    _, own = _p_values(replicates, evaluation, tried if directions else [best, *tried])
+    significance, found, _ = best_direction(replicates, evaluation, best)
+    if found.size <= 0:
+        return 0.0, 1.0
+    sides = max(len(best.candidate.strengths) if _sided(best) else 1, 1)
+    # no direction by itself may be significant, but all together
+    together = min((p for p, _ in _p_values_of_group(replicates, evaluation, directions)), default=1.0)
+    significance = max(significance, float(stats.t.isf(max(together, LEAST_P) / 2, found.freedom)))
+    if large:  # far from the model the signature is not linear: the gain itself, in the same units
+        significance = max(significance, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
+    one = float(_p_of_square(significance**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
+    return significance, max(_trials_corrected(own, min(one, together)), LEAST_P)
+
+
+def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: Trial) -> bool:
+    """Whether a fitted candidate moves the model along its own signature.
+
+    The projection of the move must lie between 0 and twice the data's score. The signature is that of the trial's
+    strength; at the fitted one, noise may exceed it.
+    """
+    if one.chance is not None or one.there is None:
+        return True
+    _, found, times = best_direction(replicates, evaluation, one)
+    keys, least = list(evaluation.residuals), 0.0
+    template, there = (
+        stacked(template_of(replicates, evaluation, signature), keys)
+        for signature in (one.signature.at(times), one.there)
+    )
+    if one.sensors is not None and not template @ there:
+        # so faint that each cell's shift may be noise and is left out; the projection of all shifts is significant
+        (whole,) = signatures(replicates, evaluation, [one.sensors], 2 * FEW, kept="all")
+        if not isinstance(whole, str):
+            there = stacked(template_of(replicates, evaluation, whole), keys)
+            least = _BY_CHANCE
+    fit = found.size * float(template @ there) / max(float(template @ template), 1e-300)
+    return abs(fit - found.data) < (1 - least) * abs(found.data)
+
+
+def _p_values(replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial]) -> tuple[list[float], np.ndarray]:
+    """(p-value of each candidate, (replicates,) the smallest p-value in each replicate).
+
+    The directions of one candidate are tested together. A candidate without a signature has none.
+    """
+    groups: dict[tuple[Any, ...], list[Trial]] = {}
+    for n, one in enumerate(tried):
+        groups.setdefault(_family(one) if _sided(one) else (n,), []).append(one)
+    data: list[float] = []
+    least = np.ones(len(evaluation.replicate_residuals[TOTALS]))
+    for group in groups.values():
+        for p, own in _p_values_of_group(replicates, evaluation, group):
+            data.append(p)
+            least = np.minimum(least, own)
+    return data, least
+
+
+def _p_values_of_group(
+    replicates: Replicates, evaluation: Evaluation, group: Sequence[Trial]
+) -> Iterator[tuple[float, np.ndarray]]:
+    """As `_p_values`, of a candidate or of all directions of one, for each strength with a signature of its own."""
+    for times in _strengths(group[0]) if group else ():
+        found = [score_test(replicates, evaluation, one.signature.at(times)) for one in group]
+        found = [x for x in found if x.size > 0]
+        if found:
+            yield _hotelling(found, _two_sided(group[0]))
+
+
+def _family(one: Trial) -> tuple[Any, ...]:
+    """What the directions of one candidate share: its name and its shapes."""
+    return one.candidate.name, shape_of(one)
+
+
+def _sided(one: Trial) -> bool:
+    """Whether it is one of several directions."""
+    return one.candidate.kind == "add" and one.signed and len(one.candidate.strengths) > 1
+
+
+def _two_sided(one: Trial) -> bool:
+    """Whether the signature of the opposite sign is the opposite one, so that the test is two-sided.
+
+    A signature with a quadratic part is not: each sign has a one-sided test of its own.
+    """
+    return one.signed and (one.signature.even is None or _sided(one))
+
+
+def _strengths(one: Trial) -> Sequence[float]:
+    """Factors on the strength at which the signature is another one.
+
+    With a quadratic part these are a small factor, and both signs.
+    """
+    if one.signature.even is None:
+        return (1.0,)
+    return (1.0, _LITTLE) if _two_sided(one) or not one.signed else (1.0, -1.0, _LITTLE, -_LITTLE)
+
+
+def best_direction(replicates: Replicates, evaluation: Evaluation, one: Trial) -> tuple[float, ScoreTest, float]:
+    """(significance, at least 0, score test, factor on the strength) where the score is largest."""
+    looks = [(score_test(replicates, evaluation, one.signature.at(x)), x) for x in _strengths(one)]
+    significances = [abs(found.data) if _two_sided(one) else max(found.data, 0.0) for found, _ in looks]
+    best = max(range(len(looks)), key=lambda k: (significances[k], looks[k][0].data))
+    return significances[best], *looks[best]
+
+
+def _hotelling(found: Sequence[ScoreTest], signed: bool) -> tuple[float, np.ndarray]:
+    """(p-value of the scores of several directions, (replicates,) those of the replicates), by Hotelling's test.
+
+    Args:
+        found: a score test for each direction.
+        signed: the test is two-sided.
+    """
+    own = np.stack([x.own for x in found], axis=1)
+    alike = own.T @ own / len(own)
+    alike = _HELD * alike + (1 - _HELD) * np.diag(np.diag(alike))
+    np.fill_diagonal(alike, np.maximum(np.diag(alike), 1.0))
+    all_ = np.vstack([[x.data for x in found], own])
+    square = np.einsum("ri,ij,rj->r", all_, np.linalg.inv(alike), all_)
+    p = _p_of_square(square, len(found), min(x.freedom for x in found))
+    if not signed:  # one-sided: a negative score is no evidence
+        p = np.where(all_[:, 0] > 0, p / 2, 1.0)
+    return float(p[0]), p[1:]
+
+
+def _p_of_square(square: np.ndarray | float, directions: int, freedom: float) -> np.ndarray:
+    """The p-value of a squared score by Hotelling's law; of the t distribution for one direction."""
+    second = max(freedom - directions + 1, 1.0)
+    return np.asarray(stats.f.sf(np.asarray(square) * second / (directions * freedom), directions, second))
+
+
+def _trials_corrected(own: np.ndarray, least: float) -> float:
+    """The p-value of the smallest of many p-values.
+
+    Args:
+        own: (replicates,) the smallest p-value in each replicate.
+        least: that in the data.
+    """
+    number = max(1 / max(float(own.mean()), 1e-6) - 1, 1.0)  # trials factor: the effective number of independent tests
+    return float(-np.expm1(number * np.log1p(-min(least, 1 - 1e-12))))
+
+
+def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> ScoreTest:
+    """The score (matched-filter) test of a signature: the data's projection on it, in null standard deviations.
+
+            z = sum_k v_k' P_k z_k / sd(sum_k v_k' P_k z*_k)
+
+    z_k, v_k: residuals and template of statistic k; z*: residuals of the replicates, cross-fitted in folds; P_k: the
+    inverse of the shrunk covariance (Schaefer and Strimmer 2005) for 2 to 32 cells, otherwise the identity. All 0
+    where there is no signature.
+    """
+    template = template_of(replicates, evaluation, signature)
+    keys = [k for k, t in template.items() if t.any()]
+    many = len(evaluation.replicate_residuals[TOTALS])
+    most = float(many - 1)
+    if not keys:
+        return ScoreTest(0.0, 0.0, np.zeros(many), 1.0, most)
+    own = np.zeros(many)
+    size = data = norm = fourth = wild = 0.0
+    for key in keys:
+        whole, *parts = _weightings(evaluation, key)
+        t, null = template[key], evaluation.nulls.get(key)
+        if null is not None and null.law == "exponential":
+            t = scores_of_powers(t)
+        w = whole(t)
+        for part, weigh in zip(_folds(many), parts, strict=True):
+            own[part] += evaluation.replicate_residuals[key][part] @ weigh(t)
+        size, data = size + float(t @ w), data + float(evaluation.residuals[key] @ w)
+        norm, fourth = norm + float(w @ w), fourth + float(np.sum(w**4))
+        wild += float(np.sum(w[~_nearly_normal(replicates, evaluation, key)] ** 4))
+    norm = math.sqrt(norm)
+    # many cells may scatter less together than independent ones; the score of a single one is not divided by a
+    # scatter that rare counts make small
+    cells = norm**4 / fourth
+    spread = max(float(own.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
+    # dependent cells may be far out together: the tails are those of few
+    few = 2 * norm**4 / max(wild, 1e-300) / spread**2
+    freedom = most if spread < _TOGETHER else min(max(few, _FEWEST), most)
+    return ScoreTest(size / norm / spread, data / norm / spread, own / norm / spread, spread, freedom)
+
+
+def _nearly_normal(replicates: Replicates, evaluation: Evaluation, key: Cell) -> np.ndarray:
+    """Which cells are counts of so many events that they are nearly normal, (cells,) bool."""
+    null = evaluation.nulls.get(key)
+    if null is None or null.law != "poisson":
+        return np.zeros(len(evaluation.residuals[key]), bool)
+    # the number of independent events is that of the bursts
+    return np.asarray(null.expected(replicates.seen[key[0]].total)[0] >= _EVENTS * max(null.factor, 1.0) ** 2)
+
+
+def _folds(recordings: int) -> list[slice]:
+    """The folds of the replicates; each is tested with the covariance of the others."""
+    return [slice(k, None, _FOLDS) for k in range(_FOLDS)]
+
+
+def _weightings(evaluation: Evaluation, key: Cell) -> list[_Weigh]:
+    """Functions template -> weights of a statistic's cells: by all replicates, and by those outside each fold."""
+    own = evaluation.replicate_residuals[key]
+    many, cells = own.shape
+    if key == TOTALS or not 1 < cells <= _SMALL:
+        return [lambda t: t] * (_FOLDS + 1)
+
+    def made() -> list[_Weigh]:
+        rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
+        return [_inverse_covariance(x) for x in [own, *rests]]
+
+    return evaluation.once(("weights", key), made)
+
+
+def _inverse_covariance(own: np.ndarray) -> _Weigh:
+    """A function template -> weights (cells,), by the inverse of the shrunk covariance.
+
+    Source: Schaefer and Strimmer, Stat. Appl. Genet. Mol. Biol. 4 (2005) 32, for correlations.
+
+    Args:
+        own: (replicates, cells) residuals.
+    """
+    together = own.T @ own / len(own)
+    alone = np.maximum(np.diag(together), _LEAST_VARIANCE)
+    alike = together / np.sqrt(np.outer(alone, alone))
+    np.fill_diagonal(alike, 0.0)
+    square, pairs = float(np.sum(alike**2)), len(alike) * (len(alike) - 1)
+    by_chance = (pairs - square) / len(own)
+    together *= min(max(0.0, 1 - by_chance / max(square, 1e-30)), 1 - 1 / len(own))
+    np.fill_diagonal(together, alone)
+    inverse = np.linalg.inv(together)
+    return lambda t: np.asarray(inverse @ t)
+
+
+def p_of_map(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    candidate: Candidate,
+    values: dict[Key, Any],
+    levels: dict[str, float],
+) -> float:
+    """The p-value of a map: the pixels (rows, columns) differ alike in all captures that could show it.
+
+    Args:
+        values: the values of the model, SI.
+        levels: light level by capture.
+    """
+    try:
+        information = map_fits.information(replicates, values, candidate, levels)
+    except (SpadError, np.linalg.LinAlgError):
+        return 1.0
+    if candidate.blinds:
+        return _p_of_blind_times(replicates, evaluation, candidate, values, information)
+    name = pixel_maps.CODES if candidate.per == "code" else _MAP
+    total_information = {id: float(x.sum()) for id, x in information.items()}
+    cells = [(id, name) for id in total_information if total_information[id] > 0 and (id, name) in evaluation.residuals]
+    if cells:
+        size = max(len(evaluation.residuals[cell]) for cell in cells)
+        cells = [cell for cell in cells if len(evaluation.residuals[cell]) == size]
+    if not cells:
+        return 1.0
+    weight = np.sqrt([total_information[id] for id, _ in cells])
+    weight /= math.sqrt(float(weight @ weight))
+    z = sum(w * evaluation.residuals[cell] for w, cell in zip(weight, cells, strict=True))
+    own = sum(w * evaluation.replicate_residuals[cell] for w, cell in zip(weight, cells, strict=True))
+    if candidate.per == "code":
+        parts = pixel_maps.code_periods(size)
+        return min(1.0, len(parts) * min(p_of_spread(z[part], own[:, part]) for part in parts.values()))
+    groups = pixel_maps.groups_of(evaluation.sensors.one, candidate.per)
+    count = np.sqrt(np.bincount(groups))
+    data = np.bincount(groups, z) / count
+    null_data = np.stack([np.bincount(groups, row) / count for row in own])
+    chance = p_of_spread(data, null_data)
+    if candidate.per != "pixel":
+        return chance
+    # with few detections in most pixels, the distribution of the counts is more sensitive than the score of each
+    best = max(total_information, key=lambda id: total_information[id])
+    laws = [(best, name) for name in _LAWS if (best, name) in evaluation.residuals]
+    others = [evaluation.nulls[cell].chance(evaluation.residuals[cell])[0] for cell in laws]
+    return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
+
+
+def _p_of_blind_times(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    candidate: Candidate,
+    values: dict[Key, Any],
+    information: dict[str, np.ndarray],
+) -> float:
+    """The p-value of pixels with unlike dead times, the larger of two tests.
+
+    Jitter may explain the scatter of the shortest intervals, afterpulses of some pixels the pairs of short intervals
+    in one pixel; neither explains both.
+
+    Args:
+        information: (pixels,) by capture.
+    """
+    cells = [(id, _EDGES) for id, x in information.items() if x.any() and (id, _EDGES) in evaluation.residuals]
+    if not cells:
+        return 1.0
+    try:
+        width = map_fits.fit_blind_times(replicates, values, candidate).width
+    except SpadError:
+        return 1.0
+    assert width is not None
+    by_edges = float(stats.chi2.sf(width.gain, 1)) / 2 if width.low > 0 else 1.0
+    z = np.concatenate([evaluation.residuals[cell] for cell in cells])
+    by_pairs = min(1.0, z.size * float(stats.norm.sf(float(z.max()))))
+    return max(by_edges, by_pairs)
+
+
+def p_of_spread(data: np.ndarray, null: np.ndarray) -> float:
+    """The p-value of values that differ more than those of the replicates.
+
+    Args:
+        data: (values,).
+        null: (replicates, values).
+    """
+    square, squares = float(np.mean(data**2)), np.mean(null**2, axis=1)
+    mean, variance = float(squares.mean()), float(squares.var(ddof=1))
+    apart = 2 * mean**2 / data.size  # variance of the mean square of independent values
+    # a few replicates give a poor variance: where they do not contradict it, that of independent values holds
+    variance = _SURER * apart if variance < _JOINED * apart else variance * (1 + math.sqrt(5 / len(squares)))
+    shape = mean**2 / max(variance, 1e-12)
+    p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
+    wide = max(1.0, float(np.sqrt(mean)))
+    p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
+    return min(1.0, 2 * min(p_sum, p_cell))
+
+    # --- significance -----------------------------------------------------------------------------------------------
+
+
+def sigmas_of(chance: float) -> float:
+    """The two-sided p-value in standard deviations."""
+    return float(stats.norm.isf(max(chance, LEAST_P) / 2))

@@ -1,0 +1,284 @@
+"""Set-up candidates: the laboratory, not the sensor, differs from what is stated.
+
+Only the totals of the captures inform them: a light level beyond its uncertainty, another wavelength or exposure, a
+light leak in a dark capture. The simplest one that explains the totals is taken. A change of the sensor that explains
+them as simply is a rival.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from .. import twin
+from .candidates import templates
+from .evaluation import Evaluation, square
+from .levels import COST_OF_A_NUMBER, FALSE_ALARM
+from .light_levels import totals_space
+from .replicates import TOTALS, Replicates
+from .results import plain
+from .scan import Scan
+from .signature import Signature, residuals_at, signature_of_totals, signatures
+from .trial import Trial
+
+ALIKE = 6.0  # in chi square: explanations nearer than that are a tie
+_VERIFIED = 3  # rivals that are simulated
+_MOST = 300.0  # of a logarithm: beyond any light
+_SILENT = 20.0  # detections missing at the end of a capture that stopped early
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A factor of the set-up on the levels of some captures, relative to what is stated.
+
+    Attributes:
+        quantity: "light", "dark" or "exposure".
+    """
+
+    quantity: str
+    captures: tuple[str, ...]
+    whole: bool  # one statement about all these captures
+
+
+@dataclass(frozen=True)
+class SetupExplanation:
+    """Factors that explain the totals.
+
+    Attributes:
+        logs, errors: (factors,) estimates of their logarithms, standard deviations.
+        left: (captures,) residuals of the totals.
+    """
+
+    factors: tuple[Factor, ...]
+    logs: np.ndarray
+    errors: np.ndarray
+    left: np.ndarray
+
+    @property
+    def p(self) -> float:
+        """The p-value of the residuals."""
+        freedom = len(self.left) - len(self.factors)
+        return float(stats.chi2.sf(float(self.left @ self.left), freedom)) if freedom > 0 else 1.0
+
+    @property
+    def cost(self) -> float:
+        """The sum of squares of the residuals, plus the cost of the factors, in chi square."""
+        return float(self.left @ self.left) + COST_OF_A_NUMBER * len(self.factors)
+
+    @property
+    def explains(self) -> bool:
+        return self.p > FALSE_ALARM and bool(np.all(np.abs(self.left) < 4))
+
+
+def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupExplanation]:
+    """Every explanation of the totals by the set-up alone, by cost."""
+    ids, _, root, _ = totals_space(replicates, evaluation)
+    if not ids:
+        return []
+    z = evaluation.residuals[TOTALS]
+    captures = {i: replicates.seen[i].capture for i in ids}
+    lit = [i for i in ids if not captures[i].light.dark]
+    single = [Factor("dark" if captures[i].light.dark else "light", (i,), False) for i in ids]
+    shared = [Factor("light", tuple(lit), True)] if len(lit) > 1 else []
+    waves = sorted({captures[i].light.wavelength or 0.0 for i in lit})
+    for wave in waves if len(waves) > 1 else []:
+        shared.append(Factor("light", tuple(i for i in lit if captures[i].light.wavelength == wave), True))
+    clocks = sorted({captures[i].conditions.frame_time for i in ids if captures[i].modality != "tr"})
+    for clock in clocks if len(clocks) > 1 else []:
+        shared.append(Factor("exposure", tuple(i for i in ids if captures[i].conditions.frame_time == clock), True))
+    shared = [factor for factor in shared if len(factor.captures) > 1]
+    tries: list[tuple[Factor, ...]] = [(one,) for one in [*shared, *single]]
+    tries += [pair for pair in itertools.combinations([*shared, *single], 2) if not _overlap(pair)]
+    if lit:  # any light level in each of them
+        tries.append(tuple(f for f in single if f.quantity == "light"))
+    found = []
+    for factors in dict.fromkeys(tries):
+        columns = np.array([[float(i in f.captures) for f in factors] for i in ids])
+        design = root @ columns
+        if np.linalg.matrix_rank(design) < len(factors):
+            continue
+        covariance = np.linalg.inv(design.T @ design)
+        logs = covariance @ design.T @ z
+        found.append(SetupExplanation(factors, logs, np.sqrt(np.diag(covariance)), z - design @ logs))
+    return sorted((e for e in found if e.explains), key=lambda e: e.cost)
+
+
+def _overlap(pair: Sequence[Factor]) -> bool:
+    a, b = (set(f.captures) for f in pair)
+    return a <= b or b <= a
+
+
+def brightest(replicates: Replicates, one: SetupExplanation) -> str | None:
+    """The capture of a set-up explanation, if it is the brightest of several; else None.
+
+    A sensor with another response at the highest rates alone looks the same: a nonlinearity that no effect here has.
+    """
+    named = {id for factor in one.factors for id in factor.captures}
+    rates = {}
+    for id, seen in replicates.seen.items():
+        c = seen.capture.conditions
+        if not seen.capture.light.dark:  # frames may have gaps between them
+            rates[id] = seen.total / (c.exposure if seen.capture.modality == "tr" else c.frames * c.frame_time)
+    most = max(rates, key=lambda id: rates[id], default=None)
+    return most if named == {most} and len(rates) > 2 else None
+
+
+def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[SetupExplanation]) -> list[dict[str, Any]]:
+    """The entries of set-up explanations for the JSON data; those that are a tie are confused.
+
+    Args:
+        likely: the explanations within a tie, the best first.
+    """
+    out: list[dict[str, Any]] = []
+    seen: set[tuple[str | None, str]] = set()
+    for number, one in enumerate(likely):
+        for factor, log, error in zip(one.factors, one.logs, one.errors, strict=True):
+            value, low, high = (plain(math.exp(min(log + k * error, _MOST))) for k in (0.0, -1.96, 1.96))
+            for id in factor.captures:
+                names = _names(replicates, evaluation, factor, id, float(log), float(error))
+                for name in names:
+                    if (id, name) in seen:
+                        continue
+                    seen.add((id, name))
+                    factor_of = {"value": value, "low": low, "high": high}
+                    confused = len(likely) > 1 or len(names) > 1
+                    out.append({"capture": id, "quantity": name, "factor": factor_of, "confused": confused})
+        if number == 0 and one.cost < likely[-1].cost - ALIKE:
+            break
+    return out
+
+
+def _names(
+    replicates: Replicates, evaluation: Evaluation, factor: Factor, id: str, log: float, error: float
+) -> list[str]:
+    """The quantities that a factor on a capture's level may be.
+
+    It is the wavelength where another one fits, otherwise light or exposure.
+    """
+    capture = replicates.seen[id].capture
+    if factor.quantity != "light" or (factor.whole and len(factor.captures) > 1):
+        return [factor.quantity]
+    own = twin.photons_at(capture, evaluation.sensors.one.layout)
+    for wave in sorted({s.capture.light.wavelength or 0.0 for s in replicates.seen.values()} - {0.0}):
+        if wave == capture.light.wavelength or not own:
+            continue
+        other = replace(capture, light=replace(capture.light, wavelength=wave))
+        there = twin.photons_at(other, evaluation.sensors.one.layout)
+        if not there:
+            continue
+        sensor = evaluation.sensors.one
+        ratio = there * sensor.nominal_pdp(wave) / (own * sensor.nominal_pdp(capture.light.wavelength))
+        if abs(math.log(ratio) - log) < 3 * math.hypot(error, 0.01 + capture.light.relative_uncertainty):
+            return ["wavelength"]
+    return ["light", "exposure"]
+
+
+def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
+    """The trials of changes of the sensor that explain the totals as simply, by the effects' closed forms.
+
+    Args:
+        cost: of the best set-up explanation, in chi square.
+    """
+    replicates = scan.replicates
+    out: list[Trial] = []
+    freedom = len(evaluation.residuals[TOTALS])
+    for candidate in replicates.candidates(evaluation.sensors.one):
+        if not candidate.strengths or candidate.phases or candidate.carrier:
+            continue
+        # from each template: from the nearest one alone the fit may not converge
+        best: tuple[float, Trial] | None = None
+        for tried in templates(candidate):
+            with scan.if_possible(candidate, "explaining the totals", wholly=False):
+                sensors = evaluation.sensors.changed(tried)
+                one = Trial(candidate, tried, signature_of_totals(replicates, evaluation, sensors), 0.0, 1.0, sensors)
+                one.gain, one.times = scan.line_search(evaluation, one.signature, one.signed)
+                if one.gain < COST_OF_A_NUMBER:
+                    continue
+                one = _fitted(scan, evaluation, one)
+                left = one.residuals[TOTALS] if one.residuals else evaluation.residuals[TOTALS]
+                if best is None or float(left @ left) < best[0]:
+                    best = float(left @ left), one
+        if best is None:
+            continue
+        remains, fit = best
+        if remains + COST_OF_A_NUMBER < cost + ALIKE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
+            fit.gain = square(evaluation.residuals) - remains
+            out.append(fit)
+    out = sorted(out, key=lambda t: t.cost(evaluation))[:_VERIFIED]
+    models = [t.sensors for t in out if t.sensors is not None]
+    return [
+        t
+        for t, signature in zip(out, signatures(replicates, evaluation, models), strict=True)
+        if _fits(scan, evaluation, t, signature)
+    ]
+
+
+def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature | str) -> bool:
+    """Whether the other statistics agree with what explains the totals."""
+    if isinstance(signature, str):
+        return False
+    residuals = residuals_at(scan.replicates, evaluation, signature)
+    others = {c: z for c, z in residuals.items() if c != TOTALS}
+    before = {c: z for c, z in evaluation.residuals.items() if c != TOTALS}
+    return square(others) - square(before) < COST_OF_A_NUMBER + ALIKE
+
+
+def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
+    """The trial with its strength fitted to the totals, by closed forms."""
+    coordinate, replicates = one.candidate.strengths[0], scan.replicates
+    given = one.scaled()
+
+    def at(x: float) -> tuple[Signature, np.ndarray]:
+        signature = signature_of_totals(
+            replicates, evaluation, evaluation.sensors.changed({**given, coordinate.key: x})
+        )
+        return signature, residuals_at(replicates, evaluation, signature)[TOTALS]
+
+    u = coordinate.coordinate(float(given[coordinate.key]))
+    ends = coordinate.ends
+    span = 0.05 if coordinate.log else 0.01 * (coordinate.high - coordinate.low)
+    covariance = 1.0
+    for _ in range(8):
+        signature, z = at(coordinate.value(u))
+        h = span if u + span <= ends[1] else -span
+        slope = (at(coordinate.value(u + h))[1] - z) / h
+        power = float(slope @ slope)
+        if power <= 0:
+            return one
+        covariance = 1 / power
+        step = float(np.clip(-float(slope @ z) / power, -1.0, 1.0))
+        u = min(max(u + step, ends[0]), ends[1])
+        if abs(step) < 1e-4:
+            break
+    signature, z = at(coordinate.value(u))
+    given[coordinate.key] = coordinate.value(u)
+    half = 1.96 * math.sqrt(covariance)
+    residuals = {**evaluation.residuals, TOTALS: z}
+    return Trial(
+        one.candidate,
+        given,
+        signature,
+        one.gain,
+        1.0,
+        evaluation.sensors.changed(given),
+        residuals=residuals,
+        intervals={coordinate.key: coordinate.interval(u - half, u + half)},
+    )
+
+
+def stopped_early(replicates: Replicates) -> dict[str, tuple[float, float]]:
+    """The captures that stopped early, by their last detection: (share that was exposed, its standard deviation)."""
+    out = {}
+    for id, seen in replicates.seen.items():
+        if seen.last is None or seen.total < 2:
+            continue
+        share = seen.last * (1 + 1 / seen.total) / seen.capture.conditions.exposure
+        if seen.total * (1 - share) / max(share, 1e-9) > _SILENT:
+            out[id] = share, share / seen.total
+    return out

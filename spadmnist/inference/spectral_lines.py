@@ -1,0 +1,202 @@
+"""Spectral lines: frequencies at which the data have more power than the model, with standard errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, special, stats
+
+from .evaluation import Evaluation
+from .null_distribution import Null
+from .replicates import TOTALS, Replicates
+
+_CLEAR = 1e-3  # p-value of a line, with the trials factor of all frequencies
+_MOST = 2  # the largest number of lines
+_APART = 2.5  # bins of the shortest capture: the least distance of two lines
+# bins to each side that are averaged; standard deviations beyond which the model has a line of its own
+_BESIDE, _OWN = 12, 3.0
+# bins to each side that a line leaks into; standard deviations beyond which the bins around are raised
+_NEXT, _RAISED = 2, 3.0
+_AROUND = [d for d in range(-_BESIDE, _BESIDE + 1) if abs(d) > _NEXT]  # bins of the average, relative to the bin
+_OTHERS = 2  # the largest neighbouring bins, which may be another line, are left out
+_WITHIN, _PLACES = 1.2, 481  # bins to both sides within which the frequency is fitted; grid points
+_STRENGTHS = np.linspace(0.7, 1.1, 17)  # factors on the amplitude in the data, a part of which is noise
+# the least number of periods in the longest capture; with fewer it is a drift, whose powers are those of a line near
+# 0
+_SWINGS = 1.5
+_SIGN = 2.0  # standard deviations of a bin that informs the frequency
+
+
+@dataclass(frozen=True)
+class Line:
+    """A spectral line.
+
+    Attributes:
+        frequency, error: Hz, with its standard deviation.
+        log_p: log p-value, with the trials factor of all frequencies.
+    """
+
+    frequency: float
+    error: float
+    log_p: float
+
+    @property
+    def p(self) -> float:
+        return math.exp(max(self.log_p, -690.0))
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """The spectrum of one capture.
+
+    Attributes:
+        power: (bins,) in the statistic's unit; z: (bins,) residuals.
+        surprise: (bins,) -log p.
+        step: Hz from bin to bin; the first bin is at `step`.
+        dark: the capture has no light.
+    """
+
+    power: np.ndarray
+    z: np.ndarray
+    surprise: np.ndarray
+    step: float
+    dark: bool
+
+    def bins(self, frequency: np.ndarray) -> np.ndarray:
+        """The bin of each frequency, -1 where there is none."""
+        k = np.rint(frequency / self.step).astype(np.int64) - 1
+        return np.where((k >= 0) & (k < self.z.size), k, -1)
+
+
+def spectral_lines(replicates: Replicates, evaluation: Evaluation) -> list[Line]:
+    """The spectral lines of the data under a model, by p-value.
+
+    The bins at a frequency are combined by the product of their p-values (Fisher's method), because a periodic lamp
+    is periodic in every capture.
+    """
+    spectra = []
+    for (id, name), z in evaluation.residuals.items():
+        if (id, name) == TOTALS or evaluation.nulls[id, name].law != "exponential":
+            continue
+        summary = replicates.seen[id].summaries[name]
+        if summary.axis is None or len(z) < 3:
+            continue
+        step = float(summary.axis[1] - summary.axis[0])
+        surprise = _surprise(
+            evaluation.nulls[id, name], np.asarray(summary.values, float), z, replicates.seen[id].total
+        )
+        dark = replicates.seen[id].capture.light.dark
+        spectra.append(_Spectrum(np.asarray(summary.values, float), z, surprise, step, dark))
+    groups = [[s] for s in spectra]
+    lit = [s for s in spectra if not s.dark]
+    if len(lit) > 1:
+        groups.insert(0, lit)
+    found: list[Line] = []
+    for group in groups:
+        found += _in(group, len(groups))
+    kept: list[Line] = []
+    for line in sorted(found, key=lambda one: one.log_p):
+        apart = _APART * max(s.step for s in spectra)
+        if all(abs(line.frequency - other.frequency) > apart for other in kept):
+            kept.append(line)
+    return kept[:_MOST]
+
+
+def _surprise(null: Null, power: np.ndarray, z: np.ndarray, total: float) -> np.ndarray:
+    """-log p of each bin, (bins,).
+
+    The mean of the model's replicates in a bin is replaced by that of its neighbours, unless the model has a line
+    there. Where the data are raised all around, a line must exceed that level: a lamp that fluctuates has no line.
+    """
+    expected, _ = null.expected(total)
+    smooth = ndimage.uniform_filter1d(expected, 2 * _BESIDE + 1, mode="nearest")
+    own = expected > smooth * (1 + _OWN / math.sqrt(null.recordings))
+    many = null.recordings * 2 * _BESIDE
+    ratio = power / np.maximum(smooth, 1e-30)
+    level, sure = _around(ratio)
+    raised = level > 1 + _RAISED / np.sqrt(sure)
+    alone = np.where(own, -stats.norm.logsf(z), many * np.log1p(ratio / many))
+    beyond = power / np.maximum(np.where(own, expected, smooth), 1e-30) / np.maximum(level, 1.0)
+    return np.where(raised, sure * np.log1p(beyond / sure), alone)
+
+
+def _around(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(mean of the bins on both sides of each bin without the largest ones, number of bins in it), (bins,) each.
+
+    Of n exponential values the i-th smallest has the mean 1/n + 1/(n - 1) + ... of i terms.
+    """
+    padded = np.pad(ratio, _BESIDE, constant_values=np.nan)
+    around = np.sort([padded[_BESIDE + d : _BESIDE + d + ratio.size] for d in _AROUND], axis=0)  # nan are sorted last
+    number = np.sum(np.isfinite(around), axis=0)
+    kept = np.maximum(number - _OTHERS, 1)
+    ratios = np.ones(len(_AROUND) + 1)
+    for n in range(_OTHERS + 1, ratios.size):
+        ratios[n] = np.cumsum(1 / np.arange(n, _OTHERS, -1.0)).mean()
+    total = np.nansum(np.where(np.arange(len(_AROUND))[:, None] < kept, around, 0.0), axis=0)
+    return total / kept / ratios[number], kept
+
+
+def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
+    """The lines of some spectra together.
+
+    Args:
+        groups: the number of such groups, for the trials factor.
+    """
+    step = min(s.step for s in group)
+    grid = step * np.arange(1, max(round(s.z.size * s.step / step) for s in group) + 1)
+    total, number = np.zeros(grid.size), np.zeros(grid.size)
+    for s in group:
+        bins = s.bins(grid)
+        total += np.where(bins >= 0, s.surprise[bins], 0.0)
+        number += bins >= 0
+    tail = stats.gamma.logsf(total, np.maximum(number, 1.0))
+    # beyond the range of a double, by the asymptotic exponential tail
+    log_p = np.where(np.isfinite(tail), tail, -total) + math.log(grid.size * groups)
+    out: list[Line] = []
+    for k in np.argsort(log_p)[: 2 * _MOST]:
+        if log_p[k] > math.log(_CLEAR):
+            break
+        line = _line(group, float(grid[k]), float(log_p[k]))
+        if line.frequency >= _SWINGS * step:
+            out.append(line)
+    return out
+
+
+def _line(group: Sequence[_Spectrum], about: float, log_p: float) -> Line:
+    """The line at a frequency, fitted by the likelihood of the powers about it in all spectra that show it."""
+    step = min(s.step for s in group)
+    grid = about + step * np.linspace(-_WITHIN, _WITHIN, _PLACES)
+    grid = grid[grid > 0]
+    total, shown = np.zeros(grid.size), False
+    for s in group:
+        cell = int(s.bins(np.array([about]))[0])
+        if cell >= 0 and s.z[cell] >= _SIGN:
+            total, shown = total + _likelihood(s.power, cell, grid / s.step), True
+    if not shown:
+        return Line(about, step, log_p)
+    weights = np.exp(total - total.max())
+    mean = float(np.average(grid, weights=weights))
+    return Line(mean, float(np.sqrt(np.average((grid - mean) ** 2, weights=weights))), log_p)
+
+
+def _likelihood(power: np.ndarray, cell: int, places: np.ndarray) -> np.ndarray:
+    """The log-likelihood of the powers about a bin, (places,), for the best line at each place.
+
+    A line leaks into the neighbouring bins with the amplitude sin(pi x) / (pi x) of its distance x. Noise has a mean
+    power of 1; a power to which a line adds S is distributed as exp(-P - S) I0(2 sqrt(P S)) (Rice, Bell Syst. Tech.
+    J. 24 (1945) 46).
+    """
+    cells = np.arange(max(cell - _NEXT, 0), min(cell + _NEXT + 1, power.size))
+    seen = np.sqrt(power[cells])
+    leak = np.abs(np.sinc(places[:, None] - (cells + 1)))
+    suits = (leak @ seen) / (leak**2).sum(axis=1)
+    best = np.full(places.size, -np.inf)
+    for factor in _STRENGTHS:
+        amplitude = factor * suits[:, None] * leak
+        x = 2 * seen * amplitude
+        value = (np.log(special.i0e(x)) + x - amplitude**2).sum(axis=1)
+        best = np.maximum(best, value)
+    return best

@@ -1,0 +1,175 @@
+"""A trial: a candidate at some values, its signature, and its gain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..effects import Effect
+from . import pixel_maps
+from .candidates import Candidate
+from .coordinates import Coordinate, Key, is_edge
+from .evaluation import Evaluation
+from .gauss_newton import Fit
+from .levels import COST_OF_A_NUMBER
+from .replicates import TOTALS, Cell, Model
+from .signature import Signature
+
+Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
+_RAISED = 12.0  # the factor on a strength without a signature for another trial
+# in chi square, constant and per root of the gain: two candidates nearer than that are a tie, because a few
+# replicates blur the difference
+_ALIKE, _BLURRED = 8.0, 0.3
+
+
+@dataclass
+class Trial:
+    """A candidate at some values, with its signature and its gain.
+
+    Attributes:
+        values: by (effect, parameter), SI.
+        gain: in chi square.
+        times: the factor on the strength of `values` at which the gain is largest.
+        fell: the fall of the squares, where the gain is another measure.
+        phases: fitted to each capture.
+        intervals: 95 % intervals of coordinates that `fit` does not hold.
+    """
+
+    candidate: Candidate
+    values: dict[Key, Any]
+    signature: Signature
+    gain: float
+    times: float
+    sensors: Model | None = None
+    fell: float = 0.0
+    power: float = 1.0  # the signature grows with this power of the strength
+    chance: float | None = None  # p-value, where a test of its own gives it
+    fit: Fit | None = None
+    maps: dict[Key, pixel_maps.PixelMap] | None = None
+    residuals: dict[Cell, np.ndarray] | None = None
+    evaluation: Evaluation | None = None  # of this model, where it was needed
+    phases: Phases = field(default_factory=dict)
+    chips: bool = False  # the pixels that it affects are random
+    faint: bool = False  # fitted by the signature of a stronger one
+    more: tuple[Candidate, ...] = ()  # maps that only make sense together
+    intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    seen: set[str] = field(default_factory=set)  # captures in which it was simulated
+    there: Signature | None = None  # the signature at the fitted values
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        return [self.candidate, *self.more]
+
+    @property
+    def fluctuates(self) -> bool:
+        """Whether its effect differs from replicate to replicate."""
+        return self.maps is None and not self.chips and (self.there or self.signature).fluctuates
+
+    @property
+    def scatters(self) -> bool:
+        """Whether its replicates scatter unlike the model's own, so that squares of residuals do not judge it."""
+        return self.chips or self.fluctuates
+
+    def cost(self, evaluation: Evaluation) -> float:
+        """The squares that it leaves in the totals, plus the cost of a free parameter."""
+        left = (self.residuals or evaluation.residuals)[TOTALS]
+        return float(left @ left) + COST_OF_A_NUMBER
+
+    @property
+    def signed(self) -> bool:
+        """Whether its strength may have either sign."""
+        return any(d.low < 0 or self.candidate.kind == "set" for d in self.candidate.strengths)
+
+    def scaled(self) -> dict[Key, Any]:
+        """The values at the best strength, SI."""
+        out = dict(self.values)
+        factor = math.copysign(abs(self.times) ** (1 / self.power), self.times)
+        for coordinate in self.candidate.strengths:
+            if coordinate.key in out:
+                out[coordinate.key] = coordinate.scaled(float(out[coordinate.key]), factor)
+        # components of one vector: the others are fixed at first, and fitted later
+        if len(self.candidate.strengths) > 1:
+            out = {**dict(self.candidate.fixed), **out}
+        return out
+
+
+def is_same(one: Trial, candidate: Candidate, tried: Mapping[Key, Any]) -> bool:
+    """Whether a trial is of this candidate, at the same shapes as in `tried`."""
+    return one.candidate.name == candidate.name and all(
+        one.values.get(d.key) == tried.get(d.key) for d in candidate.shapes
+    )
+
+
+def shape_of(one: Trial) -> tuple[Any, ...]:
+    """The values of the shapes, in which the templates of a candidate differ."""
+    return tuple(one.values.get(coordinate.key) for coordinate in one.candidate.shapes)
+
+
+def weaker(one: Trial) -> dict[Key, Any] | None:
+    """The values of an added edge half way, in the logarithm, to the low end of its range; None for all else."""
+    return _half_way(one, False)
+
+
+def further(one: Trial) -> dict[Key, Any] | None:
+    """As `weaker`, towards the high end of the range."""
+    return _half_way(one, True)
+
+
+def _half_way(one: Trial, up: bool) -> dict[Key, Any] | None:
+    if one.candidate.kind != "add" or len(one.candidate.strengths) != 1:
+        return None
+    coordinate = one.candidate.strengths[0]
+    value, end = float(one.values[coordinate.key]), coordinate.high if up else coordinate.low
+    if (
+        coordinate.off != 0
+        or not is_edge(coordinate)
+        or not coordinate.low > 0
+        or (value >= end if up else value <= end)
+    ):
+        return None
+    return {**one.values, coordinate.key: math.sqrt(end * value)}
+
+
+def stronger(one: Trial) -> dict[Key, Any] | None:
+    """The values of an added effect at several times its strength; None where it cannot be stronger."""
+    out = dict(one.values)
+    for coordinate in one.candidate.strengths:
+        if (
+            coordinate.key in out
+            and one.candidate.kind == "add"
+            and out[coordinate.key] != coordinate.off
+            and not coordinate.lacks
+        ):
+            out[coordinate.key] = coordinate.scaled(float(out[coordinate.key]), _RAISED)
+    return out if out != one.values else None
+
+
+def at_end(one: Trial) -> bool:
+    """Whether a shape is at an end of its range, so that its law is hardly the right one."""
+    shapes = {d: one.values.get(d.key) for d in one.candidate.shapes}
+    return any(
+        isinstance(x, (int, float)) and any(math.isclose(x, end, rel_tol=1e-6) for end in (d.low, d.high))
+        for d, x in shapes.items()
+    )
+
+
+def frequencies_of(candidate: Candidate) -> list[Coordinate]:
+    """The frequencies of a periodic candidate; one over the exposure is their resolution."""
+    return [d for d in candidate.shapes if d.unit == "Hz"] if candidate.phases else []
+
+
+def is_pattern(one: Trial) -> bool:
+    """Whether it is a pattern: rows, columns, or a shape of the light over the array."""
+    candidate = one.candidate
+    if candidate.kind != "add":
+        return False
+    return candidate.per in ("row", "column") or getattr(Effect.registry.find(candidate.effect), "stage", "") == "light"
+
+
+def tie(gain: float) -> float:
+    """The difference of gains, in chi square, within which two candidates are a tie."""
+    return _ALIKE + _BLURRED * math.sqrt(max(gain, 0.0))

@@ -1,0 +1,315 @@
+"""Fits of the coordinates of one trial, with its gain on captures that it is not fitted to."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..errors import SpadError
+from . import held_out
+from .coordinates import Coordinate, Key, is_edge, point_of, room_of
+from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square, stacked
+from .gauss_newton import Fit, covariance_of, gauss_newton
+from .phases import NEAR, choose_side, simulate_phases
+from .replicates import FEW, TOTALS, Replicates
+from .signature import captures_showing, residuals_at, signatures, size_of, template_of
+from .trial import Trial
+
+_ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
+# of the square of a signature, as a share and in variances: captures with so little are not simulated
+IGNORED = 0.01, 4.0
+STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
+_PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
+_FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
+_FAR, _MOVES = (0.6, 0.3, 0.15), 6  # the first distances of an edge, and how often they are repeated
+_POWERS = (0.85, 2.3)  # powers with which a signature may grow if it is simulated at another strength
+_LINE = 0.25  # of the square of a signature, in one cell of a spectrum: then it is a line
+_LEAST_BOOST = 1.5  # the least factor for which a stronger simulation is worth it
+_SWINGING = 6  # replicates for phases: a periodic model draws other random numbers
+_NEXT = 0.35, 0.1  # of a whole number's logarithm: the first step to its neighbours, and the shortest
+_EACH = 2.0  # in chi square, of a fitted parameter
+# in chi square: the least fall for another whole number; the rise beyond which one is excluded
+_BETTER, EXCLUDED = 2.0, 6.0
+
+
+def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds: int = 3) -> Trial:
+    """The trial with its coordinates fitted; its gain is that on captures that it is not fitted to.
+
+    Args:
+        rounds: see `gauss_newton`.
+    Raises:
+        SpadError: where it cannot be simulated.
+    """
+    if one.maps is not None or not one.candidate.coordinates:
+        one.residuals = residuals_at(replicates, evaluation, one.signature, noisy=True)
+        return one
+    if one.candidate.phases:
+        return _fit_phases(replicates, evaluation, one)
+    given = one.scaled()
+    coordinates = [d for d in one.candidate.coordinates if d.key in given and not d.whole]
+    boost, power = _boost(replicates, evaluation, one, given)
+    template = template_of(replicates, evaluation, one.signature.at(one.times))
+    some = captures_showing(template, *IGNORED)
+
+    def fit(values: Mapping[Key, Any], rounds: int = rounds) -> Fit | str:
+        return gauss_newton(
+            replicates,
+            evaluation,
+            coordinates,
+            values,
+            lambda v: evaluation.sensors.changed(v, one.phases, one.chips),
+            rounds,
+            stronger=(boost, power),
+            only=some,
+        )
+
+    found = fit(given)
+    if isinstance(found, str):
+        raise SpadError(found)
+    for coordinate in one.candidate.coordinates:
+        if coordinate.whole and coordinate.key in given:
+            found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
+            one.intervals |= intervals
+    if boost == 1 and _fails_own_checks(replicates, evaluation, one, found):
+        found = _probe(replicates, evaluation, one, found, some)
+    one.faint = boost > 1
+    one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
+    if not one.faint:  # the signature at the fitted values may differ from that of the trial
+        (there,) = signatures(replicates, evaluation, [one.sensors])
+        if isinstance(there, str):
+            raise SpadError(there)
+        one.there, residuals = there, residuals_at(replicates, evaluation, there)
+        found = replace(found, residuals=residuals, square=square(residuals))
+    one.fit, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
+    one.gain = square(evaluation.residuals) - found.square
+    if one.scatters:  # pixels, or replicates, may then scatter more: squares of residuals do not judge it
+        with contextlib.suppress(SpadError):  # what cannot be simulated in every capture keeps the fall of its squares
+            one.gain = log_likelihood_ratio(evaluation, evaluation_of(replicates, one), template, one.fluctuates)
+    one.gain -= _EACH * len(coordinates) if one.fluctuates else optimism(one)
+    return one
+
+
+def optimism(one: Trial) -> float:
+    """The optimism of a fitted trial, in chi square; 0 without a fit."""
+    if one.fit is None or one.residuals is None:
+        return 0.0
+    return held_out.optimism(one.residuals, one.fit) + 2.0 * len(one.phases)
+
+
+def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
+    """The evaluation of a trial's model, made once."""
+    if one.evaluation is None:
+        assert one.sensors is not None
+        one.evaluation = evaluate(replicates, {}, one.sensors)
+    return one.evaluation
+
+
+def _fails_own_checks(replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit) -> bool:
+    """Whether a check fails at the fitted values, of those with a signature."""
+    template = template_of(replicates, evaluation, one.signature.at(one.times))
+    failed = failing(block_checks(replicates, evaluation, found.residuals))
+    own = {TOTALS if block.cell[0] == "" else block.cell for block in failed}
+    return any(float(template[cell] @ template[cell]) > 1 for cell in own if cell in template)
+
+
+def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Mapping[Key, Any]) -> tuple[float, float]:
+    """(factor by which a faint effect is simulated stronger, power with which its signature grows).
+
+    (1, 1) where there is no such power: an edge moves, and a large effect saturates.
+    """
+    template = template_of(replicates, evaluation, one.signature.at(one.times))
+    size = math.sqrt(sum(float(t @ t) for t in template.values()))
+    strengths = [d for d in one.candidate.strengths if d.key in given]
+    spectra = [
+        t for cell, t in template.items() if cell in evaluation.nulls and evaluation.nulls[cell].law == "exponential"
+    ]
+    if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
+        return 1.0, 1.0  # a line is significant by itself, and no gradient leads to it
+    if size > STRONG or one.signature.even or not strengths or any(is_edge(d) for d in strengths):
+        return 1.0, 1.0
+    room = min(room_of(d, float(given[d.key])) for d in strengths)
+    boost = min((STRONG / max(size, 1e-3)) ** (1 / one.power), room)
+    if boost < _LEAST_BOOST:
+        return 1.0, 1.0
+    ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
+    models = [evaluation.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
+    templates = []
+    for signature in signatures(replicates, evaluation, models, 2 * FEW, kept="sure"):
+        if isinstance(signature, str):
+            return 1.0, 1.0
+        templates.append(stacked(template_of(replicates, evaluation, signature), list(evaluation.residuals)))
+    far, near = templates
+    projection = float(near @ far)  # the projection on the same signature, so that noise is not compared
+    power = 2 * math.log(float(far @ far) / projection) / math.log(boost) if projection > 0 else 0.0
+    return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
+
+
+def _probe(replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit, only: Collection[str]) -> Fit:
+    """The fit, improved by probes near by where no gradient leads: a line, an edge.
+
+    Args:
+        only: the captures that are simulated.
+    """
+    for coordinate in one.candidate.coordinates:
+        if coordinate not in found.coordinates or not coordinate.log:
+            continue
+        if coordinate in one.candidate.shapes:
+            found, _ = _nearest(replicates, evaluation, one, found, coordinate, _PROBES, only)
+        elif is_edge(coordinate):
+            for _ in range(_MOVES):  # an edge is not seen from afar: step by step, long ones first
+                found, better = _nearest(replicates, evaluation, one, found, coordinate, _FAR, only)
+                if not better:
+                    break
+            for probes in (_PROBES, _FINE):
+                found, _ = _nearest(replicates, evaluation, one, found, coordinate, probes, only)
+    return found
+
+
+def _nearest(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    one: Trial,
+    found: Fit,
+    coordinate: Coordinate,
+    probes: Sequence[float],
+    only: Collection[str],
+) -> tuple[Fit, bool]:
+    """(best of the probes on both sides of a coordinate, or the fit itself; whether it is a probe)."""
+    at, before = float(found.values[coordinate.key]), found
+    steps = [s * x for x in probes for s in (-1, 1)]
+    tries = [{**found.values, coordinate.key: coordinate.value(coordinate.coordinate(at) + x)} for x in steps]
+    models = [evaluation.sensors.changed(t, one.phases, one.chips) for t in tries]
+    best = found.square - 6
+    for tried, x, signature in zip(tries, steps, signatures(replicates, evaluation, models, FEW, only), strict=True):
+        if isinstance(signature, str):
+            continue
+        residuals = residuals_at(replicates, evaluation, signature)
+        if square(residuals) < best:
+            best = square(residuals)
+            found = replace(
+                found, point=point_of(found.coordinates, tried), residuals=residuals, square=best, values=tried
+            )
+            i = found.coordinates.index(coordinate)
+            # no derivative informed it, so that the distance of the probes bounds its error
+            found.covariance[i, i] = min(float(found.covariance[i, i]), (abs(x) / 2) ** 2)
+    return found, found is not before
+
+
+def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> Trial:
+    """The trial of a periodic candidate with its strength and its phase in each capture fitted.
+
+    It is simulated at a strength that noise does not hide; a smaller one follows from its signature.
+    """
+    coordinates = tuple(d for d in one.candidate.strengths if d.key in one.values)
+    size, given = size_of(replicates, evaluation, one.signature.at(one.times)), one.scaled()
+    room = min(room_of(d, float(given[d.key])) for d in coordinates)
+    stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
+    strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in coordinates}}
+    swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _SWINGING)
+    if isinstance(swing, str):
+        raise SpadError(swing)
+    gain, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
+    one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in coordinates}}
+    mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}
+    found = choose_side(replicates, evaluation, one.candidate.phases, one.values, found, mirrored)
+    signature = swing.at(found)
+    one.phases = {(id, key): p for id, p in found.items() for key in one.candidate.phases}
+    one.signature = signature.at(times)
+    one.times, one.faint = 1.0, True
+    one.residuals = residuals = residuals_at(replicates, evaluation, signature, times)
+    one.sensors = evaluation.sensors.changed(one.values, one.phases, one.chips)
+    aside = [residuals_at(replicates, evaluation, signature, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]
+    # of one strength, or of several that grow together
+    apart = [d.coordinate(d.scaled(float(one.values[d.key]), math.exp(2 * _ASIDE))) for d in coordinates]
+    now = point_of(coordinates, one.values)
+    jacobian = {
+        cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(coordinates)
+        for cell in residuals
+    }
+    own = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
+    covariance = covariance_of(np.concatenate(list(jacobian.values())), own)
+    one.fit = Fit(coordinates, now, covariance, residuals, jacobian, square(residuals), one.values)
+    one.gain = gain - optimism(one)
+    return one
+
+
+def _fit_whole_number(
+    found: Fit, coordinate: Coordinate, fit: Callable[[Mapping[Key, Any]], Fit | str]
+) -> tuple[Fit, dict[Key, tuple[float, float]]]:
+    """(best fit with a whole number, intervals by coordinate).
+
+    That of the whole number holds the values that the data do not exclude; those of the others hold for any of these.
+    No gradient leads from one whole number to the next: its neighbours are tried, ever nearer ones, with all else
+    fitted at each.
+    """
+    best = {float(found.values[coordinate.key]): found}
+    squares = {value: one.square for value, one in best.items()}
+    begun: dict[float, float] = {}  # the number from which each one was fitted last
+
+    def there(value: float, start: Fit) -> None:
+        begun[value] = float(start.values[coordinate.key])
+        one = fit({**start.values, coordinate.key: value})
+        if not isinstance(one, str) and one.square < squares.get(value, math.inf):
+            best[value], squares[value] = one, one.square
+        squares.setdefault(value, math.inf)
+
+    step = _NEXT[0]
+    while True:
+        here = float(found.values[coordinate.key])
+        near = {_beside(coordinate, here, x) for x in (-step, step)} - {here}
+        # a fit from afar may not have converged
+        last = step <= 2 * _NEXT[1]
+        for x in sorted(x for x in near if x not in squares or (last and begun.get(x) != here)):
+            there(x, found)
+        ahead = min(best.values(), key=lambda one: one.square)
+        if ahead.square < found.square - _BETTER:
+            found = ahead
+        elif step > _NEXT[1]:
+            step /= 2
+        else:
+            break
+    here = float(found.values[coordinate.key])
+    excluded = found.square + EXCLUDED * _variance_inflation(found)
+    for side in (-1, 1):  # on to the excluded numbers
+        step = _NEXT[0]
+        while all(side * (x - here) <= 0 or squares[x] <= excluded for x in squares):
+            far = max(best, key=lambda x, side=side: side * x)  # type: ignore[misc]
+            if (further := _beside(coordinate, far, side * step)) in squares:
+                break
+            there(further, best[far])
+            step *= 2
+    out = [x for x, square in squares.items() if square > excluded]
+    low = max((x + 1 for x in out if x < here), default=coordinate.low)
+    high = min((x - 1 for x in out if x > here), default=coordinate.high)
+    ends = {coordinate.key: (low, high)}
+    for i, other in enumerate(found.coordinates):
+        intervals = [
+            one.interval(i)[1:] for x, one in best.items() if low <= x <= high and one.coordinates == found.coordinates
+        ]
+        if len(intervals) > 1:
+            ends[other.key] = min(a for a, _ in intervals), max(b for _, b in intervals)
+    return found, ends
+
+
+def _variance_inflation(fit: Fit) -> float:
+    """The variance inflation of dependent cells, at least 1, in the mean over the fitted coordinates.
+
+    It is that of `gauss_newton.profile_intervals`.
+    """
+    jacobian = np.concatenate([np.zeros((0, len(fit.coordinates))), *fit.jacobian.values()])
+    naive = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10))
+    wider = np.divide(np.diag(fit.covariance), naive, out=np.ones_like(naive), where=naive > 0)
+    wider = wider[np.isfinite(wider)]
+    return max(float(np.mean(wider)) if wider.size else 1.0, 1.0)
+
+
+def _beside(coordinate: Coordinate, value: float, step: float) -> float:
+    """The whole number at this distance in the logarithm, at least the next one; within its range."""
+    other = coordinate.value(coordinate.coordinate(value) + step)
+    other = min(other, value - 1) if step < 0 else max(other, value + 1)
+    return min(max(other, coordinate.low), coordinate.high)

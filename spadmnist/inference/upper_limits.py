@@ -1,0 +1,162 @@
+"""Upper limits: the largest strength of each effect that was not found, 95 %, by inverting its score test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .evaluation import Evaluation
+from .replicates import FEW, Replicates
+from .results import plain
+from .scan import Scan
+from .score_test import ScoreTest, score_test
+from .signature import Signature, captures_showing, odd_and_even, signatures, template_of
+from .trial import Trial, shape_of
+
+_ONE_SIDED = 1.645  # standard deviations of a one-sided limit of 95 %
+_CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a signature: one that noise does not hide, and one that it does
+_UNSEEN = 0.1  # of the square of a signature: the share in captures that are not simulated for its growth
+_SATURATED = 1000.0  # standard deviations of a signature that hardly grows any more
+_LOOKS = 5  # simulations at other strengths, at most
+# (factor on the strength at the limit if the signature were linear, size of the signature, trial)
+_Shape = tuple[float, float, Trial]
+
+
+def upper_limits(
+    scan: Scan, evaluation: Evaluation, tried: Sequence[Trial]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
+    """(effects with their 95 % upper limits, effects that these captures cannot show, the others), for the JSON data.
+
+    The others have directions or phases, and no limit is given for them. The limit of an effect is the weakest one
+    over its shapes. The growth of each signature with its strength is simulated once more.
+
+    Args:
+        tried: the trials of every candidate in all captures.
+    """
+    replicates = scan.replicates
+    shapes: dict[str, dict[tuple[Any, ...], _Shape]] = {}
+    for one in tried:
+        candidate = one.candidate
+        if candidate.kind != "add" or len(candidate.strengths) != 1 or candidate.phases:
+            continue
+        test = score_test(replicates, evaluation, one.signature)
+        times = _seen_at(test)
+        for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
+            # iterated with the root of the factor, because a quadratic signature would oscillate
+            times *= math.sqrt(_seen_at(score_test(replicates, evaluation, one.signature.at(times))))
+        known = shapes.setdefault(candidate.effect, {})
+        # of several strengths, the one with the largest signature
+        if shape_of(one) not in known or known[shape_of(one)][1] < test.size:
+            known[shape_of(one)] = times, test.size, one
+    # a saturated template does not show which shape is the weakest
+    asked = {
+        (name, n): shape
+        for name, all_ in shapes.items()
+        for n, shape in enumerate(all_.values())
+        if shape is max(all_.values(), key=lambda s: s[0]) or min(s[1] for s in all_.values()) > _SATURATED
+    }
+    times_of = _at_limit(scan, evaluation, asked)
+    excluded, hidden = [], []
+    for name in shapes:
+        limits = [_strength(shape[2], times_of[key]) for key, shape in asked.items() if key[0] == name]
+        coordinate = next(iter(shapes[name].values()))[2].candidate.strengths[0]
+        if None in limits:
+            hidden.append(name)
+        else:
+            far = max((x for x in limits if x is not None), key=lambda x: abs(x - (coordinate.off or 0.0)))
+            excluded.append({"effect": name, "parameter": coordinate.parameter, "upper_limit_95": plain(far)})
+    looked = {one.candidate.effect for one in tried}  # an effect that could not be tried is reported where it failed
+    every = scan.replicates.candidates(evaluation.sensors.one)
+    others = {one.effect for one in every if one.kind == "add"} & looked - shapes.keys()
+    return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
+
+
+def _seen_at(test: ScoreTest) -> float:
+    """The factor on the strength at its upper limit, if the signature were linear."""
+    return (max(test.data, 0.0) + _ONE_SIDED) / test.size if test.size > 0 else math.inf
+
+
+def _at_limit(
+    scan: Scan, evaluation: Evaluation, weakest: Mapping[tuple[str, int], _Shape]
+) -> dict[tuple[str, int], float]:
+    """The factor on the strength at the upper limit of each effect, by the growth of its signature.
+
+    The power of the growth is measured where the signature is clear, but not by far.
+    """
+    replicates = scan.replicates
+    out: dict[tuple[str, int], float] = {}
+    # known strength and size of the signature, strength to try
+    open_: dict[tuple[str, int], tuple[float, float, float]] = {}
+    needed: dict[tuple[str, int], float] = {}
+    where: dict[tuple[str, int], list[str]] = {}
+    for name, (times, size, one) in weakest.items():
+        out[name] = times
+        if size > 2 * _CLEARLY:
+            where[name] = captures_showing(template_of(replicates, evaluation, one.signature), _UNSEEN)
+            seen = score_test(replicates, evaluation, one.signature.only(where[name])).size
+            here = one.signature if one.signature.even is None else one.signature.at(times)
+            needed[name] = score_test(replicates, evaluation, here.only(where[name])).size * (
+                times if one.signature.even is None else 1.0
+            )
+            open_[name] = 1.0, seen, _CLEARLY / seen
+    for _ in range(_LOOKS):
+        known = {name: entry for name, entry in open_.items() if _strength(weakest[name][2], entry[2]) is not None}
+        if not known:
+            break
+        asked = [(weakest[name][2], try_, where[name]) for name, (_, _, try_) in known.items()]
+        open_ = {}
+        for (name, (strong, size, try_)), signature in zip(
+            known.items(), _as_strong(replicates, evaluation, asked), strict=True
+        ):
+            there = 0.0 if signature is None else score_test(replicates, evaluation, signature).size
+            power = math.log(max(there, _HARDLY) / size) / math.log(try_ / strong)
+            out[name] = try_ * (needed[name] / max(there, _HARDLY)) ** (1 / min(max(power, 0.5), 10.0))
+            if there < _CLEARLY / 3:  # it grows faster: a signature that noise hides gives no power
+                open_[name] = strong, size, math.sqrt(strong * try_)
+            elif there > 6 * _CLEARLY:
+                open_[name] = try_, there, try_ * _CLEARLY / there
+    return out
+
+
+def _as_strong(
+    replicates: Replicates, evaluation: Evaluation, asked: Sequence[tuple[Trial, float, Sequence[str]]]
+) -> list[Signature | None]:
+    """The signature of each trial at a factor on its strength, in some captures; None where it cannot be simulated.
+
+    A strength that may have either sign is simulated with both.
+    """
+    models, only, signs = [], [], []
+    for one, times, ids in asked:
+        coordinate = one.candidate.strengths[0]
+        strong = _strength(one, times)
+        assert strong is not None  # only such strengths are asked for
+        strengths = [strong]
+        if (
+            one.signature.even is not None and coordinate.low <= -strong <= coordinate.high
+        ):  # of both signs: vanishes at 0
+            strengths.append(-strong)
+        signs.append(len(strengths))
+        for value in strengths:
+            models.append(evaluation.sensors.changed({**one.values, coordinate.key: value}))
+            only.append(ids)
+    made = iter(signatures(replicates, evaluation, models, FEW, kept="sure", only_of=only))
+    out: list[Signature | None] = []
+    for (_, _, ids), number in zip(asked, signs, strict=True):
+        up, down = next(made), next(made) if number == 2 else None
+        if isinstance(up, str) or isinstance(down, str):
+            out.append(None)
+        else:
+            out.append((up if down is None else odd_and_even(replicates, evaluation, up, down, FEW)).only(ids))
+    return out
+
+
+def _strength(one: Trial, times: float) -> float | None:
+    """The strength of a trial times a factor, in the parameter's unit; None beyond its search range."""
+    coordinate = one.candidate.strengths[0]
+    off = coordinate.off or 0.0
+    value = off + (float(one.values[coordinate.key]) - off) * times
+    inside = math.isfinite(value) and (
+        value <= coordinate.high if coordinate.off != coordinate.high else value >= coordinate.low
+    )
+    return value if inside else None

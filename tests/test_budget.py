@@ -1,0 +1,128 @@
+"""A diagnosis within a budget of work; answers that are kept as they come; what follows an answer."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+
+import pytest
+import tinylab
+
+from spadmnist.errors import InputError
+from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.comparison import compare
+from spadmnist.inference.model_selection import diagnose
+from spadmnist.inference.next_step import after_comparison, after_diagnosis
+from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.results import Diagnosis, canonical, sentence, table
+
+AFTERPULSING = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
+
+
+@pytest.fixture
+def lab(tmp_path):
+    return tinylab.labs(tmp_path)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Two candidates are tried, no others."""
+    kinds = ("add afterpulsing", "add crosstalk")
+    usual = Replicates.candidates
+    monkeypatch.setattr(
+        Replicates, "candidates", lambda self, sensor: [c for c in usual(self, sensor) if c.name in kinds]
+    )
+
+
+@pytest.mark.parametrize(
+    ("stated", "quick", "seconds"),
+    [
+        (None, False, 600.0),
+        (None, True, 180.0),
+        ("3 min", False, 180.0),
+        ("1 h", True, 3600.0),
+        ("90 s", True, 90.0),
+        (45, False, 45.0),
+        ("none", True, math.inf),
+        (" None ", False, math.inf),
+    ],
+)
+def test_a_budget_as_users_state_it(stated, quick, seconds):
+    assert seconds_of(stated, quick) == seconds
+
+
+@pytest.mark.parametrize("wrong", ["soon", "3", "-1 min", "0 s", 0, -5.0, "3 lux", True and "nan s", [3]])
+def test_what_is_no_budget(wrong):
+    with pytest.raises(InputError, match="within"):
+        seconds_of(wrong, False)
+
+
+def test_work_is_counted_before_it_is_done():
+    one = Budget(10.0, until=0.5)
+    one.spend(4.0)
+    with pytest.raises(OutOfBudget):
+        one.spend(1.5)
+    assert one.spent == 4.0  # what was not done is not counted
+    one.until = math.inf  # what every answer needs
+    one.spend(100.0)
+    assert one.spent == 104.0
+    Budget().spend(1e9)
+
+
+def test_the_clock_ends_what_takes_three_times_as_long():
+    Budget(10.0, until=1.0, began=time.monotonic() - 29.0).spend(1.0)
+    with pytest.raises(OutOfBudget):
+        Budget(10.0, until=1.0, began=time.monotonic() - 31.0).spend(1.0)
+
+
+def test_a_time_as_people_read_it():
+    assert [clock(x) for x in (4.4, 250, 3720)] == ["0:04", "4:10", "1:02:00"]
+
+
+def test_a_budget_ends_a_search_and_the_answer_says_so(lab, few, monkeypatch):
+    monkeypatch.setattr("spadmnist.inference.budget._SLOW", 1e9)  # work alone ends it, however slow this machine is
+    made = lab(AFTERPULSING)
+    told: list[str] = []
+    answers = [diagnose(*made, quick=True, jobs=1, within=0.5, progress=told.append) for _ in range(2)]
+    found = answers[0]
+    assert not found.finished and found.verdict == "unexplained" and not found.steps
+    assert canonical(answers[0]) == canonical(answers[1])  # work, not time
+    data = json.loads(canonical(found))
+    assert data["finished"] is False
+    assert any(e["effect"] is None and "--within" in e["why"] for e in data["not_tried"])
+    assert sentence(found).startswith("not finished") and "--within" in table(found)
+    assert "--within none" in after_diagnosis(found, "s.yaml", "lab")
+    assert any("left)" in line for line in told)
+
+
+@pytest.mark.slow
+def test_the_answer_is_kept_after_each_step(lab, few):
+    kept: list[Diagnosis] = []
+    found = diagnose(*lab(AFTERPULSING), quick=True, jobs=1, keep=kept.append)
+    assert found.finished and found.verdict == "explained"
+    assert [step.candidate.name for step in kept[0].steps] == ["add afterpulsing"] and not kept[0].finished
+    for one in [*kept, found]:
+        assert json.loads(canonical(one))["format"] == "spadmnist-diagnosis/1"
+    (step,) = found.steps
+    new = found.in_sample
+    assert new is not None and new.verdict == "adequate" and step.candidate.effect == "afterpulsing"
+
+
+@pytest.mark.slow
+def test_misfit_in_sample_is_the_same_in_both_verbs(lab, few):
+    """Of the same model and data: both are one evaluation."""
+    made = lab()
+    one, other = compare(*made, jobs=1), diagnose(*made, jobs=1)
+    assert other.verdict == "adequate" and other.in_sample is not None
+    assert (one.misfit, one.misfit_null_95) == (other.in_sample.misfit, other.in_sample.misfit_null_95)
+    assert json.loads(canonical(other))["misfit_in_sample"] == one.as_data()["misfit_in_sample"]
+    assert [c.p_value for c in one.checks] == [c.p_value for c in other.in_sample.checks]
+    assert "spadmnist diagnose s.yaml lab" in after_comparison(one, "s.yaml", "lab")
+    assert "nothing is missing" in after_diagnosis(other)
+
+
+def test_all_that_a_sensor_may_lack_is_tried_by_default(lab):
+    sensor, _ = lab()
+    assert {"add afterpulsing", "add crosstalk"} <= {c.name for c in candidates(sensor.settled())}
