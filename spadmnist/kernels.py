@@ -573,6 +573,41 @@ def row_totals(values, offsets):
     return out
 
 
+_FEW_IN_ROW = 64  # up to so many are put in order one by one
+
+
+@_jit
+def row_order(times, rows, count):
+    """How to bring events into order: by their rows, by their times within these; what is equal stays in its order.
+
+    rows: (events,) int64, of which there are `count`. Returns (order (events,) int64, offsets (count + 1,) int64).
+    """
+    offsets = np.zeros(count + 1, np.int64)
+    for i in range(rows.size):
+        offsets[rows[i] + 1] += 1
+    for row in range(count):
+        offsets[row + 1] += offsets[row]
+    place = offsets[:-1].copy()
+    order = np.empty(rows.size, np.int64)
+    for i in range(rows.size):
+        order[place[rows[i]]] = i
+        place[rows[i]] += 1
+    for row in range(count):
+        begin, end = offsets[row], offsets[row + 1]
+        if end - begin > _FEW_IN_ROW:
+            some = order[begin:end].copy()
+            order[begin:end] = some[np.argsort(times[some], kind="mergesort")]
+            continue
+        for k in range(begin + 1, end):
+            i = order[k]
+            at = k
+            while at > begin and times[order[at - 1]] > times[i]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = i
+    return order, offsets
+
+
 @_jit
 def merge(times, offsets, extra, extra_rows):
     """Sort a few further events into their rows.
@@ -971,8 +1006,8 @@ def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
 def add_waits(offsets, stamps, pixels, first, last, of_pixels, of_frames):
     """Add to of_pixels (pixels,) and of_frames (frames,) how long first detections were waited for.
 
-    offsets, stamps, pixels: see `recording.FirstStamps`. In the time from the tick `first` to the end of `last`; a stamp
-    is the middle of its tick.
+    offsets, stamps, pixels: see `recording.FirstStamps`. In the time from the tick `first` to the end of `last`, a
+    stamp being the middle of its tick.
     """
     unit = 1.0 / (last - first + 1)
     frames = of_frames.size
@@ -1067,30 +1102,39 @@ def stamps_by_frame(bits, offsets, ticks, frames):
     Returns (offsets (frames + 1,), stamps (stamps,) uint32, pixels (stamps,) int32), those of a frame in their order.
     """
     pixels, width = bits.shape
+    ones = np.zeros(256, np.uint64)  # how many bits of a byte are set, and which ones
+    which = np.zeros((256, 8), np.uint64)
+    for byte in range(256):
+        for bit in range(8):
+            if (byte >> (7 - bit)) & 1:
+                which[byte, ones[byte]] = bit
+                ones[byte] += np.uint64(1)
     place = np.zeros(8 * width + 1, np.int64)
     for p in range(pixels):
         for byte in range(width):
-            for bit in range(8):
-                place[8 * byte + bit + 1] += (bits[p, byte] >> (7 - bit)) & 1
+            if bits[p, byte]:
+                for bit in range(8):
+                    place[8 * byte + bit + 1] += (bits[p, byte] >> (7 - bit)) & 1
     for f in range(8 * width):
         place[f + 1] += place[f]
     begins = place[: frames + 1].copy()
     stamps = np.empty(ticks.size, np.uint32)
     whose = np.empty(ticks.size, np.int32)
+    frame = np.empty(8 * width + 8, np.uint64)
     for p in range(pixels):
-        k = offsets[p]
-        for byte in range(width):
-            left = np.uint32(bits[p, byte])
-            frame = np.int64(8 * byte)
-            while left:
-                if left & np.uint32(128):
-                    at = np.uint64(place[frame])
-                    stamps[at] = ticks[k]
-                    whose[at] = p
-                    place[frame] += 1
-                    k += 1
-                left = (left << np.uint32(1)) & np.uint32(255)
-                frame += 1
+        found = np.uint64(0)
+        for byte in range(np.uint64(width)):
+            value = bits[p, byte]
+            if value:
+                for k in range(np.uint64(8)):  # what is too much will be overwritten
+                    frame[found + k] = np.uint64(8) * byte + which[value, k]
+                found += ones[value]
+        begin = np.uint64(offsets[p])
+        for k in range(found):
+            at = np.uint64(place[frame[k]])
+            stamps[at] = ticks[begin + k]
+            whose[at] = p
+            place[frame[k]] += 1
     return begins, stamps, whose
 
 

@@ -287,6 +287,17 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
         assert linked[k] == -1 if one < len(times) else who[linked[k]] == parents[one - len(times)]
 
 
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(0, 300), st.integers(1, 9), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_the_order_of_rows_and_times(count: int, rows: int, moments: int, seed: int) -> None:
+    """That of numpy, equal ones in the order in which they come; of rows with few events and with many."""
+    rng = np.random.default_rng(seed)
+    row, time = rng.integers(0, rows, count), rng.integers(0, moments, count) / 8
+    order, offsets = kernels.row_order(time, row, rows)
+    assert order.tolist() == np.lexsort((time, row)).tolist()
+    assert np.diff(offsets).tolist() == np.bincount(row, minlength=rows).tolist() and offsets[0] == 0
+
+
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(ragged(), st.data())
 def test_sort_rows_and_kept_offsets(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None:
