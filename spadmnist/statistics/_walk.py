@@ -31,6 +31,7 @@ _AT_ONCE = 16384  # stamps of frames that are sorted together: they fit into the
 _BLOCK = 4096  # detections that are gone through together: their times fit into the nearest cache
 _DEEP = 4  # stamps of a pixel that are held; what is earlier is looked up
 _FEW_BACK = 25.0  # detections of the array within the longest lag, up to which all of them are gone through
+_LONG = 1 << 20  # ticks in the longest lag, up to which the range of each one stands in a table
 _RANGES = 8  # of lags, at most: a number that the compiler knows
 _SHIFTS = 64  # steps between stamps up to which those of the whole array are compared in turn
 _NEVER = -(1 << 62)
@@ -259,11 +260,12 @@ def _through_exposure(
         passed[spot[row]] = offsets[row] - 1
     longest = lags[lags.size - 1]
     usual = np.float64(total) / end
-    back = stride > 0 and usual * longest < _FEW_BACK
+    back = stride > 0 and usual * longest < _FEW_BACK and longest <= _LONG
     reach = REACH * (stride + 1)
     entry_of = np.full(2 * reach + 2, step.size)  # of the way from one spot to another; nobody's are the last
     for e in range(step.size if back else 0):
         entry_of[step[e] + reach] = e
+    range_of = _range_of(lags, latest) if back else np.empty(0, np.uint8)
     most = ranks[ranks.size - 1]
     times = np.empty(2 * _BLOCK, np.int64)
     some = np.empty(_BLOCK, np.int64)
@@ -281,7 +283,9 @@ def _through_exposure(
             times[i - oldest] = words[i] >> bits
         held, count = begin - oldest, stop - oldest
         if back:
-            _near_pairs_back(words, bits, begin, stop, spot, lags, latest, entry_of, kind, second, some, found, later)
+            _near_pairs_back(
+                words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
+            )
         else:
             _near_pairs(
                 words[begin:stop], bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
@@ -330,6 +334,16 @@ def _ranges(lags, latest):
 
 
 @jit
+def _range_of(lags, latest):
+    """(longest lag,) uint8, the range of each lag; see `_ranges`."""
+    limits, ranges = _ranges(lags, latest)
+    out = np.zeros(lags[lags.size - 1], np.uint8)
+    for k in range(ranges - 1):
+        out[limits[k] :] += np.uint8(1)
+    return out
+
+
+@jit
 def _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later):
     """Add what was counted by entry and range of lags to the classes of near pixels."""
     for e in range(kind.size):
@@ -343,10 +357,13 @@ def _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, lat
 
 
 @jit
-def _near_pairs_back(words, bits, begin, stop, spot, lags, latest, entry_of, kind, second, some, found, later):
+def _near_pairs_back(
+    words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
+):  # fmt: skip
     """As `_near_pairs`, where few detections are near in time: all of these are gone through, and counted.
 
-    words: all of them, of which those from `begin` to `stop` are looked back from; entry_of: see `_through_exposure`.
+    words: all of them, of which those from `begin` to `stop` are looked back from; range_of: the function of that name;
+    entry_of: see `_through_exposure`; some: a buffer for as many.
     """
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
@@ -374,10 +391,7 @@ def _near_pairs_back(words, bits, begin, stop, spot, lags, latest, entry_of, kin
             lag = (words[i] >> bits) - (words[j] >> bits)
             # far ones, which are most, all go to the place behind the last
             way = min(np.uint64(reach - spot[words[i] & mask] + spot[words[j] & mask]), most)
-            bin = np.uint64(0)
-            for limit in range(_RANGES):
-                bin += np.uint64(lag >= limits[limit])
-            counters[np.uint64(entry_of[way]), bin] += 1
+            counters[np.uint64(entry_of[way]), np.uint64(range_of[np.uint64(lag)])] += 1
     _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
     every = found[found.shape[0] - 1]
     for e in range(kind.size + 1):

@@ -18,7 +18,7 @@ _SHORTEST, _LONGEST = 10e-9, 10e-3  # s
 _LAGS = (1, 2, 3, 5, 10, 20, 50, 100)  # frames
 _PER_OCTAVE = 4
 _BOXES, _NARROW = 4096, 724  # boxes whose products fit into 32 bits together, up to what number in a box
-_SPARSE = 0.75  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
+_SPARSE = 1.5  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
 
 
 class Autocorrelation(Statistic):
