@@ -444,7 +444,7 @@ def arrivals(rates, exposure, images, key, place):
         for p in range(pixels + 1):
             offsets[row + p] += used
         used += count
-    return times[:used].copy(), offsets
+    return times[:used], offsets
 
 
 @_jit
@@ -571,6 +571,41 @@ def row_totals(values, offsets):
                 total += values[i]
             out[row] = total
     return out
+
+
+_FEW_IN_ROW = 64  # up to so many are put in order one by one
+
+
+@_jit
+def row_order(times, rows, count):
+    """How to bring events into order: by their rows, by their times within these; what is equal stays in its order.
+
+    rows: (events,) int64, of which there are `count`. Returns (order (events,) int64, offsets (count + 1,) int64).
+    """
+    offsets = np.zeros(count + 1, np.int64)
+    for i in range(rows.size):
+        offsets[rows[i] + 1] += 1
+    for row in range(count):
+        offsets[row + 1] += offsets[row]
+    place = offsets[:-1].copy()
+    order = np.empty(rows.size, np.int64)
+    for i in range(rows.size):
+        order[place[rows[i]]] = i
+        place[rows[i]] += 1
+    for row in range(count):
+        begin, end = offsets[row], offsets[row + 1]
+        if end - begin > _FEW_IN_ROW:
+            some = order[begin:end].copy()
+            order[begin:end] = some[np.argsort(times[some], kind="mergesort")]
+            continue
+        for k in range(begin + 1, end):
+            i = order[k]
+            at = k
+            while at > begin and times[order[at - 1]] > times[i]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = i
+    return order, offsets
 
 
 @_jit
@@ -968,31 +1003,43 @@ def counts_in_frames(times, offsets, frame_time, frame_period, largest, out):
 
 
 @_jit
-def span_of_stamps(stamps, none, first, last):
-    """(the smallest of `first` and all stamps below `none`, the largest of them and `last`)."""
-    for stamp in stamps:
-        if stamp < none:
-            first = min(first, np.int64(stamp))
-            last = max(last, np.int64(stamp))
-    return first, last
-
-
-@_jit
-def add_waits(frames, none, first, last, of_pixels, of_frames):
+def add_waits(offsets, stamps, pixels, first, last, of_pixels, of_frames):
     """Add to of_pixels (pixels,) and of_frames (frames,) how long first detections were waited for.
 
-    frames: (frames, pixels) ticks, `none` and above where there is no detection. In the time from the tick `first` to
-    the end of `last`; a stamp is the middle of its tick.
+    offsets, stamps, pixels: see `recording.FirstStamps`. In the time from the tick `first` to the end of `last`, a
+    stamp being the middle of its tick.
     """
     unit = 1.0 / (last - first + 1)
-    for f in range(frames.shape[0]):
-        total = 0.0
-        for p in range(frames.shape[1]):
-            stamp = frames[f, p]
-            waited = (np.int64(stamp) - first + 0.5) * unit if stamp < none else 1.0
-            of_pixels[p] += waited
-            total += waited
-        of_frames[f] += total
+    frames = of_frames.size
+    waited = np.ones((4, of_pixels.size))
+    for start in range(0, frames, 4):
+        some = min(4, frames - start)
+        for k in range(some):
+            for i in range(offsets[start + k], offsets[start + k + 1]):
+                waited[k, pixels[i]] = (np.int64(stamps[i]) - first + 0.5) * unit
+        if some == 4:
+            # four sums that do not wait for each other
+            a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            for p in range(of_pixels.size):
+                a += waited[0, p]
+                b += waited[1, p]
+                c += waited[2, p]
+                d += waited[3, p]
+                of_pixels[p] = (((of_pixels[p] + waited[0, p]) + waited[1, p]) + waited[2, p]) + waited[3, p]
+            of_frames[start] += a
+            of_frames[start + 1] += b
+            of_frames[start + 2] += c
+            of_frames[start + 3] += d
+        else:
+            for k in range(some):
+                total = 0.0
+                for p in range(of_pixels.size):
+                    total += waited[k, p]
+                    of_pixels[p] += waited[k, p]
+                of_frames[start + k] += total
+        for k in range(some):
+            for i in range(offsets[start + k], offsets[start + k + 1]):
+                waited[k, pixels[i]] = 1.0
 
 
 @_jit
@@ -1048,25 +1095,82 @@ def frames_first(bits, frames, rows, columns):
 
 
 @_jit
-def stamps_first(bits, offsets, ticks, none):
-    """Turn stamps pixel by pixel, one for each bit set, into frames (8 * bytes, pixels) uint32, `none` elsewhere.
+def stamps_by_frame(bits, offsets, ticks, frames):
+    """Put stamps, pixel by pixel one for each bit set, in the order of their frames.
 
     bits: (pixels, bytes), most significant first; offsets: (pixels + 1,) into ticks.
+    Returns (offsets (frames + 1,), stamps (stamps,) uint32, pixels (stamps,) int32), those of a frame in their order.
     """
     pixels, width = bits.shape
-    out = np.full((8 * width, pixels), np.uint32(none))
-    place = offsets[:-1].copy()
-    # some pixels at a time, which share their lines of the cache
-    for first in range(0, pixels, 16):
+    ones = np.zeros(256, np.uint64)  # how many bits of a byte are set, and which ones
+    which = np.zeros((256, 8), np.uint64)
+    for byte in range(256):
+        for bit in range(8):
+            if (byte >> (7 - bit)) & 1:
+                which[byte, ones[byte]] = bit
+                ones[byte] += np.uint64(1)
+    place = np.zeros(8 * width + 1, np.int64)
+    for p in range(pixels):
         for byte in range(width):
-            for p in range(first, min(first + 16, pixels)):
-                if bits[p, byte] == 0:
-                    continue
+            if bits[p, byte]:
                 for bit in range(8):
-                    if (bits[p, byte] >> (7 - bit)) & 1:
-                        out[8 * byte + bit, p] = ticks[place[p]]
-                        place[p] += 1
-    return out
+                    place[8 * byte + bit + 1] += (bits[p, byte] >> (7 - bit)) & 1
+    for f in range(8 * width):
+        place[f + 1] += place[f]
+    begins = place[: frames + 1].copy()
+    stamps = np.empty(ticks.size, np.uint32)
+    whose = np.empty(ticks.size, np.int32)
+    frame = np.empty(8 * width + 8, np.uint64)
+    for p in range(pixels):
+        found = np.uint64(0)
+        for byte in range(np.uint64(width)):
+            value = bits[p, byte]
+            if value:
+                for k in range(np.uint64(8)):  # what is too much will be overwritten
+                    frame[found + k] = np.uint64(8) * byte + which[value, k]
+                found += ones[value]
+        begin = np.uint64(offsets[p])
+        for k in range(found):
+            at = np.uint64(place[frame[k]])
+            stamps[at] = ticks[begin + k]
+            whose[at] = p
+            place[frame[k]] += 1
+    return begins, stamps, whose
+
+
+@_jit
+def stamps_of_frames(frames, none):
+    """The first stamps of frames (frames, pixels), `none` and above where there is no detection.
+
+    Returns (offsets (frames + 1,), stamps (stamps,) of the type of the frames, pixels (stamps,) int32).
+    """
+    offsets = np.zeros(frames.shape[0] + 1, np.int64)
+    for f in range(frames.shape[0]):
+        number = np.int64(0)
+        for p in range(frames.shape[1]):
+            number += frames[f, p] < none
+        offsets[f + 1] = offsets[f] + number
+    total = offsets[frames.shape[0]]
+    # one more, which what is no stamp may write over
+    stamps = np.empty(total + 1, frames.dtype)
+    pixels = np.empty(total + 1, np.int32)
+    for f in range(frames.shape[0]):
+        k = offsets[f]
+        if k == offsets[f + 1]:
+            continue
+        for p in range(frames.shape[1]):
+            stamps[k] = frames[f, p]
+            pixels[k] = p
+            k += frames[f, p] < none
+    return offsets, stamps[:total], pixels[:total]
+
+
+@_jit
+def fill_stamps(offsets, stamps, pixels, out):
+    """Put first stamps, frame by frame, to their pixels: out (frames, pixels)."""
+    for f in range(out.shape[0]):
+        for i in range(offsets[f], offsets[f + 1]):
+            out[f, pixels[i]] = stamps[i]
 
 
 @_jit

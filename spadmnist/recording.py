@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -76,6 +76,22 @@ class Capture:
         return self.modality == "tr" or (self.modality == "counts" and self.conditions.counting == "counter")
 
 
+class FirstStamps(NamedTuple):
+    """First stamps (STR) of some frames, frame by frame and in the order of the pixels.
+
+    offsets: (frames + 1,); stamps: (stamps,) ticks since the start of their frame; pixels: (stamps,) int32.
+    """
+
+    offsets: np.ndarray
+    stamps: np.ndarray
+    pixels: np.ndarray
+
+    def of(self, start: int, stop: int) -> FirstStamps:
+        """Those of the frames from `start` to `stop`."""
+        some = slice(int(self.offsets[start]), int(self.offsets[stop]))
+        return FirstStamps(self.offsets[start : stop + 1] - some.start, self.stamps[some], self.pixels[some])
+
+
 class FrameSource(Protocol):
     """Frames on disk or in memory, read in pieces."""
 
@@ -128,13 +144,29 @@ class Recording:
         """Frames of this readout (count frames for `counts`)."""
         return 0 if self.frames is None else self.frames.shape[0]
 
-    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """(number of the first frame, frames) piece by piece, so that a large capture never lies in memory whole."""
+    def pieces(self) -> Iterator[tuple[int, int]]:
+        """(number of the first frame, of the one behind the last) of as many as are looked at together."""
         assert self.frames is not None
         size = int(np.prod(self.frames.shape[1:])) * (1 if self.modality == "qis" else 4)
         step = max(8, _CHUNK // max(1, size))
         for start in range(0, self.n_frames, step):
-            yield start, np.asarray(self.frames[start : min(start + step, self.n_frames)])
+            yield start, min(start + step, self.n_frames)
+
+    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """(number of the first frame, frames) piece by piece, so that a large capture never lies in memory whole."""
+        assert self.frames is not None
+        for start, stop in self.pieces():
+            yield start, np.asarray(self.frames[start:stop])
+
+    def stamped(self) -> Iterator[tuple[int, FirstStamps]]:
+        """(number of the first frame, first stamps of some frames) piece by piece, for STR."""
+        assert self.frames is not None
+        for start, stop in self.pieces():
+            if isinstance(self.frames, StampedFrames):
+                yield start, self.frames.found.of(start, stop)
+            else:
+                flat = np.ascontiguousarray(self.frames[start:stop]).reshape(stop - start, -1)
+                yield start, FirstStamps(*kernels.stamps_of_frames(flat, self.none))
 
     def bits(self) -> Iterator[tuple[int, np.ndarray]]:
         """(number of the first frame, (frames, rows, ceil(columns / 8)) uint8): which pixels have a detection.
@@ -165,14 +197,14 @@ class Recording:
 
     def _waited(self) -> tuple[np.ndarray, np.ndarray] | None:
         first, last = self.none, -1
-        for _, part in self.chunks():
-            first, last = kernels.span_of_stamps(np.ascontiguousarray(part).ravel(), self.none, first, last)
+        for _, found in self.stamped():
+            if len(found.stamps):
+                first, last = min(first, int(found.stamps.min())), max(last, int(found.stamps.max()))
         if last - first < _FEW_TICKS:
             return None
         of_pixels, of_frames = np.zeros(self.pixels), np.zeros(self.n_frames)
-        for start, part in self.chunks():
-            flat = np.ascontiguousarray(part).reshape(len(part), -1)
-            kernels.add_waits(flat, self.none, first, last, of_pixels, of_frames[start : start + len(part)])
+        for start, found in self.stamped():
+            kernels.add_waits(*found, first, last, of_pixels, of_frames[start : start + len(found.offsets) - 1])
         return of_pixels, of_frames
 
     def kept(self, name: str, make: Callable[[], T]) -> T:
@@ -276,6 +308,27 @@ def _whole(stamps: np.ndarray, last: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class StampedFrames:
+    """Frames that are held as their first stamps (STR), and filled where they are read.
+
+    none: the stamp where there is no detection; shape: (frames, rows, columns).
+    """
+
+    found: FirstStamps
+    none: int
+    shape: tuple[int, int, int]
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        """(frames, rows, columns) uint32."""
+        start, stop, step = part.indices(self.shape[0])
+        first, last = (start, max(start, stop)) if step > 0 else (min(start, stop) + 1, start + 1)
+        out = np.full((max(0, last - first), self.shape[1] * self.shape[2]), self.none, np.uint32)
+        if len(out):
+            kernels.fill_stamps(*self.found.of(first, last), out)
+        return out.reshape(-1, *self.shape[1:])[::step]
+
+
+@dataclass(frozen=True)
 class _EveryOther:
     """Of each two blocks of `length` frames one, `blocks` in all."""
 
@@ -336,6 +389,7 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
     if none >= 1 << 32:
         frame, tick = (show(x, "s") for x in (capture.conditions.frame_time, first.tick))
         raise InputError(f"{capture.id}: STR stamps of {tick} in frames of {frame} need more than 32 bits")
-    stamps = kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, none)[: one.frames.frames]
+    found = FirstStamps(*kernels.stamps_by_frame(one.frames.bits, first.offsets, first.ticks, one.frames.frames))
+    frames = StampedFrames(found, none, (one.frames.frames, rows, columns))
     totals: dict[str, object] = {"totals": np.diff(first.offsets)}
-    return Recording(capture, layout, None, stamps.reshape(-1, rows, columns), first.tick, dead_time, totals)
+    return Recording(capture, layout, None, frames, first.tick, dead_time, totals)

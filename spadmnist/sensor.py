@@ -751,8 +751,8 @@ class Sensor:
         """
         cascade = self.rules == "device"
         correlated = self.at("correlated")
-        children: list[tuple[np.ndarray, ...]] = []  # times, rows, parents, generations, causes
-        current, index, known = events, np.arange(len(events)) if correlated else _NONE, len(events)
+        children: list[tuple[np.ndarray, ...]] = []  # times, rows, parents, causes, generation by generation
+        current, first, known = events, 0, len(events)  # of which the first is so many in all
         generation = 0
         while correlated and len(current) and (cascade or generation == 0):
             if generation == _GENERATIONS or known > _CHILDREN * (len(events) + _CHILDREN):
@@ -767,19 +767,18 @@ class Sensor:
             inside = t < conditions.exposure
             inside[inside] = self._open(t[inside], conditions)
             t, r, p, made_by = t[inside], r[inside], p[inside], np.concatenate(made)[inside]
-            order = np.lexsort((t, r))
+            order, offsets = kernels.row_order(t, r, len(events.offsets) - 1)
             t, r, p, made_by = t[order], r[order], p[order], made_by[order]
-            children.append((t, r, index[p], np.full(len(t), generation), made_by))
+            children.append((t, r, first + p, made_by))
             generation += 1
-            index = known + np.arange(len(t))
+            first = known
             known += len(t)
-            offsets = np.searchsorted(r, np.arange(len(events.offsets)))
-            current = Events(t, offsets.astype(np.int64), events.pixels)
+            current = Events(t, offsets, events.pixels)
         if known == len(events):
             return events, _NOBODY
-        times, rows, parents, generations, made_by = (np.concatenate(column) for column in zip(*children, strict=True))
-        # what is equally late: the parent first
-        order = np.lexsort((generations, times, rows))
+        times, rows, parents, made_by = (np.concatenate(column) for column in zip(*children, strict=True))
+        # what is equally late stays in the order of the generations: the parent first
+        order, _ = kernels.row_order(times, rows, len(events.offsets) - 1)
         merged, offsets, before = kernels.merge(events.times, events.offsets, times[order], rows[order])
         out = Events(merged, offsets, events.pixels, end=conditions.exposure)
         linked = kernels.relinked(len(events), before, order, parents) if cascade or causes else _NOBODY

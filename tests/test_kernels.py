@@ -287,6 +287,17 @@ def test_merge(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None
         assert linked[k] == -1 if one < len(times) else who[linked[k]] == parents[one - len(times)]
 
 
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(0, 300), st.integers(1, 9), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_the_order_of_rows_and_times(count: int, rows: int, moments: int, seed: int) -> None:
+    """That of numpy, equal ones in the order in which they come; of rows with few events and with many."""
+    rng = np.random.default_rng(seed)
+    row, time = rng.integers(0, rows, count), rng.integers(0, moments, count) / 8
+    order, offsets = kernels.row_order(time, row, rows)
+    assert order.tolist() == np.lexsort((time, row)).tolist()
+    assert np.diff(offsets).tolist() == np.bincount(row, minlength=rows).tolist() and offsets[0] == 0
+
+
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(ragged(), st.data())
 def test_sort_rows_and_kept_offsets(data: tuple[np.ndarray, np.ndarray], draw: st.DataObject) -> None:
@@ -694,6 +705,13 @@ def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> 
         ticks = rng.integers(0, 1000, int(offsets[-1])).astype(kind)
         wanted = np.full((pixels, frames), 1000, np.uint32)
         wanted[ones] = ticks
-        found = kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, 1000)
-        assert found.dtype == np.uint32 and np.array_equal(found[:frames], wanted.T)
-        assert np.all(found[frames:] == 1000)
+        begins, stamps, whose = kernels.stamps_by_frame(np.packbits(ones, axis=1), offsets, ticks, frames)
+        frame, pixel = np.nonzero(wanted.T < 1000)
+        assert stamps.dtype == np.uint32 and stamps.tolist() == wanted.T[frame, pixel].tolist()
+        assert whose.tolist() == pixel.tolist()
+        assert np.diff(begins).tolist() == ones.sum(axis=0).tolist()
+        again = kernels.stamps_of_frames(np.ascontiguousarray(wanted.T), 1000)
+        assert all(np.array_equal(*both) for both in zip(again, (begins, stamps, whose), strict=True))
+        filled = np.full((frames, pixels), 1000, np.uint32)
+        kernels.fill_stamps(begins, stamps, whose, filled)
+        assert np.array_equal(filled, wanted.T)

@@ -4,8 +4,8 @@ itself; a family of statistics stands in one file.
 A statistic turns a `Recording` into a `Summary`: numbers in a unit (its cells), each with the law it follows if
 nothing but the model is at work, and words for where each one looks. It cannot know whether the recording is measured
 or simulated, and it does not know the model: expectations and scatter come from recordings that the model makes, which
-are reduced in the same way (`spadmnist.inference.comparison`). Cells should not depend on the light level more than they
-must, for the level is not known exactly: what is left of it is taken out by regression on the total of the capture.
+are reduced in the same way (`spadmnist.inference`). Cells should not depend on the light level more than they must, for
+the level is not known exactly: what is left of it is taken out by regression on the total of the capture.
 """
 
 from __future__ import annotations

@@ -83,11 +83,10 @@ _DIGIT = 2048
 
 
 @jit
-def sort_ticks(raw, count, low, span, out, first, spare, heads):
+def sort_ticks(raw, count, low, span, out, first):
     """Put `raw[:count]` in order into `out[first:]`: whole numbers, most of them between low and low + span, evenly.
 
-    spare: (count,) int64, heads: (2, 2049) int64, buffers. By the upper 22 bits of their place in two turns; what has
-    the same ones, or lies outside, is put right at the end.
+    By the upper 22 bits of their place in two turns; what has the same ones, or lies outside, is put right at the end.
     """
     if count < _DIGIT // 4:
         out[first : first + count] = raw[:count]
@@ -95,22 +94,29 @@ def sort_ticks(raw, count, low, span, out, first, spare, heads):
         return
     scale = _DIGIT * np.float64(_DIGIT) / max(span, 1)
     most = np.int64(_DIGIT * _DIGIT - 1)
-    heads[:, :] = 0
+    keys = np.empty(count, np.uint32)
     for i in range(count):
-        q = min(max(np.int64((raw[i] - low) * scale), 0), most)
-        heads[0, (q & 2047) + 1] += 1
-        heads[1, (q >> 11) + 1] += 1
+        keys[i] = min(max(np.int64((raw[i] - low) * scale), 0), most)
+    lower = np.zeros(_DIGIT + 1, np.uint32)
+    upper = np.zeros(_DIGIT + 1, np.uint32)
+    for i in range(np.uint64(count)):
+        lower[np.uint64(keys[i] & np.uint32(2047)) + np.uint64(1)] += np.uint32(1)
+        upper[np.uint64(keys[i] >> np.uint32(11)) + np.uint64(1)] += np.uint32(1)
     for b in range(_DIGIT):
-        heads[0, b + 1] += heads[0, b]
-        heads[1, b + 1] += heads[1, b]
-    for i in range(count):
-        q = min(max(np.int64((raw[i] - low) * scale), 0), most) & 2047
-        spare[heads[0, q]] = raw[i]
-        heads[0, q] += 1
-    for i in range(count):
-        q = min(max(np.int64((spare[i] - low) * scale), 0), most) >> 11
-        out[first + heads[1, q]] = spare[i]
-        heads[1, q] += 1
+        lower[b + 1] += lower[b]
+        upper[b + 1] += upper[b]
+    spare = np.empty(count, np.int64)
+    left = np.empty(count, np.uint16)
+    for i in range(np.uint64(count)):
+        digit = np.uint64(keys[i] & np.uint32(2047))
+        at = np.uint64(lower[digit])
+        spare[at] = raw[i]
+        left[at] = keys[i] >> np.uint32(11)
+        lower[digit] += np.uint32(1)
+    for i in range(np.uint64(count)):
+        digit = np.uint64(left[i])
+        out[np.uint64(first) + np.uint64(upper[digit])] = spare[i]
+        upper[digit] += np.uint32(1)
     moves = 0
     for i in range(first + 1, first + count):
         value = out[i]

@@ -9,46 +9,15 @@ brought into it, a piece at a time and every time anew.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..kernels import inline, jit
-from ..recording import Recording
+from ..recording import FirstStamps, Recording, StampedFrames
 
 _MANY = 100.0  # counts for which whole numbers are no matter
 _SMALL = 2**23  # pixels times frames up to which a form of the frames is kept with the recording
-
-
-class FirstStamps(NamedTuple):
-    """First stamps (STR) of some frames, frame by frame and in the order of the pixels.
-
-    offsets: (frames + 1,); stamps: (stamps,) ticks since the start of their frame; pixels: (stamps,) int32.
-    """
-
-    offsets: np.ndarray
-    stamps: np.ndarray
-    pixels: np.ndarray
-
-
-def contiguous(frames: np.ndarray) -> np.ndarray:
-    """(frames, pixels) of frames (frames, rows, columns), in the order of memory, too."""
-    flat = frames.reshape(len(frames), -1)
-    if flat.flags.c_contiguous:
-        return flat
-    out = np.empty(flat.shape, flat.dtype)
-    _copy(flat, out)
-    return out
-
-
-@jit
-def _copy(frames, out):
-    # some frames at a time: one of two arrays is gone through across its lines of the cache
-    for first in range(0, frames.shape[0], 16):
-        last = min(first + 16, frames.shape[0])
-        for p in range(frames.shape[1]):
-            for f in range(first, last):
-                out[f, p] = frames[f, p]
 
 
 def _kept(recording: Recording, name: str, make: Callable[[], Iterator[Any]]) -> Iterator[Any]:
@@ -62,18 +31,10 @@ def _kept(recording: Recording, name: str, make: Callable[[], Iterator[Any]]) ->
 
 
 def first_stamps(recording: Recording) -> Iterator[tuple[int, FirstStamps]]:
-    """(number of the first frame, first stamps of some frames) of an STR recording, piece by piece."""
-
-    def make() -> Iterator[tuple[int, FirstStamps]]:
-        for first, part in recording.chunks():
-            flat = contiguous(part)
-            offsets = np.zeros(len(flat) + 1, np.int64)
-            _number(flat, recording.none, offsets)
-            stamps, pixels = np.empty(offsets[-1] + 1, flat.dtype), np.empty(offsets[-1] + 1, np.int32)
-            _gather(flat, recording.none, offsets, stamps, pixels)
-            yield first, FirstStamps(offsets, stamps[:-1], pixels[:-1])
-
-    return _kept(recording, "first stamps", make)
+    """As `recording.stamped`: (number of the first frame, first stamps of some frames), but kept where it is small."""
+    if isinstance(recording.frames, StampedFrames):
+        return recording.stamped()
+    return _kept(recording, "first stamps", recording.stamped)
 
 
 def in_equal_times(counts: np.ndarray, waited: np.ndarray) -> np.ndarray:
@@ -86,28 +47,6 @@ def in_equal_times(counts: np.ndarray, waited: np.ndarray) -> np.ndarray:
     more = 3.0 * usual / max(mean, 1e-9)
     found = np.asarray(counts * ((usual + more) / (waited + more)))
     return found if mean >= _MANY else np.rint(found)
-
-
-@jit
-def _number(frames, none, offsets):
-    for f in range(frames.shape[0]):
-        number = np.int64(0)
-        for p in range(frames.shape[1]):
-            number += frames[f, p] < none
-        offsets[f + 1] = offsets[f] + number
-
-
-@jit
-def _gather(frames, none, offsets, stamps, pixels):
-    """The stamps below `none`; there is room for one more, which is written behind them and written over."""
-    for f in range(frames.shape[0]):
-        k = offsets[f]
-        if k == offsets[f + 1]:
-            continue
-        for p in range(frames.shape[1]):
-            stamps[k] = frames[f, p]
-            pixels[k] = p
-            k += frames[f, p] < none
 
 
 def bits(recording: Recording) -> Iterator[tuple[int, np.ndarray]]:

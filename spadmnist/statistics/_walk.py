@@ -17,6 +17,7 @@ from ..kernels import jit
 from ..recording import Recording
 from ._counting import exposure_in, guide, logarithmic, place, sort_ticks, tick_of, whole_ticks
 from ._frames import first_stamps
+from ._order import time_order
 
 REACH = 3  # pitches
 SIZES = ((2, 2), (3, 3), (4, 4), (5, 8), (9, 16), (17, 0))  # detections in a cluster; 0: any number
@@ -26,9 +27,11 @@ _LAGS = (1e-9, 3e-9, 10e-9, 30e-9, 100e-9)  # s
 _LATER = 30e-9  # s: up to here one neighbour is asked to fire after the other
 _GAPS = (1e-9, 10e-9)  # s
 _PER_DECADE = 10
-_AT_ONCE = 16384  # events that are sorted together: they fit into the cache
+_AT_ONCE = 16384  # stamps of frames that are sorted together: they fit into the cache
+_BLOCK = 4096  # detections that are gone through together: their times fit into the nearest cache
 _DEEP = 4  # stamps of a pixel that are held; what is earlier is looked up
 _FEW_BACK = 25.0  # detections of the array within the longest lag, up to which all of them are gone through
+_LONG = 1 << 20  # ticks in the longest lag, up to which the range of each one stands in a table
 _RANGES = 8  # of lags, at most: a number that the compiler knows
 _SHIFTS = 64  # steps between stamps up to which those of the whole array are compared in turn
 _NEVER = -(1 << 62)
@@ -181,11 +184,10 @@ def _through(recording: Recording) -> Walk:
     spacings = np.zeros(edges.size, np.int64)
     crowds = np.zeros((len(RANKS), len(_SELDOM)), np.int64)
     clusters = np.zeros((len(_GAPS), len(SIZES)), np.int64)
-    upto = np.zeros(lags.size, np.int64)
     kinds = np.array([low for low, _ in SIZES])
-    # behind the classes of near pixels comes the pixel itself
-    found = np.zeros((len(near_by.names) + 1, lags.size), np.int64)
-    later = np.zeros(len(near_by.names) + 1, np.int64)
+    # behind the classes of near pixels comes the pixel itself, and then all pairs there are
+    found = np.zeros((len(near_by.names) + 2, lags.size), np.int64)
+    later = np.zeros(len(near_by.names) + 2, np.int64)
     if recording.events is None:
         for _, part in first_stamps(recording):
             between = gaps(tick), kinds, spacings, clusters
@@ -195,11 +197,12 @@ def _through(recording: Recording) -> Walk:
         offsets, end = recording.events.offsets, exposure_in(recording, tick)
         spot, stride, first, step, kind, second = around(recording.layout, near_by)
         _through_exposure(
-            stamps, offsets, end, edges, start, np.array(RANKS), crowd_edges(recording)[0], gaps(tick), kinds,
-            lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
-            spacings, crowds, clusters, upto, found, later,
+            *time_order(recording), stamps, offsets, end, edges, start, np.array(RANKS), crowd_edges(recording)[0],
+            gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
+            spacings, crowds, clusters, found, later,
         )  # fmt: skip
-    return Walk(spacings, crowds, clusters, np.diff(upto, prepend=0), found[:-1], found[-1], later[:-1])
+    own, every = found[-2:]
+    return Walk(spacings, crowds, clusters, every, found[:-2], own, later[:-2])
 
 
 def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -232,28 +235,22 @@ def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, 
 
 @jit
 def _through_exposure(
-    stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
-    spot, stride, first, step, kind, second, spacings, crowds, clusters, upto, found, later,
+    words, bits, stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
+    spot, stride, first, step, kind, second, spacings, crowds, clusters, found, later,
 ):  # fmt: skip
-    """Walk through all rows' stamps in the order of time, a slab of time after the other.
+    """Walk through the detections in the order of time, some after the others.
 
-    edges, start: of spacings, see `guide`; ranks, crowded: of crowds, with their edges; gaps, kinds: of clusters; lags:
-    (bins,) ticks; spot, ..., second: see `around`. Adds to spacings, crowds, clusters, upto (bins,) pairs of the array
-    that are nearer than each of `lags`, found (classes, bins) pairs of near pixels, later (classes,).
+    words, bits: see `TimeOrder`; stamps, offsets: the same by rows; edges, start: of spacings, see `guide`; ranks,
+    crowded: of crowds, with their edges; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
+    `around`.
+    Adds to spacings, crowds, clusters, found (classes, bins) pairs of near pixels, and of all in the last one, later
+    (classes,).
     """
+    total = words.size
     rows = offsets.size - 1
-    total = offsets[rows]
-    if total == 0:
-        return
-    slabs = 1 + total // max(_AT_ONCE, 2 * rows)
-    width = end // slabs + 1
     spots = np.int64(0)
     for row in range(rows):
         spots = max(spots, spot[row] + 1 + REACH * (stride + 1))
-    bits = 0
-    while (np.int64(1) << bits) < spots:
-        bits += 1
-    top = (np.int64(1) << (62 - bits)) - 1
     row_of = np.full(spots, -1)
     recent = np.full((_DEEP, spots), _NEVER)  # the last stamps that were passed
     latest_at = np.full(_DEEP + 1, _NEVER)  # of all those that ever stood at each depth; the last is held no longer
@@ -261,82 +258,70 @@ def _through_exposure(
     for row in range(rows):
         row_of[spot[row]] = row
         passed[spot[row]] = offsets[row] - 1
-    position = offsets[:-1].copy()
-    raw = np.empty(2 * total // slabs + 1024, np.int64)
-    spare = np.empty(0, np.int64)
-    ordered = np.empty(0, np.int64)
-    times = np.empty(0, np.int64)
-    heads = np.empty((2, 2049), np.int64)
-    held = 0  # stamps of the slabs before that are near enough to matter
     longest = lags[lags.size - 1]
-    back = stride > 0 and np.float64(total) * longest < _FEW_BACK * end
+    usual = np.float64(total) / end
+    back = stride > 0 and usual * longest < _FEW_BACK and longest <= _LONG
     reach = REACH * (stride + 1)
     entry_of = np.full(2 * reach + 2, step.size)  # of the way from one spot to another; nobody's are the last
     for e in range(step.size if back else 0):
         entry_of[step[e] + reach] = e
-    tail = 0  # of them, those that stand before the sorted ones
+    range_of = _range_of(lags, latest) if back else np.empty(0, np.uint8)
+    most = ranks[ranks.size - 1]
+    times = np.empty(2 * _BLOCK, np.int64)
+    some = np.empty(_BLOCK, np.int64)
     runs = np.ones(gaps.size, np.int64)
-    last = np.int64(-1)
-    past = np.full(ranks[ranks.size - 1], _NEVER)  # the last stamps before a slab
-    for slab in range(slabs):
-        stop = (slab + 1) * width if slab < slabs - 1 else top
-        before = position.copy()
-        count = _gather(stamps, offsets, position, stop, spot, bits, raw)
-        while count < 0:
-            raw = np.empty(2 * raw.size, np.int64)
-            position[:] = before
-            count = _gather(stamps, offsets, position, stop, spot, bits, raw)
-        if spare.size < count:
-            spare = np.empty(raw.size, np.int64)
-        if ordered.size < tail + count:
-            wider = np.empty(tail + raw.size, np.int64)
-            wider[:tail] = ordered[:tail]
-            ordered = wider
-        if times.size < held + count:
-            grown = np.empty(held + raw.size, np.int64)
-            grown[:held] = times[:held]
-            times = grown
-        sort_ticks(raw, count, (slab * width) << bits, width << bits, ordered, tail, spare, heads)
+    for begin in range(0, total, _BLOCK):
+        stop = min(begin + _BLOCK, total)
+        # with those before that are near enough to matter
+        oldest = begin
+        if not back:
+            oldest = _after(words, bits, begin, (words[begin] >> bits) - longest)
+        oldest = max(min(oldest, begin - most), 0)
+        if times.size < stop - oldest:
+            times = np.empty(2 * (stop - oldest), np.int64)
+        for i in range(oldest, stop):
+            times[i - oldest] = words[i] >> bits
+        held, count = begin - oldest, stop - oldest
         if back:
-            _near_pairs_back(ordered, tail, tail + count, bits, lags, latest, entry_of, kind, second, found, later)
+            _near_pairs_back(
+                words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
+            )
         else:
             _near_pairs(
-                ordered[:count], bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
+                words[begin:stop], bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
                 row_of, recent, latest_at, passed, found, later,
             )  # fmt: skip
-        for i in range(count):
-            times[held + i] = ordered[tail + i] >> bits
-        last = _follow(times, held, held + count, last, edges, start, gaps, kinds, runs, spacings, clusters)
-        whole = held + count
-        _crowds(times[held:whole], past, ranks, crowded, crowds)
-        for k in range(lags.size):
-            upto[k] += _pairs(times, held, whole, lags[k], np.float64(total) * lags[k] / end)
-        oldest = _since(times, 0, whole, stop - longest)
-        for i in range(oldest, whole):
-            times[i - oldest] = times[i]
-        if back:  # as many of those that know their spots
-            for i in range(oldest, whole):
-                ordered[i - oldest] = ordered[i]
-            tail = whole - oldest
-        held = whole - oldest
+            before = np.int64(0)
+            for k in range(lags.size):
+                nearer = _pairs(times, held, count, lags[k], usual * lags[k])
+                found[found.shape[0] - 1, k] += nearer - before
+                before = nearer
+        _spacings(times, max(held, 1), count, edges, start, spacings)
+        _clusters(times, max(held, 1), count, gaps, kinds, runs, some, clusters)
+        for r in range(ranks.size):
+            i = max(held, ranks[r])
+            before = np.int64(0)
+            for bin in range(crowded.shape[1] if i < count else 0):
+                closer = _nearer(times[i:count], times[i - ranks[r] : count - ranks[r]], crowded[r, bin])
+                crowds[r, bin] += closer - before
+                before = closer
     _finish(kinds, runs, clusters)
 
 
 @jit
-def _gather(stamps, offsets, position, stop, spot, bits, raw):
-    """The stamps before `stop`, with their spots in the lower bits; moves `position` on. -1 where there is no room."""
-    count = 0
-    for row in range(offsets.size - 1):
-        i = position[row]
-        while i < offsets[row + 1] and np.int64(stamps[i]) < stop:
-            i += 1
-        if count + i - position[row] > raw.size:
-            return -1
-        for k in range(position[row], i):
-            raw[count] = (np.int64(stamps[k]) << bits) | spot[row]
-            count += 1
-        position[row] = i
-    return count
+def _after(words, bits, end, time):
+    """The first of the words before `end` that is later than `time`, looked for from there back."""
+    far = 1
+    while far < end and (words[end - far] >> bits) > time:
+        far *= 2
+    low, high = max(end - far, 0), end
+    while low < high:
+        middle = (low + high) // 2
+        if (words[middle] >> bits) > time:
+            high = middle
+        else:
+            low = middle + 1
+    return low
 
 
 @jit
@@ -346,6 +331,16 @@ def _ranges(lags, latest):
     limits = np.full(_RANGES, lags[lags.size - 1])
     limits[: ranges.size] = ranges
     return limits, ranges.size
+
+
+@jit
+def _range_of(lags, latest):
+    """(longest lag,) uint8, the range of each lag; see `_ranges`."""
+    limits, ranges = _ranges(lags, latest)
+    out = np.zeros(lags[lags.size - 1], np.uint8)
+    for k in range(ranges - 1):
+        out[limits[k] :] += np.uint8(1)
+    return out
 
 
 @jit
@@ -362,10 +357,13 @@ def _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, lat
 
 
 @jit
-def _near_pairs_back(ordered, begin, end, bits, lags, latest, entry_of, kind, second, found, later):
-    """As `_near_pairs`, where few stamps are near in time: all of these are gone through.
+def _near_pairs_back(
+    words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
+):  # fmt: skip
+    """As `_near_pairs`, where few detections are near in time: all of these are gone through, and counted.
 
-    ordered: of the stamps before `begin` those that are near enough are there, too; entry_of: see `_through_exposure`.
+    words: all of them, of which those from `begin` to `stop` are looked back from; range_of: the function of that name;
+    entry_of: see `_through_exposure`; some: a buffer for as many.
     """
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
@@ -373,29 +371,40 @@ def _near_pairs_back(ordered, begin, end, bits, lags, latest, entry_of, kind, se
     counters = np.zeros((kind.size + 1, _RANGES + 1), np.int64)
     reach = np.int64(entry_of.size // 2 - 1)
     most = np.uint64(entry_of.size - 1)
-    for i in range(begin, end):
-        now = ordered[i] >> bits
-        here = reach - (ordered[i] & mask)
-        j = i - 1
-        while j >= 0:
-            lag = now - (ordered[j] >> bits)
-            if lag >= longest:
-                break
+    # those that are next to each other, then those next but one that were near enough, and so on until there are none
+    left = np.uint64(stop - begin)
+    for k in range(left):
+        some[k] = begin + np.int64(k)
+    step = 0
+    while left > 0:
+        step += 1
+        still = np.uint64(0)
+        for k in range(left):
+            i = some[k]
+            some[still] = i
+            apart = (words[i] >> bits) - (words[max(i - step, 0)] >> bits)
+            still += np.uint64((i >= step) & (apart < longest))
+        left = still
+        for k in range(left):
+            i = some[k]
+            j = i - step
+            lag = (words[i] >> bits) - (words[j] >> bits)
             # far ones, which are most, all go to the place behind the last
-            way = min(np.uint64(here + (ordered[j] & mask)), most)
-            e = entry_of[way]
-            if e < kind.size:
-                k = np.uint64(0)
-                for limit in range(_RANGES):
-                    k += np.uint64(lag >= limits[limit])
-                counters[e, k] += 1
-            j -= 1
+            way = min(np.uint64(reach - spot[words[i] & mask] + spot[words[j] & mask]), most)
+            counters[np.uint64(entry_of[way]), np.uint64(range_of[np.uint64(lag)])] += 1
     _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
+    every = found[found.shape[0] - 1]
+    for e in range(kind.size + 1):
+        b = 0
+        for k in range(ranges):
+            while lags[b] < limits[k]:
+                b += 1
+            every[b] += counters[e, k]
 
 
 @jit
 def _near_pairs(
-    ordered, bits, stamps, offsets, lags, latest, stride, first, step, kind, second,
+    words, bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
     row_of, recent, latest_at, passed, found, later,
 ):  # fmt: skip
     """Count the pairs that each stamp makes with earlier ones around it; moves `recent`, ..., `passed` on."""
@@ -405,9 +414,9 @@ def _near_pairs(
     counters = np.zeros((step.size, _RANGES + 1), np.int64)
     hits = np.empty(step.size + 1, np.int64)
     begin, end, base = np.int64(0), np.int64(step.size), np.int64(0)
-    for i in range(ordered.size):
-        now = ordered[i] >> bits
-        here = ordered[i] & mask
+    for i in range(words.size):
+        now = words[i] >> bits
+        here = spot[words[i] & mask]
         if now - latest_at[0] < longest:
             if stride > 0:
                 base = here
@@ -506,39 +515,38 @@ def _nearer(later, earlier, lag):
 
 
 @jit
-def _follow(times, begin, end, last, edges, start, gaps, kinds, runs, spacings, clusters):
-    """Count spacings and clusters of times in order; last: the one before them, -1 without. Returns the last one."""
+def _spacings(times, begin, end, edges, start, spacings):
+    """Count the spacings of times in order, from that between `begin` and the one before it."""
     for i in range(begin, end):
-        now = times[i]
-        if last >= 0:
-            apart = now - last
-            spacings[place(apart, edges, start) + 1] += 1
-            for g in range(gaps.size):
-                if apart <= gaps[g]:
-                    runs[g] += 1
-                elif runs[g] > 1:
-                    _end_of_run(kinds, runs[g], clusters[g])
-                    runs[g] = 1
-        last = now
-    return last
+        spacings[place(times[i] - times[i - 1], edges, start) + 1] += 1
 
 
 @jit
-def _crowds(times, past, ranks, crowded, crowds):
-    """Count crowds of times in order by how long they last. past: (most,) the times before them, brought up to date."""
-    most = past.size
-    for i in range(times.size):
-        for r in range(ranks.size):
-            k = i - ranks[r]
-            apart = times[i] - (times[k] if k >= 0 else past[most + k])
-            bin = crowded.shape[1]
-            while bin > 0 and apart < crowded[r, bin - 1]:
-                bin -= 1
-            if bin < crowded.shape[1]:
-                crowds[r, bin] += 1
-    some = min(times.size, most)
-    past[: most - some] = past[some:].copy()
-    past[most - some :] = times[times.size - some :]
+def _clusters(times, begin, end, gaps, kinds, runs, some, clusters):
+    """Count clusters of times in order. runs: (gaps,) how long the one is to which that before `begin` belongs, which
+    is brought up to date; some: (most,) a buffer, of which a time that is close to the one before takes one.
+    """
+    widest = gaps[gaps.size - 1]
+    close = np.uint64(0)
+    for i in range(begin, end):
+        some[close] = i
+        close += np.uint64(times[i] - times[i - 1] <= widest)
+    for g in range(gaps.size):
+        last = begin - 1
+        for k in range(close):
+            i = some[k]
+            if times[i] - times[i - 1] > gaps[g]:
+                continue
+            if i > last + 1:
+                if runs[g] > 1:
+                    _end_of_run(kinds, runs[g], clusters[g])
+                runs[g] = 1
+            runs[g] += 1
+            last = i
+        if last < end - 1:
+            if runs[g] > 1:
+                _end_of_run(kinds, runs[g], clusters[g])
+            runs[g] = 1
 
 
 @jit
@@ -569,9 +577,8 @@ def _through_frames(offsets, stamps, none, edges, start, gaps, kinds, spacings, 
     for f in range(frames):
         most = max(most, offsets[f + 1] - offsets[f])
     raw = np.empty(most, np.int64)
-    spare = np.empty(most, np.int64)
     times = np.empty(most, np.int64)
-    heads = np.empty((2, 2049), np.int64)
+    some = np.empty(most + 1, np.int64)
     runs = np.ones(gaps.size, np.int64)
     first = 0
     while first < frames:
@@ -582,12 +589,13 @@ def _through_frames(offsets, stamps, none, edges, start, gaps, kinds, spacings, 
         for f in range(first, last):
             for i in range(offsets[f], offsets[f + 1]):
                 raw[i - before] = (np.int64(f - first) << bits) | np.int64(stamps[i])
-        sort_ticks(raw, offsets[last] - before, 0, np.int64(last - first) << bits, times, 0, spare, heads)
+        sort_ticks(raw, offsets[last] - before, 0, np.int64(last - first) << bits, times, 0)
         for f in range(first, last):
             begin, end = offsets[f] - before, offsets[f + 1] - before
             if end - begin > 1:
                 for i in range(begin, end):
                     times[i] &= mask
-                _follow(times, begin, end, -1, edges, start, gaps, kinds, runs, spacings, clusters)
+                _spacings(times, begin + 1, end, edges, start, spacings)
+                _clusters(times, begin + 1, end, gaps, kinds, runs, some, clusters)
                 _finish(kinds, runs, clusters)
         first = last

@@ -17,7 +17,8 @@ from ._frames import as_words, at_ends, bits, count_ones, moments
 _SHORTEST, _LONGEST = 10e-9, 10e-3  # s
 _LAGS = (1, 2, 3, 5, 10, 20, 50, 100)  # frames
 _PER_OCTAVE = 4
-_SPARSE = 0.75  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
+_BOXES, _NARROW = 4096, 724  # boxes whose products fit into 32 bits together, up to what number in a box
+_SPARSE = 1.5  # stamps in a window of 8 boxes, up to which pairs are looked up one by one
 
 
 class Autocorrelation(Statistic):
@@ -201,15 +202,32 @@ def _add_pair(here, there, weight, levels, held):
 def _many(filled, size, level, out):
     """The products of boxes for all levels from `level` on; the boxes are added up in place."""
     while level < out.shape[0]:
-        for d in range(4, 8):
-            total = np.int64(0)
-            for i in range(size - d):
-                total += np.int64(filled[i]) * np.int64(filled[i + d])
-            out[level, d - 4] += total
+        most = np.int32(0)
+        for i in range(size):
+            most = max(most, filled[i])
+        for first in range(0, size, _BOXES):
+            _add_products(filled[first : min(first + _BOXES + 7, size)], most, out[level])
         size >>= 1
         for i in range(size):
             filled[i] = filled[2 * i] + filled[2 * i + 1]
         level += 1
+
+
+@jit
+def _add_products(boxes, most, out):
+    """Add the products of the first `_BOXES` boxes with those 4 to 7 further on. most: in any box."""
+    if most <= _NARROW:  # sums of narrow numbers, of which a processor takes more at a time
+        for d in range(4, 8):
+            total = np.int32(0)
+            for i in range(min(_BOXES, boxes.size - d)):
+                total = np.int32(total + np.int32(boxes[i] * boxes[i + d]))
+            out[d - 4] += total
+        return
+    for d in range(4, 8):
+        wide = np.int64(0)
+        for i in range(min(_BOXES, boxes.size - d)):
+            wide += np.int64(boxes[i]) * np.int64(boxes[i + d])
+        out[d - 4] += wide
 
 
 def _products(recording: Recording, lags: np.ndarray) -> np.ndarray:

@@ -13,14 +13,14 @@ import numpy as np
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
-from ._counting import exposure_in, span, whole_ticks
+from ._counting import exposure_in, span, tick_of
+from ._order import time_order
 from ._scores import largest_score, shares
 from ._walk import REACH
 
 _STEP, _LONGEST = 1e-9, 300e-9  # s, between delays; the longest
 _MOST_STEPS = 4096  # from one pixel to another, of a grid
 _PAIRS = 1_500_000  # that are looked at, about
-_PLACE, _HERE = 12, 4095  # bits of a place on the grid
 _LEAST_CHANCE = 1e-6  # of pairs that chance makes
 
 
@@ -51,23 +51,22 @@ class Delays(Statistic):
         if not steps.names:
             return None
         assert recording.events is not None
-        ticks, tick = whole_ticks(recording)
+        tick = tick_of(recording)
         step = max(1, round(_STEP / tick))
         delays = max(1, round(_LONGEST / tick) // step)
-        offsets = recording.events.offsets
+        words, bits = time_order(recording)
         exposure = exposure_in(recording, tick)
         looked_at = exposure
-        if len(ticks):
-            by_chance = len(ticks) ** 2 * step * delays / exposure
+        if len(words):
+            by_chance = len(words) ** 2 * step * delays / exposure
             looked_at = math.ceil(exposure * min(1.0, _PAIRS / max(by_chance, 1.0)))
-        some = ticks < looked_at
-        pixels = np.repeat(np.arange(recording.pixels), np.diff(offsets))[some]
-        order = np.sort((ticks[some].astype(np.int64) << _PLACE) | steps.place[pixels])
+        some = words[: np.searchsorted(words, looked_at << bits)]
+        detections = len(some)
         counts = np.zeros((steps.number, delays), np.int32)
-        _count(order, step, counts)
+        _count(some, bits, steps.place, step, counts)
         counts = steps.joined(counts)
         most = counts.max(axis=1)
-        n = np.bincount(pixels, minlength=recording.pixels).astype(np.float64)
+        n = np.bincount(some & ((1 << bits) - 1), minlength=recording.pixels).astype(np.float64)
         chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
         scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
 
@@ -78,7 +77,7 @@ class Delays(Statistic):
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             found, mean = int(most[cell]), float(chance[cell])
             text = f"{found} pairs within {show(step * tick, 's')}, {mean:.3g} by chance"
-            return text, (found - mean) / max(1, int(some.sum()))
+            return text, (found - mean) / max(1, detections)
 
         return Summary(scores, "normal", where, size, scale=np.ones(scores.size))
 
@@ -125,17 +124,18 @@ _ENDS = ("up", "down")
 
 
 @jit
-def _count(order, step, counts):
-    """Add pairs to counts (steps over the grid, delays). order: (detections,) tick << _PLACE | place, rising."""
+def _count(words, bits, place, step, counts):
+    """Add pairs to counts (steps over the grid, delays). words, bits: see `TimeOrder`; place: (pixels,) of each."""
+    mask = (np.int64(1) << bits) - 1
     of_lag = np.arange(step * counts.shape[1]) // step
     zero = counts.shape[0] // 2  # no way at all
-    for i in range(order.size):
-        at, here = order[i] >> _PLACE, (order[i] & _HERE) - zero
-        for j in range(i + 1, order.size):
-            lag = (order[j] >> _PLACE) - at
+    for i in range(words.size):
+        at, here = words[i] >> bits, place[words[i] & mask] - zero
+        for j in range(i + 1, words.size):
+            lag = (words[j] >> bits) - at
             if lag >= of_lag.size:
                 break
-            counts[(order[j] & _HERE) - here, of_lag[lag]] += 1
+            counts[place[words[j] & mask] - here, of_lag[lag]] += 1
 
 
 def _meeting(n: np.ndarray) -> np.ndarray:

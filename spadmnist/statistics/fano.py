@@ -10,7 +10,9 @@ import numpy as np
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
+from ._counting import tick_of
 from ._frames import as_words, bits, count_ones, frame_sums
+from ._order import time_order
 from ._scores import Pairs, minority, nested, number_at, pair_scores, pairs_law, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 
@@ -101,17 +103,6 @@ def pairs_in_windows(sums, levels):
         for k in range(windows):
             sums[k] = sums[2 * k] + sums[2 * k + 1]
     return pairs
-
-
-@jit
-def event_sums(stamps, factor, windows):
-    """(windows,) int32 events of the whole array in each window. factor: windows per unit of the stamps."""
-    out = np.zeros(windows, np.int32)
-    for i in range(stamps.size):
-        window = np.int64(stamps[i] * factor)
-        if window < windows:
-            out[window] += 1
-    return out
 
 
 @jit
@@ -358,9 +349,12 @@ class ArrayFano(Statistic):
         conditions = recording.conditions
         if recording.events is not None:
             levels, shortest = _exact_lengths(conditions.exposure, _MOST)
-            found, unit = stamps(recording)
-            sums = event_sums(found, unit / shortest, _WINDOWS << (levels - 1))
-            slots = np.inf
+            words, bits_of_pixel = time_order(recording)
+            # as if all were of one pixel
+            one_row = words >> bits_of_pixel, np.array([0, len(words)])
+            pairs, inside = event_pairs(*one_row, tick_of(recording) / shortest, levels)
+            slots, total, scatter = np.inf, int(inside[0]), 0.0
+            detections, windows = float(total), _WINDOWS << (levels - 1)
             lengths = shortest * 2.0 ** np.arange(levels)
         else:
             if recording.n_frames < _WINDOWS:
@@ -369,18 +363,17 @@ class ArrayFano(Statistic):
             sums = frame_sums(recording)[: recording.n_frames >> (levels - 1) << (levels - 1)].copy()
             slots = slots_of_frame(recording)
             lengths = _frame_length(recording) * 2.0 ** np.arange(levels)
-        total, scatter = int(sums.sum()), 0.0
-        if np.isfinite(slots):
-            # a pixel's number is binomial, the array's the sum of different ones
-            places = recording.n_frames * slots
-            taken = recording.totals / places
-            scatter = float((taken * (1.0 - taken)).sum()) * slots * _drawn(places)
-            if total > slots * recording.pixels / 2.0 * len(sums):  # free slots scatter like those that are taken
-                sums = int(slots) * recording.pixels - sums
-        detections = float(sums.sum())
+            total, scatter = int(sums.sum()), 0.0
+            if np.isfinite(slots):
+                # a pixel's number is binomial, the array's the sum of different ones
+                places = recording.n_frames * slots
+                taken = recording.totals / places
+                scatter = float((taken * (1.0 - taken)).sum()) * slots * _drawn(places)
+                if total > slots * recording.pixels / 2.0 * len(sums):  # free slots scatter like those that are taken
+                    sums = int(slots) * recording.pixels - sums
+            detections, windows = float(sums.sum()), len(sums)
+            pairs = pairs_in_windows(sums, levels)
         share = shares(np.append(recording.totals, levels), levels)
-        windows = len(sums)
-        pairs = pairs_in_windows(sums, levels)
         scores, laws, noises = [], [], []
         for level in range(levels):
             n = windows >> level

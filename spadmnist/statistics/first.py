@@ -41,7 +41,9 @@ class FirstArrivals(Statistic):
         edges = _edges(recording.none)
         counts = np.zeros((len(_AFTER), edges.size - 1), np.int64)
         kind, last = np.zeros(recording.pixels, np.int8), np.full(recording.pixels, -1)
-        bin_of = np.repeat(np.arange(edges.size - 1), np.diff(edges)) if recording.none <= 1 << 22 else np.zeros(0, int)
+        bin_of = np.zeros(0, np.uint8)
+        if recording.none <= 1 << 22:
+            bin_of = np.repeat(np.arange(edges.size - 1, dtype=np.uint8), np.diff(edges))
         late = round(_LATE * recording.none)
         for first, found in first_stamps(recording):
             _arrivals(*found, first, late, edges, bin_of, kind, last, counts)

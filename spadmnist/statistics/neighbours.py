@@ -17,6 +17,7 @@ from ._frames import at_ends, bits, count_ones, first_stamps, frame_sums, moment
 from ._walk import REACH, Near, around, lag_edges, latest, near, walk
 
 _CROWDED = 24  # places for each stamp, up to which all places of a frame are gone through
+_SPOTS = 512  # places that are looked at together
 _BLOCK = 4096  # words that are looked at together: they stay in the cache
 _PARTS = 64  # of a frame, in which the times of first stamps are counted
 
@@ -391,13 +392,15 @@ def _close(offsets, stamps, pixels, edges, spot, stride, begins, step, kind, hel
         if stride > 0 and number * _CROWDED > spot.size:
             low, high = spot[0], spot[spot.size - 1] + 1
             for e in range(step.size):
-                for b in range(edges.size - 1, -1, -1):
-                    pairs = _within(one[low:high], other[low + step[e] : high + step[e]], edges[b])
-                    if pairs == 0:
-                        break
-                    out[kind[e], b] += pairs
-                    if b + 1 < edges.size:
-                        out[kind[e], b + 1] -= pairs
+                for at in range(low, high, _SPOTS):
+                    until = min(at + _SPOTS, high)
+                    for b in range(edges.size - 1, -1, -1):
+                        pairs = _within(one[at:until], other[at + step[e] : until + step[e]], edges[b])
+                        if pairs == 0:  # as it is of most
+                            break
+                        out[kind[e], b] += pairs
+                        if b + 1 < edges.size:
+                            out[kind[e], b + 1] -= pairs
         elif number > 1:
             for i in range(offsets[f], offsets[f + 1]):
                 here, now = spot[pixels[i]], np.int64(stamps[i])

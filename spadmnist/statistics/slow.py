@@ -116,17 +116,16 @@ def _end_of_block(number, each, held, pairs, inside):
 
     number: of blocks that there were; each: of them make one of each level. Adds to pairs (levels, ...), inside (...).
     """
-    for i in range(inside.shape[0]):
-        for j in range(inside.shape[1]):
-            count = held[0, i, j]
-            inside[i, j] += count
-            for level in range(each.size):
-                if level > 0:
-                    held[level, i, j] += count
-                if number % each[level] == 0:
-                    whole = held[level, i, j]
-                    pairs[level, i, j] += whole * (whole - 1) // 2
-                    held[level, i, j] = 0
+    inside += held[0]
+    for level in range(each.size - 1, -1, -1):
+        now = held[level]
+        if level > 0:
+            now += held[0]
+        if number % each[level] == 0:
+            for i in range(now.shape[0]):
+                for j in range(now.shape[1]):
+                    pairs[level, i, j] += now[i, j] * (now[i, j] - 1) // 2
+            now[:] = 0
 
 
 def _block_time(recording: Recording, blocks: int) -> float:

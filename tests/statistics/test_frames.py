@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from simple_sensor import one_of_each
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simple_sensor import one_of_each, stamped
 
+from spadmnist import kernels
 from spadmnist.inference.replicates import statistics_for
-from spadmnist.recording import Recording
-from spadmnist.statistics._frames import add_pixels, contiguous, first_stamps, frame_sums
+from spadmnist.recording import FirstStamps, Recording, StampedFrames
+from spadmnist.statistics._frames import add_pixels, first_stamps, frame_sums
 
 
 def test_first_stamps_are_those_of_the_frames() -> None:
@@ -29,9 +34,39 @@ def test_sums_of_pixels(frames: int) -> None:
     assert totals.tolist() == (bits.sum(axis=0).ravel() + 1).tolist()
 
 
-def test_frames_in_another_order_of_memory() -> None:
-    frames = np.arange(37 * 3 * 5).reshape(3, 5, 37).transpose(2, 0, 1)
-    assert contiguous(frames).flags.c_contiguous and np.array_equal(contiguous(frames), frames.reshape(37, 15))
+@pytest.mark.parametrize("frames", [1, 4, 403])
+def test_frames_that_are_held_as_their_stamps(frames: int) -> None:
+    """They are read like any others, and statistics find in them the same."""
+    dense = stamped(3, (frames, 6, 11), 0.2)
+    whole = np.asarray(dense.frames[:])  # type: ignore[index]
+    found = FirstStamps(*kernels.stamps_of_frames(whole.reshape(frames, -1), dense.none))
+    held = replace(dense, frames=StampedFrames(found, dense.none, whole.shape), _kept={})
+    assert held.frames is not None and held.n_frames == frames
+    for part in (slice(None), slice(1, 3), slice(3, 1), slice(-2, None), slice(None, None, -3), slice(2, None, 2)):
+        assert np.array_equal(held.frames[part], whole[part]) and held.frames[part].dtype == np.uint32
+    assert np.array_equal(held.totals, dense.totals)
+    assert (held.waited is None) == (dense.waited is None)
+    for statistic in statistics_for(dense.capture):
+        summary, wanted = statistic.reduce(held), statistic.reduce(dense)
+        assert (summary is None) == (wanted is None)
+        assert summary is None or wanted is None or np.array_equal(summary.values, wanted.values), statistic.name
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(0, 9), st.integers(1, 7), st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_how_long_first_detections_were_waited_for(frames: int, pixels: int, share: float, seed: int) -> None:
+    """Beside a literal sum, to the last bit."""
+    rng = np.random.default_rng(seed)
+    stamps = np.where(rng.random((frames, pixels)) < share, rng.integers(3, 900, (frames, pixels)), 1000)
+    of_pixels, of_frames = np.zeros(pixels), np.zeros(frames)
+    kernels.add_waits(*kernels.stamps_of_frames(stamps.astype(np.uint32), 1000), 3, 900, of_pixels, of_frames)
+    wanted_pixels, wanted_frames = [0.0] * pixels, [0.0] * frames
+    for f in range(frames):
+        for p in range(pixels):
+            waited = (int(stamps[f, p]) - 3 + 0.5) * (1.0 / 898) if stamps[f, p] < 1000 else 1.0
+            wanted_pixels[p] += waited
+            wanted_frames[f] += waited
+    assert of_pixels.tolist() == wanted_pixels and of_frames.tolist() == wanted_frames
 
 
 @pytest.mark.parametrize("kind", ["qis", "str", "counts", "counter"])

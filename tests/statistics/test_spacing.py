@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import laws
@@ -11,8 +12,10 @@ import pytest
 from simple_sensor import grid, many, one_of_each, reduced, sigmas, stamped, str_of, tr, tr_of
 
 from spadmnist import recording as recordings
+from spadmnist.events import Events
 from spadmnist.recording import Recording
 from spadmnist.statistics._counting import guide, logarithmic, place, sort_ticks
+from spadmnist.statistics._order import time_order
 from spadmnist.statistics._walk import crowd_edges, walk
 from spadmnist.statistics.spacing import Crowds, Multiplicity, Spacing
 
@@ -108,12 +111,26 @@ def test_bins_are_found_at_once() -> None:
 
 def test_sorting() -> None:
     rng = np.random.default_rng(1)
-    heads = np.empty((2, 2049), np.int64)
     for count in (0, 1, 400, 5000, 70_000):
         for raw in (rng.integers(0, 1 << 40, count), rng.integers(5, 90, count), np.arange(count)[::-1] - (1 << 30)):
             out = np.full(count + 3, -7)
-            sort_ticks(raw.astype(np.int64), count, 0, 1 << 40, out, 3, np.empty(count, np.int64), heads)
+            sort_ticks(raw.astype(np.int64), count, 0, 1 << 40, out, 3)
             assert np.array_equal(out[3:], np.sort(raw)) and (out[:3] == -7).all()
+
+
+@pytest.mark.parametrize("rates", [0.0, 3e4, 3e6])
+def test_the_order_of_time(rates: float) -> None:
+    """Of many pixels, of some in which stamps are not in order, and of stamps behind the end."""
+    recording = tr(3, grid(7, 9), rates, 5e-3, tick=1e-10)
+    ticks = np.asarray(recording.events.ticks).astype(np.int64)  # type: ignore[union-attr]
+    pixels = recording.events.pixel  # type: ignore[union-attr]
+    for change in (0, 1 << 30, -7):
+        changed = ticks.copy()
+        changed[3::50] = abs(changed[3::50] + change)
+        events = Events(None, recording.events.offsets, 63, changed.astype(np.uint64), 1e-10)  # type: ignore[union-attr]
+        words, bits = time_order(replace(recording, events=events, _kept={}))
+        wanted = sorted(zip(changed.tolist(), pixels.tolist(), strict=True))
+        assert [(int(w) >> bits, int(w) & ((1 << bits) - 1)) for w in words] == wanted
 
 
 STEADY = {
