@@ -192,6 +192,9 @@ def generate(
     The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
     drawn value of what is made.
 
+    Pictures of your own are `source: folder` (spadmnist init writes such a config). A pixel's photons follow its grey
+    level. With `gamma: srgb` the level is first taken back from sRGB to light: half of white gets 21 % of its photons.
+
     \b
     spadmnist generate configs/quick.yaml -o out
     spadmnist generate configs/spad_mnist.yaml -o full --images-dir ~/mnist
@@ -199,12 +202,15 @@ def generate(
     """
     from . import config as configs
     from . import factory
+    from . import images as sources
 
     _load(plugin_files)
     experiment = configs.read(config, seed, format_, levels, limit, causes)
     for note in experiment.notes:
         _say(f"Note: {note}")
     images = experiment.load_images(images_dir)
+    for note in sources.notes(images):
+        _say(f"Note: {note}")
     root = output if output is not None else Path(config.stem)
     workers = jobs or factory.most_workers(experiment, images, processors())
     if dry_run:

@@ -23,7 +23,7 @@ LAYERS = [
     {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "compiled"},
     {"import_options"},
     {"disk", "kernels", "workers"},
-    {"document", "section", "plugins", "events", "image_files", "digits", "store", "tiles"},
+    {"document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
     {"validated", "scene"},
     {"effects", "readout", "images", "pictures", "window"},
     {"gather", "grids", "recording"},
