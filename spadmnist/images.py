@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, model_validator
+from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
 from . import disk, image_files, tiles
 from .digits import draw_digit
@@ -458,6 +458,10 @@ class _AtMost:
 # --- folders of images -----------------------------------------------------------------------------------
 
 
+_SIDE = {"type": "integer", "minimum": 1}
+_SIZE = {"anyOf": [_SIDE, {"type": "array", "items": _SIDE, "minItems": 2, "maxItems": 2}, {"type": "null"}]}
+
+
 def _size(raw: object) -> list[int] | None:
     """[rows, columns]; one number stands for both."""
     size: Any = [raw, raw] if isinstance(raw, int) else raw
@@ -487,7 +491,7 @@ class Folder(_Source):
     source: Literal["folder"] = "folder"
     path: str = Field(min_length=1, description="the folder")
     white: float | None = Field(default=None, gt=0, description="the grey level of white; 255, or 65535 for 16 bits")
-    resize: Annotated[Any, PlainValidator(_size), LATER] = Field(
+    resize: Annotated[Any, PlainValidator(_size), WithJsonSchema(_SIZE), LATER] = Field(
         default=None, description="the size that pictures are brought to: N, or [rows, columns]; light is averaged"
     )
     fit: Annotated[Literal["crop", "pad", "stretch"], LATER] = Field(
@@ -520,7 +524,7 @@ class Folder(_Source):
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
         root = _find(self.path, [images_dir if images_dir is not None else base], Path.is_dir)
-        names, ignored = _image_files(root)
+        names, ignored = pictures_in(root)
         prefixes = {split: f"{split}/" for split in ("train", "test") if (root / split).is_dir()}
         if list(prefixes) == ["test"]:
             raise InputError(
@@ -564,8 +568,11 @@ def _white(given: float | None, dtype: np.dtype[Any]) -> float:
     return float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
 
 
-def _image_files(root: Path) -> tuple[list[str], int]:
-    """The image files below `root`, as relative paths in their order, and the number of other files."""
+def pictures_in(root: Path) -> tuple[list[str], int]:
+    """The image files below `root`, as relative paths in their order, and the number of other files.
+
+    Raises InputError for a link that leads back, and for a name that is no text; OSError as the system does.
+    """
 
     def fail(error: OSError) -> None:
         raise error
