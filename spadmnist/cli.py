@@ -192,6 +192,9 @@ def generate(
     The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
     drawn value of what is made.
 
+    Pictures of your own are `source: folder` (spadmnist init writes such a config). A pixel's photons follow its grey
+    level. With `gamma: srgb` the level is first taken back from sRGB to light: half of white gets 21 % of its photons.
+
     \b
     spadmnist generate configs/quick.yaml -o out
     spadmnist generate configs/spad_mnist.yaml -o full --images-dir ~/mnist
@@ -199,12 +202,15 @@ def generate(
     """
     from . import config as configs
     from . import factory
+    from . import images as sources
 
     _load(plugin_files)
     experiment = configs.read(config, seed, format_, levels, limit, causes)
     for note in experiment.notes:
         _say(f"Note: {note}")
     images = experiment.load_images(images_dir)
+    for note in sources.notes(images):
+        _say(f"Note: {note}")
     root = output if output is not None else Path(config.stem)
     workers = jobs or factory.most_workers(experiment, images, processors())
     if dry_run:
@@ -233,6 +239,66 @@ def generate(
         _say("")
         _say(f"Made {outcome.made} shards in {_duration(outcome.seconds)}{kept}: {root}")
         _say(f"Look at it:  spadmnist inspect {quoted(root)} --plot {quoted(f'{root.name}.png')}")
+
+
+@cli.command(short_help="Begin: a config and a sensor, or a plan for a bench, every line explained.")
+@click.argument("folder", type=_Place())
+@click.option("--images", type=click.Path(path_type=Path), metavar="DIR", help="A folder of pictures of your own.")
+@click.option(
+    "--sensor",
+    type=click.Choice(["spad23", "spad512", "spad_mnist"]),
+    default="spad_mnist",
+    help="The sensor to begin with.  [default: spad_mnist]",
+)
+@click.option("--measurement", is_flag=True, help="A plan of captures instead, which `import -o FOLDER` fills.")
+@_json
+def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_json: bool) -> None:
+    """Write FOLDER/config.yaml and FOLDER/sensor.yaml, which run as they are, or FOLDER/measurement.yaml.
+
+    Beside them lie their JSON Schemas, with which an editor completes and checks. A config for pictures has gamma:
+    srgb. Light is linear and pictures are not: a value of half of white then gets 21 % of white's photons.
+
+    \b
+    spadmnist init my --images photos --sensor spad512
+    spadmnist generate my/config.yaml -o my_dataset
+    spadmnist init bench --sensor spad512 --measurement
+    """
+    from . import starting
+    from .errors import SpadError
+
+    if measurement and images is not None:
+        raise SpadError("--images: belongs to a config, and a plan of captures has none; leave it or --measurement out")
+    files = starting.measurement(folder, sensor) if measurement else starting.dataset(folder, sensor, images)
+    written = starting.write(folder, files)
+    if as_json:
+        _print_json({"files": [str(path) for path in written]})
+        return
+    for path in written:
+        _print(str(path))
+    last = quoted(written[-1])
+    if measurement:
+        _say(f"Then fill it:  spadmnist import FILE... -o {quoted(folder)}")
+    else:
+        _say(f"What it costs:  spadmnist generate {last} --dry-run")
+        _say(f"Then:  spadmnist generate {last} -o {quoted(f'{folder.resolve().name}_dataset')}")
+
+
+@cli.command("schema", short_help="Print the JSON Schema of the YAML files, for editors.")
+@click.argument("kind", required=False, default="config", metavar="[config|sensor|measurement]")
+@_plugin
+def schema_(kind: str, plugin_files: tuple[Path, ...]) -> None:
+    """Print the JSON Schema of a config (or of a sensor's file, or of measurement.yaml), made from the classes.
+
+    An editor that knows YAML completes and checks with it, where the first line of the file names the schema's:
+
+    \b
+    spadmnist schema > config.schema.json
+    # yaml-language-server: $schema=config.schema.json
+    """
+    from . import schema
+
+    _load(plugin_files)
+    _print_lines(schema.text(kind).rstrip("\n"))
 
 
 @cli.command("reconstruct", short_help="Make flux images of a dataset or a measurement.")

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
-from pydantic import Field, PlainValidator
+from pydantic import ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from . import disk, document, plugins, reconstruct, units
 from .document import Document, Path_
@@ -33,7 +33,7 @@ from .readout import READOUTS, no_detection, unsigned_for
 from .reconstruct import Method
 from .section import LATER, Section
 from .sensor import Sensor
-from .validated import Area, Irradiance, Lux, Reader, Share, Time, brief
+from .validated import Area, Irradiance, Lux, Reader, Share, Time, brief, written
 
 _CHANNELS = ("red", "green", "blue")  # of colour images, in their order
 
@@ -59,9 +59,26 @@ def _one_length(raw: object) -> units.Quantity:
     return value
 
 
+_LENGTH = written("m", signed=False)
+_LENGTHS = {
+    "anyOf": [
+        _LENGTH,
+        {"type": "array", "items": _LENGTH, "minItems": len(_CHANNELS), "maxItems": len(_CHANNELS)},
+        {
+            "type": "object",
+            "properties": dict.fromkeys(_CHANNELS, _LENGTH),
+            "required": list(_CHANNELS),
+            "additionalProperties": False,
+        },
+    ]
+}
+
+
 class _Scene(Section):
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["lux"]}, {"required": ["irradiance"]}]})
+
     images: ImageSource
-    wavelength: Annotated[Any, PlainValidator(_of_light)] = Field(default="555 nm")
+    wavelength: Annotated[Any, PlainValidator(_of_light), WithJsonSchema(_LENGTHS)] = Field(default="555 nm")
     lux: list[Lux] | None = Field(default=None, min_length=1)
     irradiance: list[Irradiance] | None = Field(default=None, min_length=1)
 
@@ -86,6 +103,10 @@ class _Output(Section):
 
 
 class _Layout(Section):
+    model_config = ConfigDict(
+        json_schema_extra={"oneOf": [{"required": ["rows", "columns"]}, {"required": ["positions"]}]}
+    )
+
     rows: int | None = Field(default=None, ge=1, le=100_000)
     columns: int | None = Field(default=None, ge=1, le=100_000)
     positions: str | None = None  # a CSV file, instead of rows and columns
@@ -126,6 +147,12 @@ _EXAMPLES = {
     "pixel_area": "pixel_area: 25 um^2",
     "effects": "effects: {detection: {pdp: 0.5}}",
 }
+
+
+def entries() -> dict[str, tuple[Any, Any]]:
+    """The entries of a config by name: pydantic's kind, and the default, `...` where there is none."""
+    kinds = {**_SECTIONS, "sensor": str | _Sensor}
+    return {name: (kind, _DEFAULTS.get(name, ...)) for name, kind in kinds.items()}
 
 
 def read(

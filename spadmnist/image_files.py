@@ -144,11 +144,12 @@ def idx_sha256(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
-    """One image file: (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour.
+def read_image(path: Path, grey_palettes: bool = True, exif: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+    """One image file: its pixels, (rows, columns) uint8 or uint16 if grey, (3, rows, columns) uint8 in colour; and how
+    opaque they are, (rows, columns) uint8 up to 255, or None where all are as opaque as can be.
 
-    A palette is colour unless all colours that the picture uses are greys; grey_palettes=False: then, too.
-    Raises InputError.
+    A palette is colour unless all colours that the picture uses are greys; grey_palettes=False: then, too. exif: turn
+    the picture as its EXIF orientation says. Raises InputError.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -161,7 +162,7 @@ def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
                     image.verify()  # PNG's checksums, which decoding leaves out
                 file.seek(0)
                 with Image.open(file, formats=_FORMATS) as image:
-                    return _to_pixels(image, path, grey_palettes)
+                    return _to_pixels(image, path, grey_palettes, exif)
         except InputError:
             raise
         except UnidentifiedImageError as error:
@@ -178,8 +179,10 @@ def read_image(path: Path, grey_palettes: bool = True) -> np.ndarray:
             ) from error
 
 
-def _to_pixels(image: Any, path: Path, grey_palettes: bool) -> np.ndarray:
-    """The pixels of an open Pillow image, or InputError where they would not be what the file says."""
+def _to_pixels(image: Any, path: Path, grey_palettes: bool, exif: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """What `read_image` returns of an open Pillow image, or InputError where it would not be what the file says."""
+    from PIL import ImageOps
+
     # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
     if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
         raise InputError(f"{path}: it holds {image.n_frames} images; store each in a file of its own")
@@ -191,19 +194,23 @@ def _to_pixels(image: Any, path: Path, grey_palettes: bool) -> np.ndarray:
         raise InputError(
             f"{path}: it has {kind}; convert it to 8-bit RGB or to 8-bit or 16-bit grey, or use source array"
         )
-    if image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255):
-        raise InputError(f"{path}: parts of it are transparent; put it on a background and store it without")
+    if exif:
+        image = ImageOps.exif_transpose(image)
+    alpha = None
+    if image.has_transparency_data:
+        alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+        alpha = None if alpha.min() == 255 else alpha
     if mode.startswith("I"):
         pixels = np.asarray(image)
         if pixels.min() < 0 or pixels.max() > 65535:
             raise InputError(f"{path}: its grey levels do not fit into 16 bits; scale them to 0 to 65535")
-        return pixels.astype(np.uint16)
+        return pixels.astype(np.uint16), alpha
     if mode in ("1", "L", "LA"):
-        return np.asarray(image.convert("L"))
+        return np.asarray(image.convert("L")), alpha
     colours = np.moveaxis(np.asarray(image.convert("RGB")), -1, 0)
     if grey_palettes and mode in ("P", "PA") and (colours == colours[0]).all():
-        return np.ascontiguousarray(colours[0])
-    return colours
+        return np.ascontiguousarray(colours[0]), alpha
+    return colours, alpha
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_bytes: int, place: str) -> np.ndarray:

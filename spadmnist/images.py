@@ -13,19 +13,21 @@ import os
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
 from . import disk, image_files, tiles
 from .digits import draw_digit
 from .errors import InputError
+from .events import MOST_PIXELS
 from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
+from .photos import Making
 from .section import LATER, Section
 from .tiles import Tiles
 
@@ -59,6 +61,7 @@ class Images:
     names        the file of each image, relative to the folder, where the source is a folder
     label_names  the class folder that each label stands for, where the source is a folder with classes
     ignored      how many files of the folder were left out because they are not images
+    transparent  how many pictures of the folder had transparent parts, which are black
     tiles        where the tiles lie and which images they are, where the images are charts
     """
 
@@ -69,6 +72,7 @@ class Images:
     label_names: tuple[str, ...] | None = None
     ignored: int = 0
     tiles: Tiles | None = None
+    transparent: int = 0
 
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (3, 4) or self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
@@ -140,6 +144,29 @@ class Images:
         return ", ".join(parts)
 
 
+_NAMED = 12  # classes that are said one by one
+
+
+def notes(splits: Mapping[str, Images]) -> list[str]:
+    """What of a folder of pictures its files do not show, a sentence each: labels, and what was left out or blackened.
+
+    Nothing of other sources.
+    """
+    said = []
+    first = next(iter(splits.values()))
+    if first.label_names:
+        named = ", ".join(f"{i} {name}" for i, name in enumerate(first.label_names[:_NAMED]))
+        more = len(first.label_names) - _NAMED
+        said.append(f"the labels are the class folders: {named}{f' and {more} more' if more > 0 else ''}")
+    if ignored := sum(part.ignored for part in splits.values()):
+        held = "1 file of the folder is no image and is" if ignored == 1 else f"{ignored:,} files are no images and are"
+        said.append(f"{held} left out")
+    if transparent := sum(part.transparent for part in splits.values()):
+        shown = "1 picture has" if transparent == 1 else f"{transparent:,} pictures have"
+        said.append(f"{shown} transparent parts, which are black")
+    return said
+
+
 def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) -> None:
     """Raise InputError unless all images have the (rows, columns) `shape` of the sensor's layout.
 
@@ -157,6 +184,8 @@ def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) ->
             problem += "colour channels come before the rows: store np.moveaxis(images, -1, 1)"
         else:
             problem += "set sensor.layout to the size of the images, or give images of the sensor's size"
+            if part.names is not None:
+                problem += f" (of a folder: resize: [{shape[0]}, {shape[1]}] in scene.images)"
         raise InputError(problem)
 
 
@@ -429,20 +458,64 @@ class _AtMost:
 # --- folders of images -----------------------------------------------------------------------------------
 
 
+_SIDE = {"type": "integer", "minimum": 1}
+_SIZE = {"anyOf": [_SIDE, {"type": "array", "items": _SIDE, "minItems": 2, "maxItems": 2}, {"type": "null"}]}
+
+
+def _size(raw: object) -> list[int] | None:
+    """[rows, columns]; one number stands for both."""
+    size: Any = [raw, raw] if isinstance(raw, int) else raw
+    if raw is None:
+        return None
+    whole = isinstance(size, list) and len(size) == 2 and all(type(n) is int and n >= 1 for n in size)
+    if whole and size[0] * size[1] <= MOST_PIXELS:
+        return size
+    raise ValueError(
+        f"{raw!r:.60} is not a size; write one number of pixels for rows and columns, resize: 28, or both, "
+        f"resize: [rows, columns], each at least 1, together at most {MOST_PIXELS:,}"
+    )
+
+
 class Folder(_Source):
-    """A folder of images, grey or colour, all of one size and one kind.
+    """A folder of images, grey or colour, all of one size and one kind, or brought to that.
 
     With `train` and `test` folders in it these are the splits and all else is left out. Inside a split the
     first folder is the class; labels count the classes of both splits in alphabetical order. The order of the
     images is that of their paths. Hidden files and files that are not images by their suffix are left out.
-    Pixel values are taken as they are stored: EXIF orientation and colour profiles are ignored. Pictures with palettes
-    (GIF, some PNG) are grey where none of the folder has a colour.
+    Pixel values are taken for light as they are stored, unless `gamma: srgb` takes them back to light: half of white
+    is then 21 % of its photons, not 50 %. Transparent parts are black. EXIF orientation is ignored without `exif`,
+    colour profiles always. Pictures with palettes (GIF, some PNG) are grey where none of the folder has a colour.
     A relative path refers to --images-dir or, without it, to the folder of the config.
     """
 
     source: Literal["folder"] = "folder"
     path: str = Field(min_length=1, description="the folder")
     white: float | None = Field(default=None, gt=0, description="the grey level of white; 255, or 65535 for 16 bits")
+    resize: Annotated[Any, PlainValidator(_size), WithJsonSchema(_SIZE), LATER] = Field(
+        default=None, description="the size that pictures are brought to: N, or [rows, columns]; light is averaged"
+    )
+    fit: Annotated[Literal["crop", "pad", "stretch"], LATER] = Field(
+        default="crop", description="for resize, where the sides differ: cut what is over, pad with black, or stretch"
+    )
+    grey: Annotated[bool, LATER] = Field(default=False, description="make grey of colour: its luminance (Rec. 709)")
+    gamma: Annotated[Literal["linear", "srgb"], LATER] = Field(
+        default="linear",
+        description="what pixel values are: linear, photons in proportion to them, or srgb, as of nearly all pictures: "
+        "the value 128 then gets 22 % of white's photons, not 50 %",
+    )
+    exif: Annotated[bool, LATER] = Field(default=False, description="turn photographs as their EXIF orientation says")
+
+    @model_validator(mode="after")
+    def _fits_a_size(self) -> Folder:
+        if self.resize is None and "fit" in self.model_fields_set:
+            raise ValueError("fit says how pictures come to a size, and there is none; add resize, or take fit out")
+        return self
+
+    @property
+    def making(self) -> Making:
+        """How a picture becomes an image."""
+        size = None if self.resize is None else (self.resize[0], self.resize[1])
+        return Making(size, self.fit, self.grey, self.gamma)
 
     def describe(self) -> str:
         return f"folder {self.path}"
@@ -451,7 +524,7 @@ class Folder(_Source):
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
         root = _find(self.path, [images_dir if images_dir is not None else base], Path.is_dir)
-        names, ignored = _image_files(root)
+        names, ignored = pictures_in(root)
         prefixes = {split: f"{split}/" for split in ("train", "test") if (root / split).is_dir()}
         if list(prefixes) == ["test"]:
             raise InputError(
@@ -472,17 +545,18 @@ class Folder(_Source):
             if not part:
                 allowed = ", ".join(_SUFFIXES)
                 raise InputError(f"{root / prefixes[split]}: there is no image in it; put some there ({allowed})")
-        arrays = _read_splits(root, {split: part[:limit] for split, part in files.items()}, self.white)
+        found = _read_splits(root, {split: part[:limit] for split, part in files.items()}, self)
         splits = {}
         for split, part in files.items():
-            of_part, pixels = classes[split], arrays[split]
+            of_part, (pixels, transparent) = classes[split], found[split]
             splits[split] = Images(
                 pixels,
                 None if of_part is None else np.array([number[c] for c in of_part[:limit]], np.uint8),
-                _white(self.white, pixels.dtype),
+                self.making.white(_white(self.white, pixels.dtype)),
                 tuple(part[:limit]),
                 None if of_part is None else tuple(label_names),
                 ignored if split == "train" else 0,
+                transparent=transparent,
             )
         return splits
 
@@ -494,8 +568,11 @@ def _white(given: float | None, dtype: np.dtype[Any]) -> float:
     return float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
 
 
-def _image_files(root: Path) -> tuple[list[str], int]:
-    """The image files below `root`, as relative paths in their order, and the number of other files."""
+def pictures_in(root: Path) -> tuple[list[str], int]:
+    """The image files below `root`, as relative paths in their order, and the number of other files.
+
+    Raises InputError for a link that leads back, and for a name that is no text; OSError as the system does.
+    """
 
     def fail(error: OSError) -> None:
         raise error
@@ -544,18 +621,21 @@ class _Unlike(InputError):
     """An image is of another size or kind than the first."""
 
 
-def _read_splits(root: Path, files: dict[str, list[str]], white: float | None) -> dict[str, np.ndarray]:
+_Read = tuple[np.ndarray, int]  # images, and how many of them had transparent parts
+
+
+def _read_splits(root: Path, files: dict[str, list[str]], how: Folder) -> dict[str, _Read]:
     """The images of each split. Pictures whose palettes hold greys alone are grey where all others are, too.
 
     Beside pictures in colour they are colour: one of a folder of colour pictures may happen to have none.
     """
 
-    def read(grey_palettes: bool) -> dict[str, np.ndarray]:
-        return {split: _read_folder(root, names, white, grey_palettes) for split, names in files.items()}
+    def read(grey_palettes: bool) -> dict[str, _Read]:
+        return {split: _read_folder(root, names, how, grey_palettes) for split, names in files.items()}
 
     try:
         splits = read(True)
-        if len({pixels.ndim for pixels in splits.values()}) == 1:
+        if len({pixels.ndim for pixels, _ in splits.values()}) == 1:
             return splits
         unlike = None
     except _Unlike as error:
@@ -568,30 +648,37 @@ def _read_splits(root: Path, files: dict[str, list[str]], white: float | None) -
         raise unlike from None
 
 
-def _read_folder(root: Path, names: list[str], white: float | None, grey_palettes: bool) -> np.ndarray:
+def _read_folder(root: Path, names: list[str], how: Folder, grey_palettes: bool) -> _Read:
     """All images, (n, rows, columns) or (n, 3, rows, columns), after checking that they are alike."""
-    first = read_image(root / names[0], grey_palettes)
+    first, clear = _read_picture(root / names[0], how, grey_palettes)
     if first.nbytes * len(names) > image_files.MAX_BYTES:
         raise InputError(
             f"{root}: {len(names)} images like {names[0]} take more than the {image_files.MAX_BYTES} bytes allowed; "
             "give fewer (--limit) or smaller ones"
         )
     pixels = np.empty((len(names), *first.shape), first.dtype)
-    top = _white(white, first.dtype)
+    transparent = 0
     for i, name in enumerate(names):
-        image = read_image(root / name, grey_palettes) if i else first
+        image, clear = _read_picture(root / name, how, grey_palettes) if i else (first, clear)
         if (image.shape, image.dtype) != (first.shape, first.dtype):
             raise _Unlike(
                 f"{root / name}: it is {_kind(image)}, but {names[0]} is {_kind(first)}; "
-                "all images must be of one size and kind: convert or remove those that differ"
-            )
-        if image.max() > top:
-            raise InputError(
-                f"{root / name}: it has the grey level {image.max()}, but white is {top:g}; raise white or "
-                "correct the image"
+                "all images must be of one size and kind: set resize, or grey, or convert or remove those that differ"
             )
         pixels[i] = image
-    return pixels
+        transparent += clear
+    return pixels, transparent
+
+
+def _read_picture(path: Path, how: Folder, grey_palettes: bool) -> tuple[np.ndarray, bool]:
+    """The image that is made of a picture, and whether parts of that are transparent."""
+    pixels, alpha = read_image(path, grey_palettes, how.exif)
+    top = _white(how.white, pixels.dtype)
+    if pixels.max() > top:
+        raise InputError(
+            f"{path}: it has the grey level {pixels.max()}, but white is {top:g}; raise white or correct the image"
+        )
+    return how.making.image(pixels, alpha, top), alpha is not None
 
 
 def _kind(image: np.ndarray) -> str:

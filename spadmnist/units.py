@@ -104,6 +104,14 @@ def allowed_units(unit: str) -> str:
     return ", ".join(u for u in _DIMENSIONS[unit][1] if u)
 
 
+def pattern(unit: str, signed: bool = True) -> str:
+    """A regular expression, as JSON Schema has them, of every text that `parse` reads; signed: below 0, too."""
+    named = [re.escape(u) for u in _DIMENSIONS[unit][1] if u]
+    written = "|".join(f"[u\u00b5\u03bc]{u[1:]}" if u[0] == "u" else u for u in named)
+    number = r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?"
+    return rf"^\s*{'[+-]' if signed else '[+]'}?{number}\s*({written}){'' if unit else '?'}\s*$"
+
+
 def parse(value: object, unit: str) -> Quantity:
     """Read a quantity whose SI unit is `unit` (`"s"`, `"Hz"`, `"m"`, `"m^2"`, `"lux"`, `"W/m^2"`, `""`).
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, PlainValidator, TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import core_schema
 
 from . import units
 from .document import Document, Path_
@@ -19,27 +20,42 @@ from .errors import did_you_mean
 # --- quantities ---------------------------------------------------------------------------------------------------
 
 
-def quantity(unit: str, zero: bool = False, most: float = math.inf) -> Any:
+def written(unit: str, signed: bool = True) -> dict[str, Any]:
+    """The JSON Schema of a quantity whose SI unit is `unit`; signed: below 0, too."""
+    text = {"type": "string", "pattern": units.pattern(unit, signed)}
+    return text if unit else {"anyOf": [{"type": "number"} if signed else {"type": "number", "minimum": 0}, text]}
+
+
+@dataclass(frozen=True)
+class Amount:
     """For `Annotated`: a quantity whose SI unit is `unit`, more than 0 or, with `zero`, at least 0; at most `most`."""
 
-    def read(raw: object) -> units.Quantity:
-        value = units.parse(raw, unit)
-        if value < 0 or (value == 0 and not zero) or value > most:
-            upper = "" if most == math.inf else f" and at most {most:g} ({100 * most:g} %)"
-            raise ValueError(f"{value} is not possible; it must be {'at least' if zero else 'more than'} 0{upper}")
+    unit: str
+    zero: bool = False
+    most: float = math.inf
+
+    def _read(self, raw: object) -> units.Quantity:
+        value = units.parse(raw, self.unit)
+        if value < 0 or (value == 0 and not self.zero) or value > self.most:
+            upper = "" if self.most == math.inf else f" and at most {self.most:g} ({100 * self.most:g} %)"
+            raise ValueError(f"{value} is not possible; it must be {'at least' if self.zero else 'more than'} 0{upper}")
         return value
 
-    return PlainValidator(read)
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.no_info_plain_validator_function(self._read)
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        return written(self.unit, signed=False)
 
 
-Time = Annotated[units.Quantity, quantity("s")]
-Length = Annotated[units.Quantity, quantity("m")]
-Area = Annotated[units.Quantity, quantity("m^2")]
-Lux = Annotated[units.Quantity, quantity("lux")]
-Irradiance = Annotated[units.Quantity, quantity("W/m^2")]
-Share = Annotated[units.Quantity, quantity("", most=1)]
-Uncertainty = Annotated[units.Quantity, quantity("", zero=True, most=1)]
-Mean = Annotated[units.Quantity, quantity("", zero=True)]
+Time = Annotated[units.Quantity, Amount("s")]
+Length = Annotated[units.Quantity, Amount("m")]
+Area = Annotated[units.Quantity, Amount("m^2")]
+Lux = Annotated[units.Quantity, Amount("lux")]
+Irradiance = Annotated[units.Quantity, Amount("W/m^2")]
+Share = Annotated[units.Quantity, Amount("", most=1)]
+Uncertainty = Annotated[units.Quantity, Amount("", zero=True, most=1)]
+Mean = Annotated[units.Quantity, Amount("", zero=True)]
 
 
 # --- reading ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from ..errors import SpadError
 from ..section import Section
@@ -60,6 +60,10 @@ File = Annotated[str, BeforeValidator(_inside)]
 
 class Array(Section):
     """`layout`: rows and columns, or the places of the pixels in a CSV file, which count as one row."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"anyOf": [{"required": ["rows", "columns"]}, {"required": ["positions"]}]}
+    )
 
     rows: int | None = Field(default=None, ge=1, le=100_000)
     columns: int | None = Field(default=None, ge=1, le=100_000)
