@@ -19,7 +19,7 @@ from .nulls import scores_of_powers
 from .tried import Tried, shape_of
 
 LEAST_P = 1e-300
-_MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
+PIXELS, _LAWS = "pixel_map", ("spread", "tails", "outliers")  # of the pixels' numbers: each, and their law
 _EDGES = "early_intervals"  # how unlike the pixels are in how long they are blind
 _BY_CHANCE = 0.25  # of what the data have of a trace: as much a few recordings may have of it by chance
 _LITTLE = 0.1  # times as strong: what grows with the square is no matter there
@@ -277,7 +277,7 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
         return 1.0
     if change.blinds:
         return _of_edges(bench, state, change, values, told)
-    name = mapping.CODES if change.per == "code" else _MAP
+    name = mapping.CODES if change.per == "code" else PIXELS
     tells = {id: float(x.sum()) for id, x in told.items()}
     cells = [(id, name) for id in tells if tells[id] > 0 and (id, name) in state.residuals]
     if cells:
@@ -293,10 +293,18 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
         parts = mapping.code_periods(size)
         return min(1.0, len(parts) * min(of_spread(z[part], own[:, part]) for part in parts.values()))
     groups = mapping.groups_of(state.sensors.one, change.per)
-    count = np.sqrt(np.bincount(groups))
-    data = np.bincount(groups, z) / count
-    usual = np.stack([np.bincount(groups, row) / count for row in own])
-    chance = of_spread(data, usual)
+    if any(bench.of_scene(id) for id, _ in cells):
+        slopes = np.sqrt([told[id] for id, _ in cells])
+        z, *own = (
+            _as_told([x[cell] for cell in cells], slopes, groups)
+            for x in (state.residuals, *({cell: state.own[cell][k] for cell in cells} for k in range(len(own))))
+        )
+        chance = of_spread(z, np.stack(own)) if z.size else 1.0
+    else:
+        count = np.sqrt(np.bincount(groups))
+        data = np.bincount(groups, z) / count
+        usual = np.stack([np.bincount(groups, row) / count for row in own])
+        chance = of_spread(data, usual)
     if change.per != "pixel":
         return chance
     # few detections in most pixels: then the law of their numbers tells more than the scores of each
@@ -304,6 +312,17 @@ def of_map(bench: Bench, state: State, change: Change, values: dict[Key, Any], l
     laws = [(best, name) for name in _LAWS if (best, name) in state.residuals]
     others = [state.nulls[cell].chance(state.residuals[cell])[0] for cell in laws]
     return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
+
+
+def _as_told(residuals: Sequence[np.ndarray], slopes: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Residuals (captures, pixels) of each group's value, 1 wide, of those groups of which anything is told.
+
+    slopes: (captures, pixels) of a residual on the logarithm of the value: where a scene is black there are none.
+    """
+    told = np.bincount(groups, (slopes**2).sum(axis=0))
+    score = np.bincount(groups, (slopes * residuals).sum(axis=0))
+    some = told > mapping.NOTHING**-2
+    return np.asarray(score[some] / np.sqrt(told[some]))
 
 
 def _of_edges(bench: Bench, state: State, change: Change, values: dict[Key, Any], told: dict[str, np.ndarray]) -> float:

@@ -394,6 +394,10 @@ class Bench:
                     other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
         return other
 
+    def of_scene(self, id: str) -> bool:
+        """Is a capture one of a scene?"""
+        return self.seen[id].capture.light.scene is not None
+
     @property
     def dark(self) -> list[str]:
         """Captures without light."""

@@ -40,6 +40,7 @@ _PERIODS = (256, 140, 100)  # as `statistics.codes` folds them
 _GRID, _ROUNDS = (-4.0, 8.0, 97), 100  # logarithms about the middle that pixels of few counts may have
 _FAR_OFF = 4.0  # standard deviations from most pixels, beyond which it does not matter how far
 _NEEDED = 1e-4  # p-value of a map that is needed beside others
+NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,12 @@ class Map:
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) how likely each is
     certain: float = _TELLING  # raw_error, below which a value is the estimate, whatever the others are
     width: edges.Width | None = None  # where the likelihood of all pixels tells it
+    of_scene: bool = False  # and so no light falls on some pixels, and nothing tells how much of it they detect
+
+    @property
+    def told(self) -> np.ndarray:
+        """(groups,) bool: which values anything is known of."""
+        return self.raw_error < NOTHING if self.of_scene else np.ones(self.raw.size, bool)
 
     @property
     def price(self) -> float:
@@ -313,7 +320,9 @@ def settle_maps(
         assert change.carrier is not None
         error = np.sqrt(np.maximum(post[i], 0))
         r, v = raw[i]
+        scene = bench_light_only(start, change) and any(bench.of_scene(line.id) for line in lines)
         map_ = Map(change.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i])
+        map_ = replace(map_, of_scene=scene)
         if not bench_light_only(start, change) and float(np.median(v)) >= _TELLING**2:
 
             def at(log: float, i: int = i) -> Sensor:
@@ -595,7 +604,7 @@ def needed(
 
 def _spread_p(map_: Map) -> float:
     """p-value of pixels that are all alike."""
-    told = map_.raw_error < 3.0  # elsewhere nothing is known
+    told = map_.raw_error < NOTHING
     if told.sum() < 3 or float(np.std(map_.estimate)) < _LEAST_WIDTH:  # all at a bound: they do not differ
         return 1.0
     r, weight = map_.raw[told], 1 / map_.raw_error[told] ** 2
@@ -607,8 +616,9 @@ def odd(map_: Map) -> tuple[np.ndarray, np.ndarray]:
     """(groups,) bool: which are far below all others, and which far above."""
     inner = map_.estimate - _middle(map_.estimate)
     # of the bulk: beyond its noise, without the odd pixels
-    width = 1.4826 * float(np.median(np.abs(map_.raw - np.median(map_.raw))))
-    noise = float(np.median(map_.raw_error))
+    raw = map_.raw[map_.told]
+    width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
+    noise = float(np.median(map_.raw_error[map_.told])) if raw.size else NOTHING
     bulk = math.sqrt(max(width**2 - noise**2, 0.0))
     beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
     return inner < -beyond, inner > beyond
@@ -632,7 +642,7 @@ def low_ratio(map_: Map) -> tuple[float, float]:
 def summary(map_: Map) -> dict[str, float]:
     """sigma, low_fraction, low_ratio, high_fraction of a map."""
     low, high = odd(map_)
-    rest = ~(low | high)
+    rest = ~(low | high) & map_.told
     spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
     return {
         "sigma": math.sqrt(max(float(spread), 0.0)),
@@ -648,18 +658,46 @@ def patterned(map_: Map, designs: dict[str, np.ndarray]) -> dict[str, tuple[floa
 
     designs: (pixels, k) columns, without the mean.
     """
-    y = np.exp(np.clip(map_.raw, -_MOST, _MOST))
+    y = np.exp(np.clip(map_.raw[map_.told], -_MOST, _MOST))
+    if y.size < 3:
+        return dict.fromkeys(designs, (1.0, 0.0))
     middle, width = _middle(y), 1.4826 * _middle(np.abs(y - _middle(y)))
     y = np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)  # odd pixels do not make a pattern
     out = {}
     ones = np.ones((len(y), 1))
     for name, design in designs.items():
+        design = design[map_.told]
         full = np.linalg.lstsq(np.hstack([ones, design]), y, rcond=None)[0]
         left = y - np.hstack([ones, design]) @ full
         k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
-        free = len(y) - k - 1
+        free = max(len(y) - k - 1, 1)
         explained = float(((y - y.mean()) ** 2).sum() - (left**2).sum())
         square = max(float((left**2).sum()), 1e-30)
         p = float(stats.f.sf(explained / max(k, 1) / (square / free), k, free))
         out[name] = p, len(y) * math.log(square) + k * math.log(len(y))
     return out
+
+
+def explained(before: np.ndarray, after: np.ndarray, told: np.ndarray, sigma: float, numbers: int) -> float:
+    """p-value of what so many numbers take from the pixels' residuals, against the scatter that they leave (F test).
+
+    Of pixels that differ by themselves, by `sigma` of a logarithm, the same in all captures: residuals are first
+    brought to where these scatter as chance does. before, after: (captures, pixels) residuals; told: of that shape, the
+    squared slope of a residual on the logarithm of its pixel's value.
+    """
+    z, left = (_beside_pixels(x, np.sqrt(told), sigma).ravel() for x in (before, after))
+    free = z.size - numbers
+    if free < 1:
+        return 1.0
+    middle = _middle(z)
+    far = _FAR_OFF * max(1.4826 * _middle(np.abs(z - middle)), 1.0)
+    z, left = (np.clip(x, middle - far, middle + far) for x in (z, left))  # as of odd pixels in `patterned`
+    square = max(float(left @ left), 1e-30)
+    return float(stats.f.sf((float(z @ z) - square) / numbers / (square / free), numbers, free))
+
+
+def _beside_pixels(z: np.ndarray, slopes: np.ndarray, sigma: float) -> np.ndarray:
+    """(captures, pixels) residuals, 1 wide and independent where each pixel differs by `sigma`, times its slopes."""
+    square = (slopes**2).sum(axis=0)
+    along = (slopes * z).sum(axis=0) / np.maximum(square, 1e-300)
+    return np.asarray(z - slopes * along * (1 - 1 / np.sqrt(1 + sigma**2 * square)))

@@ -22,12 +22,12 @@ from ..sensor import Sensor
 from ..statistics import Statistic
 from . import checks, fit, mapping
 from .candidates import Change, Key, chancy, templates, with_values
-from .chance import LEAST_P, nearest_face, of_map
+from .chance import LEAST_P, PIXELS, nearest_face, of_map
 from .fit import RATES, Bench, Moved, Sensors, State, likelier, square, stacked
 from .lines import Line, lines
 from .refining import STRONG, optimism, state_of
 from .swings import NEAR, TIMES, turned
-from .tried import EACH, Tried, further, is_edge, is_pattern, is_same, lines_of, shape_of, stronger, weaker
+from .tried import EACH, Tried, further, is_edge, is_pattern, is_same, lines_of, of_scene, shape_of, stronger, weaker
 
 _LOOKING, _AGAIN, _MAPPING = "the first look", "the second look", "making a map"  # where a candidate may fail
 _SCAN = 2  # recordings of each capture for a first look
@@ -475,6 +475,7 @@ class Search:
             return tried
         assert maps[0].maps is not None
         free = maps[0].maps[maps[0].change.carrier]  # type: ignore[index]
+        scenes = {t.change.name: self._of_scene(state, t, maps[0].change, free) for t in patterns if of_scene(t)}
         chance = 1.0 if maps[0].chance is None else maps[0].chance
         doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
         layout = state.sensors.one.layout
@@ -486,17 +487,32 @@ class Search:
                 designs[one.change.name] = _indicators(mapping.groups_of(state.sensors.one, "row"))
             elif one.change.per == "column":
                 designs[one.change.name] = _indicators(mapping.groups_of(state.sensors.one, "column"))
-            else:
+            elif not of_scene(one):
                 designs[one.change.name] = np.stack([*place, radius], axis=1)
         found = mapping.patterned(free, designs)
-        real = [t for t in patterns if found[t.change.name][0] < doubtful]
+        chances = {name: p for name, (p, _) in found.items()} | scenes
+        real = [t for t in patterns if chances[t.change.name] < doubtful]
         dropped = [t for t in patterns if t not in real]
         rest = [t for t in tried if t not in dropped]
-        if real and (rest[0] in maps or rest[0] in real):
-            first = min(real, key=lambda t: found[t.change.name][1])
+        if real and (rest[0] in maps or rest[0] in real or (scenes and _of_pixels(rest[0]))):
+            fixed = [t for t in real if not of_scene(t)]
+            firsts = [min(fixed, key=lambda t: found[t.change.name][1])] if fixed else []
+            first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.gain)
             rest.remove(first)
             rest.insert(0, first)
         return rest
+
+    def _of_scene(self, state: State, one: Tried, change: Change, free: mapping.Map) -> float:
+        """p-value of a change of the scene, by what it leaves of the pixels' numbers. change, free: the map beside it.
+
+        What it does to a pixel hangs on the scene about it, so that no shape over the array stands for it, and there is
+        much where no light falls, of which a map of the light knows nothing.
+        """
+        ids = [id for id, name in state.residuals if name == PIXELS and self.bench.of_scene(id)]
+        after = self.bench.residuals(state, one.moved, one.times)
+        told = mapping.information(self.bench, state.values, change, mapping.levels_of(self.bench, state))
+        z, left = (np.stack([x[id, PIXELS] for id in ids]) for x in (state.residuals, after))
+        return mapping.explained(z, left, np.stack([told[id] for id in ids]), free.sigma, len(one.change.dials))
 
     def scattered(self, state: State, values: dict[Key, Any], like: Tried, faint: bool = False) -> list[Tried]:
         """Maps that no pixel tells by its counts, but that may do to all else what a candidate does.

@@ -151,9 +151,14 @@ def lines_of(change: Change) -> list[Dial]:
     return [d for d in change.shapes if d.unit == "Hz"] if change.phases else []
 
 
+def of_scene(one: Tried) -> bool:
+    """Does it change the scene that is seen?"""
+    return bool(getattr(Effect.registry.find(one.change.effect), "of_scene", False))
+
+
 def is_pattern(one: Tried) -> bool:
     """Rows, columns, or a shape of the light over the array?"""
     change = one.change
     if change.kind != "add":
-        return False
+        return of_scene(one)  # no other number of the light is set
     return change.per in ("row", "column") or getattr(Effect.registry.find(change.effect), "stage", "") == "light"
