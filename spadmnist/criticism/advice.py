@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import twin, units
 from ..effects import Conditions, Mimic
+from ..foreign import visible
 from ..recording import Capture, Light, Recording
 from . import fit, recordings
 from .answer import NONLINEARITY, Step, plain
@@ -95,7 +96,7 @@ def _brighter(bench: Bench, id: str, rate: float, times: float) -> Iterator[tupl
         or times * rate * capture.conditions.exposure > 2 * _MOST_EVENTS
     ):
         return
-    words = f"a flat field {'as bright as a tenth of' if times < 1 else f'{times:g} times as bright as'} {id}"
+    words = f"{_seen_in(capture)} {'as bright as a tenth of' if times < 1 else f'{times:g} times as bright as'} {id}"
     yield words, replace(capture, light=replace(capture.light, level=level * times)), id
 
 
@@ -141,7 +142,7 @@ def between_totals(search: Search, state: State, setup: Explanation, other: Trie
             continue
         for times in (0.1, 10.0):
             brighter = replace(seen.capture, light=replace(light, level=light.level * times))
-            words = f"a flat field {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
+            words = f"{_seen_in(brighter)} {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
             tries.append((words, brighter, log if id in whole else 0.0))
     assert other.sensors is not None
     for words, capture, expected in tries:
@@ -166,12 +167,19 @@ def on_mimic(step: Step, other: Mimic) -> dict[str, Any]:
 def on_brightest(bench: Bench, state: State, setup: Explanation, entry: Mapping[str, Any]) -> dict[str, Any]:
     """What tells a set-up from a nonlinearity: with half of the light, half is left, of a mistake nothing."""
     then = 0.5 * abs(float(setup.logs[0])) / bench.level_error(state, entry["capture"])
-    words = f"a flat field half as bright as {entry['capture']}, its light measured anew"
+    what = _seen_in(bench.seen[entry["capture"]].capture)
+    words = f"{what} half as bright as {entry['capture']}, its light measured anew"
     return _told(words, [entry["quantity"], NONLINEARITY], 0.0, then)
 
 
 def _dark(conditions: Conditions) -> Conditions:
-    return replace(conditions, wavelength=None)
+    return replace(conditions, wavelength=None, scene=None)
+
+
+def _seen_in(capture: Capture) -> str:
+    """What a capture's light falls from, in words."""
+    shown = capture.light.scene
+    return "a flat field" if shown is None else f"the scene {visible(shown.name)}"
 
 
 def on_setup(bench: Bench, state: State, entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
