@@ -42,7 +42,9 @@ class _File(Section):
     sha256: Digest
 
 
-class _Tiles(Section):
+class TileFacts(Section):
+    """The tiles of a chart, as `Tiles.facts` has them."""
+
     size: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
     corners: Annotated[list[Annotated[list[Whole], Field(min_length=2, max_length=2)]], Field(min_length=1)]
     numbers: list[Whole]
@@ -52,7 +54,7 @@ class _Tiles(Section):
 class _Split(Section):
     images: Annotated[int, Field(ge=1)]
     sha256: Digest
-    tiles: _Tiles | None = None
+    tiles: TileFacts | None = None
 
 
 class _Images(Section):
@@ -159,7 +161,7 @@ def _compare(manifest: Mapping[str, Any], reader: Reader) -> None:
         ends[which] = [number + 1, shard["stop"]]
     for split, facts in splits.items():
         if tiles := facts.get("tiles"):
-            _check_tiles(tiles, manifest["images"]["shape"][-2:], ("images", "splits", split, "tiles"), reader)
+            check_tiles(tiles, manifest["images"]["shape"][-2:], ("images", "splits", split, "tiles"), reader)
     for level in (None, *texts):
         for split, facts in splits.items():
             held = ends.get((level, split), [0, 0])[1]
@@ -182,8 +184,8 @@ def _compare(manifest: Mapping[str, Any], reader: Reader) -> None:
             say(("normalisation",), f"{level} is missing")
 
 
-def _check_tiles(tiles: Mapping[str, Any], shape: Sequence[int], path: tuple[str, ...], reader: Reader) -> None:
-    """Tiles of a chart lie on it, and each has a number and, where there are any, a label."""
+def check_tiles(tiles: Mapping[str, Any], shape: Sequence[int], path: tuple[str, ...], reader: Reader) -> None:
+    """Note where tiles, which are well formed, do not lie on their chart of `shape`, or lack a number or a label."""
     n = len(tiles["corners"])
     for key in ("numbers", "labels"):
         if len(tiles.get(key) or [0] * n) != n:

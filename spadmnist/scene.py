@@ -6,12 +6,16 @@ import hashlib
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from . import disk
 from .errors import InputError
 from .image_files import HEAD, another, read_npy
+
+if TYPE_CHECKING:
+    from .tiles import Tiles
 
 _LARGEST = 1 << 30  # bytes of a scene's file
 
@@ -21,11 +25,13 @@ class Scene:
     """What share of white each pixel sees; scenes of the same values are equal.
 
     name: of its file; stored: (rows, columns) as it lies there, uint8 (white 255) or float (0 to 1), read-only.
+    tiles: of the chart that it is, None where they are not known.
     """
 
     name: str = field(compare=False)
     stored: np.ndarray = field(repr=False, compare=False)
     sha256: str = field(default="", init=False)
+    tiles: Tiles | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         view = np.ascontiguousarray(self.stored).view()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from commands import run as command
 
-from spadmnist import config, experiments, measurement, twin
+from spadmnist import config, experiments, measurement, tiles, twin
 from spadmnist.effects.illumination_gradient import IlluminationGradient
 from spadmnist.errors import InputError, SpadError
 from spadmnist.experiments import Setting, _chip, captures
@@ -188,34 +188,64 @@ def test_a_free_light_level_is_the_fitted_one(small: Path) -> None:
 
 def test_captures_that_are_not_of_the_chart(small: Path) -> None:
     bench = bench_of(small)
-    chart = bench.plan.captures[1]
+    chart, laid = bench.plan.captures[1], bench.shown.tiles
     scene = chart.light.scene
-    assert scene is not None
+    assert scene is not None and laid is not None and scene.tiles is laid
     other = scene.stored.copy()
-    a, b = bench.shown.tiles.corners[5].tolist()  # type: ignore[union-attr]
-    other[a + 3, b + 4] ^= 255
-    strange = Scene("other.npy", other)
+    other[0, 0] ^= 255
+
+    def of(shown: Scene | None) -> dict[str, Any]:
+        return {"light": replace(chart.light, scene=shown), "conditions": replace(chart.conditions, scene=shown)}
+
+    facts = laid.facts()
+    small_ones, digits = {**facts, "size": [14, 28]}, facts["labels"]
+    eleven = [10, *digits[1:]]
+    bare = {key: value for key, value in facts.items() if key != "labels"}
     wrong: list[tuple[dict[str, Any], str]] = [
         (
-            {
-                "light": replace(chart.light, scene=strange),
-                "conditions": replace(chart.conditions, scene=strange),
-            },
-            rf"in other.npy the tile at row {a}, column {b} is none of the test images; show the chart",
+            of(Scene("other.npy", other)),
+            r"other.npy is not the chart of .*, and its light says nothing of tiles; fill the plan",
+        ),
+        (
+            of(Scene("other.npy", other, tiles.of_facts(small_ones, scene.shape))),
+            "the tiles of other.npy are 14 x 28 pixels, but the networks read 28 x 28; show tiles of that size",
+        ),
+        (
+            of(Scene("other.npy", other, tiles.of_facts(bare, scene.shape))),
+            "the tiles of other.npy have no labels, but the networks read the digits 0 to 9; write labels",
+        ),
+        (
+            of(Scene("other.npy", other, tiles.of_facts({**facts, "labels": eleven}, scene.shape))),
+            "the tiles of other.npy have the label 10, but the networks read the digits 0 to 9; write labels",
         ),
         (
             {"conditions": replace(chart.conditions, frames=50, exposure=0.5e-3)},
             "has 50 frames, but the networks are trained on sums of 100; record 100 frames",
         ),
-        (
-            {"light": replace(chart.light, scene=None), "conditions": replace(chart.conditions, scene=None)},
-            "has no QIS capture of a scene; write light:",
-        ),
+        (of(None), "has no QIS capture of a scene; write light:"),
     ]
     for i, (changed, says) in enumerate(wrong):
         lab = lab_of(bench, small / f"lab{i}", **changed)
         with pytest.raises(InputError, match=says):
             bench_of(small, lab).shots(REAL)
+
+
+def test_a_chart_of_a_lab_tells_its_own_digits(small: Path) -> None:
+    """Half of the tiles, in another order; without tiles the chart is known by its image."""
+    bench = bench_of(small)
+    chart, laid = bench.plan.captures[1], bench.shown.tiles
+    scene = chart.light.scene
+    assert scene is not None and laid is not None and laid.labels is not None
+    some = [3, 12, 7, 0]
+    facts = {name: [one[i] for i in some] if name != "size" else one for name, one in laid.facts().items()}
+    theirs = replace(scene, tiles=tiles.of_facts(facts, scene.shape))
+    for name, shown, digits in (("own", theirs, laid.labels[some]), ("bare", replace(scene, tiles=None), laid.labels)):
+        changed = {"light": replace(chart.light, scene=shown), "conditions": replace(chart.conditions, scene=shown)}
+        lab = lab_of(bench, small / name, **changed)
+        shots = bench_of(small, lab).shots(REAL)
+        assert all(shot.labels.tolist() == digits.tolist() for shot in shots)
+        assert all(shot.counts.shape == (len(digits), 28, 28) for shot in shots)
+        assert (small / name / "chart.json").exists() == (name == "own")
 
 
 def test_a_lab_of_other_pixels(small: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,10 @@ import laws
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from measured import described, device, stored
+from measured import described, device, stored, tree
 from scipy import stats
 
-from spadmnist import cli, config, factory, look, measurement, scene, twin
+from spadmnist import cli, config, factory, look, measurement, scene, tiles, twin
 from spadmnist.effects import Conditions
 from spadmnist.effects.detection import Detection
 from spadmnist.errors import InputError, SpadError
@@ -378,6 +379,84 @@ def test_a_dataset_of_a_chart_is_a_measurement_of_its_scene(tmp_path: Path) -> N
     for capture in data.captures:
         assert capture.light.scene == Scene("x", charts[capture.id.split()[2]].pixels[0])
     assert compare(experiment.sensor, data, jobs=1).verdict == "adequate"
+
+
+def test_the_tiles_of_a_chart_go_with_its_measurement(tmp_path: Path) -> None:
+    """From the dataset to a twin of it, to a copy, and to a plan; each split has its own."""
+    digits = "{source: digits, train: 9, test: 9, rows: 9, columns: 9}"
+    experiment, root = dataset_of(tmp_path, f"chart, of: {digits}, count: 4")
+    charts = experiment.load_images()
+    twin.simulate(experiment.sensor, measurement.open(root), tmp_path / "twin", seed=1)
+    measurement.open(tmp_path / "twin").save(tmp_path / "copy")
+    assert sorted(p.name for p in (tmp_path / "copy").glob("*.json")) == ["test.json", "train.json"]
+    assert tree(tmp_path / "twin") == tree(tmp_path / "copy")
+    for folder in (root, tmp_path / "twin", tmp_path / "copy"):
+        data = measurement.open(folder)
+        for capture in data.captures:
+            chart = charts[capture.id.split()[2]]
+            laid = data[capture.id].tiles
+            assert chart.tiles is not None and laid.facts() == chart.tiles.facts() and laid.shape == (18, 18)
+            assert capture.light.scene == Scene("x", chart.pixels[0])  # the same scene, whatever is known of its tiles
+            assert np.array_equal(laid.cut(chart.pixels[0]), chart.tiles.cut(chart.pixels[0]))
+
+
+TILES = {"size": [2, 2], "corners": [[0, 0], [1, 2]], "numbers": [4, 7], "labels": [3, 1]}
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"corners": [[0, 0], [2, 2]]}, "chart.json: corners: a tile leads beyond the chart of 3 x 4 pixels"),
+        ({"labels": [3]}, "chart.json: labels: there are 1 for 2 tiles"),
+        ({"labels": [3, 256]}, "chart.json: labels[1]: 256 is not possible; it must be at most 255"),
+        ({"numbers": None}, "chart.json: numbers: None is not possible; it must be a list"),
+        ({"size": [2, 0]}, "chart.json: size[1]: 0 is not possible; it must be at least 1"),
+        (
+            {"places": []},
+            "chart.json: places is not an entry here. Did you mean labels? Allowed are size, corners, numbers, lab",
+        ),
+        (None, "chart.json: cannot be read (it is not JSON); the tiles of a chart are a JSON file"),
+    ],
+)
+def test_tiles_that_are_none(changed: dict[str, Any] | None, sentence: str, tmp_path: Path) -> None:
+    folder = lab(tmp_path / "lab", "tiles: chart.json")
+    (folder / "chart.json").write_text("tiles" if changed is None else json.dumps({**TILES, **changed}))
+    refused(lambda: opened(folder), sentence)
+
+
+def test_tiles_of_a_lab_are_read_and_missing_ones_said(tmp_path: Path) -> None:
+    folder = lab(tmp_path / "lab", "tiles: chart.json")
+    refused(
+        lambda: opened(folder), "measurement.yaml:5: captures[0].light.tiles", "chart.json: cannot be read (No such"
+    )
+    (folder / "chart.json").write_text(json.dumps(TILES))
+    stored(folder / "a.h5", frames=np.ones((40, 3, 4), np.uint8))
+    laid = measurement.open(folder)["a"].tiles
+    assert (
+        laid.labels is not None
+        and laid.labels.tolist() == [3, 1]
+        and laid.cut(SEEN)[1].tolist() == [[153, 204], [0, 255]]
+    )
+    stored(lab(tmp_path / "bare") / "a.h5", frames=np.ones((40, 3, 4), np.uint8))
+    refused(lambda: measurement.open(tmp_path / "bare")["a"].tiles, "a: says nothing of tiles", "tiles: chart.json}")
+
+
+def test_charts_alike_with_other_tiles_keep_them_apart(tmp_path: Path) -> None:
+    base = opened(lab(tmp_path / "plan")).captures[0]
+    laid = [tiles.of_facts({**TILES, "labels": labels}, (3, 4)) for labels in ([3, 1], [5, 5], [3, 1])]
+    shown = [Scene("chart.npy", SEEN, one) for one in [*laid, None]]
+    captures = [
+        replace(
+            base, id=str(i), light=replace(base.light, scene=s), conditions=replace(base.conditions, scene=s), mean=9
+        )
+        for i, s in enumerate(shown)
+    ]
+    measurement.write(tmp_path / "lab", "lab", Layout(3, 4, 25e-12, 1.0), captures, captures)
+    assert {p.name for p in (tmp_path / "lab").iterdir()} == {
+        "chart.npy", "chart.json", "chart-2.json", "measurement.yaml"
+    }  # fmt: skip
+    read = [c.light.scene.tiles for c in measurement.open(tmp_path / "lab").captures]  # type: ignore[union-attr]
+    assert [None if t is None else t.facts() for t in read] == [*(t.facts() for t in laid), None]
 
 
 def test_a_dataset_of_other_images_is_none(tmp_path: Path) -> None:

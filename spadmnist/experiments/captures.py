@@ -168,7 +168,12 @@ class _Shot:
     lux: float
     fitted: float
     counts: np.ndarray
-    labels: np.ndarray
+    laid: Tiles
+
+    @property
+    def labels(self) -> np.ndarray:
+        assert self.laid.labels is not None
+        return self.laid.labels.astype(np.int64)
 
     @property
     def labelled(self) -> Labelled:
@@ -209,15 +214,13 @@ class _Bench:
         return self.chart.load_images(self.images_dir)["test"]
 
     @functools.cached_property
-    def labels(self) -> dict[bytes, int]:
-        """By the pixels of every test image, what it is."""
-        of = self.chart.source.of.load(self.chart.sensor.layout.shape, self.images_dir, self.chart.base)["test"]
-        return {pixels.tobytes(): int(label) for pixels, label in zip(of.pixels, of.labels, strict=True)}
+    def scene(self) -> Scene:
+        return Scene("chart.npy", self.shown.pixels[0], self.shown.tiles)
 
     @functools.cached_property
     def plan(self) -> Measurement:
         """The captures that the chart's config describes, and one in the dark."""
-        clock, scene = self.chart.conditions, Scene("chart.npy", self.shown.pixels[0])
+        clock, scene = self.chart.conditions, self.scene
         dark = replace(
             clock, frames=_DARK_FRAMES, exposure=_DARK_FRAMES * clock.frame_period, wavelength=None, scene=None
         )
@@ -288,40 +291,51 @@ class _Bench:
                 f"{lab.place(capture.id)}: has {capture.conditions.frames} frames, but the networks are trained on "
                 f"sums of {frames}; record {frames} frames"
             )
-        place, laid = lab.place(capture.id), self.shown.tiles
-        assert laid is not None
+        place = lab.place(capture.id)
+        laid = self.laid(capture, place)
         fitted = effective_light(image, model, place)
         photons = twin.photons_at(capture, model.layout)
         # 12 digits: 300 mlux are 0.3 lux, whichever way they were converted
         stated = None if photons is None else float(f"{photons / _photons_of_a_lux(capture, model):.12g}")
-        return _Shot(capture, stated or fitted, fitted, laid.cut(image.values), self.read(capture, laid, place))
+        return _Shot(capture, stated or fitted, fitted, laid.cut(image.values), laid)
 
-    def read(self, capture: Capture, laid: Tiles, place: str) -> np.ndarray:
-        """(digits,) labels of a capture's scene: of the test images that its tiles are."""
-        scene = capture.light.scene
-        assert scene is not None
-        grey = np.rint(scene.share * 255).astype(np.uint8).reshape(scene.shape)
-        found = [self.labels.get(tile.tobytes()) for tile in laid.cut(grey)]
-        if None in found:
-            row, column = laid.corners[found.index(None)].tolist()
+    def laid(self, capture: Capture, place: str) -> Tiles:
+        """The tiles of a capture's chart with their labels: as it says itself, or those of the experiment's chart."""
+        scene, own = capture.light.scene, self.scene
+        assert scene is not None and own.tiles is not None
+        found = own.tiles if scene.tiles is None and scene == own else scene.tiles
+        sizes = [" x ".join(map(str, one.size)) for one in (found or own.tiles, own.tiles)]
+        if found is None:
             raise InputError(
-                f"{place}: in {scene.name} the tile at row {row}, column {column} is none of the test images; show the "
-                f"chart of {self.chart.name}, whose image the imitation leaves in its folder plan"
+                f"{place}: {scene.name} is not the chart of {self.chart.name}, and its light says nothing of tiles; "
+                "fill the plan that the imitation leaves in its folder plan, or write light: {..., tiles: FILE.json}"
             )
-        return np.array(found, np.int64)
+        if sizes[0] != sizes[1]:
+            raise InputError(
+                f"{place}: the tiles of {scene.name} are {sizes[0]} pixels, but the networks read {sizes[1]}; show "
+                "tiles of that size"
+            )
+        if found.labels is None or found.labels.max() >= _lenet.CLASSES:
+            has = "no labels" if found.labels is None else f"the label {found.labels.max()}"
+            raise InputError(
+                f"{place}: the tiles of {scene.name} have {has}, but the networks read the digits 0 to "
+                f"{_lenet.CLASSES - 1}; write labels, a digit for each tile"
+            )
+        return found
 
     def pictures(self) -> list[dict[str, Any]]:
         """The first digits, as originals, and at each level simulated at the light that was fitted, and captured."""
-        laid = self.shown.tiles
-        assert laid is not None
-        out = [_picture("original", laid.cut(self.shown.pixels[0]))]
-        for same in _by_light(self.shots(self.rows[-1])):
+        shots = self.shots(self.rows[-1])
+        shown = shots[0].capture.light.scene
+        assert shown is not None
+        out = [_picture("original", shots[0].laid.cut(np.rint(255 * shown.share.reshape(shown.shape))))]
+        for same in _by_light(shots):
             lit = replace(same[0].capture.light, level=same[0].fitted, kind_of_level="lux")
             (image,) = fluxes.of_measurement(
                 self.simulated(self.chips[SIMULATED], [replace(same[0].capture, light=lit)]), [METHOD]
             ).images
             at = _mlux(float(np.mean([one.lux for one in same])))
-            out.append(_picture(f"{at}, simulated", laid.cut(image.values)))
+            out.append(_picture(f"{at}, simulated", same[0].laid.cut(image.values)))
             out.append(_picture(f"{at}, captured", same[0].counts))
         return out
 

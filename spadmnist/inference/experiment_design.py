@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import twin, units
 from ..effects import Conditions, Mimic
+from ..foreign import visible
 from ..recording import Capture, Light, Recording
 from .candidates import Candidate
 from .evaluation import Evaluation, evaluate, square
@@ -102,7 +103,7 @@ def _brighter(replicates: Replicates, id: str, rate: float, times: float) -> Ite
         or times * rate * capture.conditions.exposure > 2 * _MOST_EVENTS
     ):
         return
-    words = f"a flat field {'as bright as a tenth of' if times < 1 else f'{times:g} times as bright as'} {id}"
+    words = f"{_seen_in(capture)} {'as bright as a tenth of' if times < 1 else f'{times:g} times as bright as'} {id}"
     yield words, replace(capture, light=replace(capture.light, level=level * times)), id
 
 
@@ -148,7 +149,7 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
             continue
         for times in (0.1, 10.0):
             brighter = replace(seen.capture, light=replace(light, level=light.level * times))
-            words = f"a flat field {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
+            words = f"{_seen_in(brighter)} {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
             tries.append((words, brighter, log if id in whole else 0.0))
     assert other.sensors is not None
     for words, capture, expected in tries:
@@ -178,12 +179,19 @@ def on_brightest(
     At half the light, half of the nonlinearity is left, and nothing of a wrong light level.
     """
     then = 0.5 * abs(float(setup.logs[0])) / level_error(replicates, evaluation, entry["capture"])
-    words = f"a flat field half as bright as {entry['capture']}, its light measured anew"
+    what = _seen_in(replicates.seen[entry["capture"]].capture)
+    words = f"{what} half as bright as {entry['capture']}, its light measured anew"
     return _told(words, [entry["quantity"], NONLINEARITY], 0.0, then)
 
 
 def _dark(conditions: Conditions) -> Conditions:
-    return replace(conditions, wavelength=None)
+    return replace(conditions, wavelength=None, scene=None)
+
+
+def _seen_in(capture: Capture) -> str:
+    """The light of a capture in words: a flat field or a scene."""
+    shown = capture.light.scene
+    return "a flat field" if shown is None else f"the scene {visible(shown.name)}"
 
 
 def on_setup(

@@ -275,6 +275,8 @@ def fit_maps(
         error = np.sqrt(np.maximum(post[i], 0))
         r, v = raw[i]
         map_ = PixelMap(candidate.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i])
+        scene = acts_on_light(start, candidate) and any(replicates.of_scene(line.id) for line in lines)
+        map_ = replace(map_, of_scene=scene)
         if not acts_on_light(start, candidate) and float(np.median(v)) >= TELLING**2:
 
             def at(log: float, i: int = i) -> Sensor:

@@ -14,10 +14,10 @@ from . import map_fits, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
-from .replicates import Model
-from .score_test import p_of_map
+from .replicates import Model, Replicates
+from .score_test import PIXELS, p_of_map
 from .signature import Signature, residuals_at, signatures, template_of
-from .trial import Trial, is_pattern, tie
+from .trial import Trial, is_pattern, of_scene, tie
 
 if TYPE_CHECKING:
     from .scan import Scan
@@ -101,6 +101,11 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
         return tried
     assert maps[0].maps is not None
     free = maps[0].maps[maps[0].candidate.carrier]  # type: ignore[index]
+    scenes = {
+        t.candidate.name: _p_of_scene(scan.replicates, evaluation, t, maps[0].candidate, free)
+        for t in patterns
+        if of_scene(t)
+    }
     chance = 1.0 if maps[0].chance is None else maps[0].chance
     doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
     layout = evaluation.sensors.one.layout
@@ -112,17 +117,41 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
             designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "row"))
         elif one.candidate.per == "column":
             designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "column"))
-        else:
+        elif not of_scene(one):
             designs[one.candidate.name] = np.stack([*place, radius], axis=1)
     found = pixel_maps.pattern_tests(free, designs)
-    real = [t for t in patterns if found[t.candidate.name][0] < doubtful]
+    chances = {name: p for name, (p, _) in found.items()} | scenes
+    real = [t for t in patterns if chances[t.candidate.name] < doubtful]
     dropped = [t for t in patterns if t not in real]
     rest = [t for t in tried if t not in dropped]
-    if real and (rest[0] in maps or rest[0] in real):
-        first = min(real, key=lambda t: found[t.candidate.name][1])
+    of_pixels = rest[0].maps is not None and rest[0].candidate.per == "pixel"
+    if real and (rest[0] in maps or rest[0] in real or (scenes and of_pixels)):
+        fixed = [t for t in real if not of_scene(t)]
+        firsts = [min(fixed, key=lambda t: found[t.candidate.name][1])] if fixed else []
+        first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.gain)
         rest.remove(first)
         rest.insert(0, first)
     return rest
+
+
+def _p_of_scene(
+    replicates: Replicates, evaluation: Evaluation, one: Trial, candidate: Candidate, free: pixel_maps.PixelMap
+) -> float:
+    """The p-value of a change of the scene, by what it takes from the residuals of the pixels.
+
+    Its effect on a pixel depends on the scene around it, so that no shape over the array stands for it; and a map of
+    the light is not informed where no light falls.
+
+    Args:
+        candidate, free: the map of pixels that it is compared with, and its fit.
+    """
+    ids = [id for id, name in evaluation.residuals if name == PIXELS and replicates.of_scene(id)]
+    after = residuals_at(replicates, evaluation, one.signature, one.times)
+    levels = map_fits.light_levels_of(replicates, evaluation)
+    information = map_fits.information(replicates, evaluation.values, candidate, levels)
+    z, left = (np.stack([x[id, PIXELS] for id in ids]) for x in (evaluation.residuals, after))
+    known = np.stack([information[id] for id in ids])
+    return pixel_maps.p_of_explained(z, left, known, free.sigma, len(one.candidate.coordinates))
 
 
 def unseen_maps(

@@ -32,6 +32,7 @@ CODES = "codes"  # the statistic of the codes
 _PERIODS = (256, 140, 100)  # the periods that `statistics.codes` folds codes with
 # the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law
 GRID, ROUNDS = (-4.0, 8.0, 97), 100
+NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
 _FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off
 HALF_95 = 1.96  # standard deviations: half of a 95 % interval
 
@@ -63,6 +64,12 @@ class PixelMap:
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) posterior weights
     certain: float = TELLING  # raw_error below which a value is the estimate, whatever the others are
     width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
+    of_scene: bool = False  # no light falls on some pixels, and nothing says how much of it they detect
+
+    @property
+    def informed(self) -> np.ndarray:
+        """(groups,) bool: the values that anything is known of."""
+        return self.raw_error < NOTHING if self.of_scene else np.ones(self.raw.size, bool)
 
     @property
     def price(self) -> float:
@@ -166,8 +173,9 @@ def odd_pixels(map_: PixelMap) -> tuple[np.ndarray, np.ndarray]:
     """((groups,) bool far below all others, (groups,) bool far above)."""
     inner = map_.estimate - median_of(map_.estimate)
     # of most pixels: beyond their noise, without the odd ones
-    width = 1.4826 * float(np.median(np.abs(map_.raw - np.median(map_.raw))))
-    noise = float(np.median(map_.raw_error))
+    raw = map_.raw[map_.informed]
+    width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
+    noise = float(np.median(map_.raw_error[map_.informed])) if raw.size else NOTHING
     bulk = math.sqrt(max(width**2 - noise**2, 0.0))
     beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
     return inner < -beyond, inner > beyond
@@ -193,7 +201,7 @@ def low_ratio(map_: PixelMap) -> tuple[float, float]:
 def summary(map_: PixelMap) -> dict[str, float]:
     """The statistics of a map by name: sigma, low_fraction, low_ratio, high_fraction."""
     low, high = odd_pixels(map_)
-    rest = ~(low | high)
+    rest = ~(low | high) & map_.informed
     spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
     return {
         "sigma": math.sqrt(max(float(spread), 0.0)),
@@ -212,12 +220,15 @@ def pattern_tests(map_: PixelMap, designs: dict[str, np.ndarray]) -> dict[str, t
     Args:
         designs: (pixels, k) columns of each pattern, without the mean.
     """
-    y = np.exp(np.clip(map_.raw, -MOST, MOST))
+    y = np.exp(np.clip(map_.raw[map_.informed], -MOST, MOST))
+    if y.size < 3:
+        return dict.fromkeys(designs, (1.0, 0.0))
     middle, width = median_of(y), 1.4826 * median_of(np.abs(y - median_of(y)))
     y = np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)  # odd pixels do not make a pattern
     out = {}
     ones = np.ones((len(y), 1))
     for name, design in designs.items():
+        design = design[map_.informed]
         full = np.linalg.lstsq(np.hstack([ones, design]), y, rcond=None)[0]
         left = y - np.hstack([ones, design]) @ full
         k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
@@ -234,7 +245,7 @@ def pattern_tests(map_: PixelMap, designs: dict[str, np.ndarray]) -> dict[str, t
 
 def spread_p(map_: PixelMap) -> float:
     """The p-value of a map under the null that all pixels are alike."""
-    informed = map_.raw_error < 3.0  # pixels without information are left out
+    informed = map_.raw_error < NOTHING  # pixels without information are left out
     if informed.sum() < 3 or float(np.std(map_.estimate)) < LEAST_WIDTH:  # all at a bound: no differences
         return 1.0
     r, weight = map_.raw[informed], 1 / map_.raw_error[informed] ** 2
@@ -283,3 +294,34 @@ def map_values(map_: PixelMap) -> dict[str, Value]:
     if math.isfinite(error):  # without low pixels there is no ratio
         results["low_ratio"] = Value(ratio, max(ratio - HALF_95 * error, 0.0), ratio + HALF_95 * error)
     return results
+
+
+def p_of_explained(
+    before: np.ndarray, after: np.ndarray, information: np.ndarray, sigma: float, parameters: int
+) -> float:
+    """The p-value of what some parameters take from the residuals of pixels: an F test against the rest.
+
+    Pixels that differ by themselves, by `sigma`, are a random effect: residuals are first whitened for it.
+
+    Args:
+        before, after: (captures, pixels) residuals without and with the parameters.
+        information: (captures, pixels) squared slope of a residual on the logarithm of its pixel's value.
+        sigma: standard deviation of a logarithm.
+        parameters: their number.
+    """
+    z, left = (_whitened(x, np.sqrt(information), sigma).ravel() for x in (before, after))
+    free = z.size - parameters
+    if free < 1:
+        return 1.0
+    middle = median_of(z)
+    far = _FAR_OFF * max(1.4826 * median_of(np.abs(z - middle)), 1.0)
+    z, left = (np.clip(x, middle - far, middle + far) for x in (z, left))  # as of odd pixels in `pattern_tests`
+    square = max(float(left @ left), 1e-30)
+    return float(stats.f.sf((float(z @ z) - square) / parameters / (square / free), parameters, free))
+
+
+def _whitened(z: np.ndarray, sensitivity: np.ndarray, sigma: float) -> np.ndarray:
+    """(captures, pixels) residuals of unit variance, independent although each pixel differs by `sigma`."""
+    square = (sensitivity**2).sum(axis=0)
+    along = (sensitivity * z).sum(axis=0) / np.maximum(square, 1e-300)
+    return np.asarray(z - sensitivity * along * (1 - 1 / np.sqrt(1 + sigma**2 * square)))

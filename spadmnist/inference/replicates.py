@@ -312,6 +312,10 @@ class Replicates:
                     other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
         return other
 
+    def of_scene(self, id: str) -> bool:
+        """Whether a capture is one of a scene."""
+        return self.seen[id].capture.light.scene is not None
+
     @property
     def dark(self) -> list[str]:
         """The captures without light."""

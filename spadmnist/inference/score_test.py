@@ -27,7 +27,7 @@ from .trial import Trial, shape_of
 
 LEAST_P = 1e-300  # a p-value is never 0
 # statistics of the pixels' counts: each by itself, and their distribution
-_MAP, _LAWS = "pixel_map", ("spread", "tails", "outliers")
+PIXELS, _LAWS = "pixel_map", ("spread", "tails", "outliers")
 _EDGES = "early_intervals"  # the statistic of the differences between the pixels' dead times
 _BY_CHANCE = 0.25  # of the data's projection on a signature: as much may be the noise of a few replicates
 _LITTLE = 0.1  # factor on the strength at which the quadratic part is negligible
@@ -345,7 +345,7 @@ def p_of_map(
         return 1.0
     if candidate.blinds:
         return _p_of_blind_times(replicates, evaluation, candidate, values, information)
-    name = pixel_maps.CODES if candidate.per == "code" else _MAP
+    name = pixel_maps.CODES if candidate.per == "code" else PIXELS
     total_information = {id: float(x.sum()) for id, x in information.items()}
     cells = [(id, name) for id in total_information if total_information[id] > 0 and (id, name) in evaluation.residuals]
     if cells:
@@ -361,10 +361,19 @@ def p_of_map(
         parts = pixel_maps.code_periods(size)
         return min(1.0, len(parts) * min(p_of_spread(z[part], own[:, part]) for part in parts.values()))
     groups = pixel_maps.groups_of(evaluation.sensors.one, candidate.per)
-    count = np.sqrt(np.bincount(groups))
-    data = np.bincount(groups, z) / count
-    null_data = np.stack([np.bincount(groups, row) / count for row in own])
-    chance = p_of_spread(data, null_data)
+    if any(replicates.of_scene(id) for id, _ in cells):
+        sensitivity = np.sqrt([information[id] for id, _ in cells])
+        rows = [[evaluation.replicate_residuals[cell][k] for cell in cells] for k in range(len(own))]
+        data, *null = (
+            _scores_of_groups(row, sensitivity, groups)
+            for row in ([evaluation.residuals[cell] for cell in cells], *rows)
+        )
+        chance = p_of_spread(data, np.stack(null)) if data.size else 1.0
+    else:
+        count = np.sqrt(np.bincount(groups))
+        data = np.bincount(groups, z) / count
+        null_data = np.stack([np.bincount(groups, row) / count for row in own])
+        chance = p_of_spread(data, null_data)
     if candidate.per != "pixel":
         return chance
     # with few detections in most pixels, the distribution of the counts is more sensitive than the score of each
@@ -372,6 +381,20 @@ def p_of_map(
     laws = [(best, name) for name in _LAWS if (best, name) in evaluation.residuals]
     others = [evaluation.nulls[cell].chance(evaluation.residuals[cell])[0] for cell in laws]
     return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
+
+
+def _scores_of_groups(residuals: Sequence[np.ndarray], sensitivity: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """The score of each value of a map, of unit variance, where anything informs it.
+
+    Args:
+        residuals: of captures, (pixels,) each.
+        sensitivity: (captures, pixels) slope of a residual on the logarithm of the value: 0 where a scene is black.
+        groups: (pixels,) which value each pixel has.
+    """
+    information = np.bincount(groups, (sensitivity**2).sum(axis=0))
+    score = np.bincount(groups, (sensitivity * residuals).sum(axis=0))
+    some = information > pixel_maps.NOTHING**-2
+    return np.asarray(score[some] / np.sqrt(information[some]))
 
 
 def _p_of_blind_times(

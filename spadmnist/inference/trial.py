@@ -162,11 +162,16 @@ def frequencies_of(candidate: Candidate) -> list[Coordinate]:
     return [d for d in candidate.shapes if d.unit == "Hz"] if candidate.phases else []
 
 
+def of_scene(one: Trial) -> bool:
+    """Whether it changes the scene that is seen."""
+    return bool(getattr(Effect.registry.find(one.candidate.effect), "of_scene", False))
+
+
 def is_pattern(one: Trial) -> bool:
     """Whether it is a pattern: rows, columns, or a shape of the light over the array."""
     candidate = one.candidate
     if candidate.kind != "add":
-        return False
+        return of_scene(one)  # no other parameter of the light is set
     return candidate.per in ("row", "column") or getattr(Effect.registry.find(candidate.effect), "stage", "") == "light"
 
 

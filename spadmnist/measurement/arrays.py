@@ -23,6 +23,7 @@ from ..errors import InputError, did_you_mean
 from ..events import Events, Layout
 from ..readout import no_detection, unsigned_for
 from ..recording import MODALITIES, Light, Recording
+from ..tiles import Tiles
 from .entries import MOST_FRAMES, check_name
 
 if TYPE_CHECKING:
@@ -213,6 +214,17 @@ class Data:
     def counts(self) -> np.ndarray:
         """(rows, columns) detections of each pixel over the capture (of frames: those that have one)."""
         return self.recording.totals.reshape(self.recording.layout.shape)
+
+    @property
+    def tiles(self) -> Tiles:
+        """The tiles of the chart that was seen: `.tiles.cut(image)`, `.tiles.labels`. Raises InputError without any."""
+        shown = self.capture.light.scene
+        if shown is None or shown.tiles is None:
+            raise InputError(
+                f"{self.capture.id}: says nothing of tiles; a capture of a chart names their file, light: {{kind: "
+                "image, file: chart.npy, tiles: chart.json}, and simulate writes it of a chart's dataset"
+            )
+        return shown.tiles
 
     def __repr__(self) -> str:
         c, total = self.recording.conditions, int(self.recording.totals.sum())

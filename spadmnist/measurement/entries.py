@@ -94,10 +94,15 @@ class Flat(_Light):
 
 
 class Image(_Light):
-    """An image that the light follows: a scene. Without irradiance and lux the level of its white is free."""
+    """An image that the light follows: a scene. Without irradiance and lux the level of its white is free.
+
+    tiles: a JSON file that says where the tiles of a chart lie: size, [rows, columns]; corners, of each its first row
+    and column; numbers, of the images that they are; labels, where there are any.
+    """
 
     kind: Literal["image"]
     file: File
+    tiles: File | None = None
     wavelength: Length | None = None
     irradiance: Irradiance | None = None
     lux: Lux | None = None
@@ -157,6 +162,7 @@ EXAMPLES = {
     "light": "light: {kind: dark}",
     "wavelength": "wavelength: 500 nm",
     "file": "file: chart.npy",
+    "tiles": "tiles: chart.json",
     "exposure": "exposure: 100 ms",
     "frames": "frames: 1000",
     "frame_time": "frame_time: 10 us",

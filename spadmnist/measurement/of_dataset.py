@@ -52,8 +52,10 @@ def of_dataset(root: Path, readout: str | None) -> Measurement:
     if isinstance(source, Chart):
         white = manifest["images"]["white"]
         for split in stored.splits:
-            chart = stored[stored.levels[0], split].images[0]
-            scenes[split] = Scene(f"{split}.npy", chart if chart.dtype == np.uint8 else chart / float(white))
+            part = stored[stored.levels[0], split]
+            chart = part.images[0]
+            seen = chart if chart.dtype == np.uint8 else chart / float(white)
+            scenes[split] = Scene(f"{split}.npy", seen, part.tiles)
     captures = []
     for level, split, i in images:
         share = source.grey / 255 if isinstance(source, Uniform) else 1.0

@@ -11,18 +11,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import capture_files, config, dataset, document, scene, units
-from ..document import Path_
+from .. import capture_files, config, dataset, disk, document, manifest, scene, tiles, units
+from ..document import Document, Path_
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
 from ..events import MOST_PIXELS, Layout
+from ..foreign import from_json
 from ..recording import Capture, Light, Recording
 from ..scene import Scene
+from ..tiles import Tiles
 from ..validated import Reader
 from .entries import EXAMPLES, FILE, SECTIONS, Array, Counts, Dark, Entry, Flat, Frames, Image, Stamps
 from .of_dataset import of_dataset
 from .type import Measurement, without_file
 
+_LARGEST_TILES = 1 << 26  # bytes of a file of tiles: a million of them
 _DEFAULT_WAVELENGTH = "555 nm"  # of a scene, and where a level is given in lux, which mean light of this colour
 
 
@@ -154,7 +157,7 @@ class _Reader(Reader):
             return None
         lit = _light(entry.light)
         if isinstance(entry.light, Image):
-            lit = replace(lit, scene=self.scene((*path, "light", "file"), entry.light.file, layout))
+            lit = replace(lit, scene=self.scene((*path, "light"), entry.light, layout))
         conditions = replace(_conditions(entry, lit.wavelength), scene=lit.scene)
         self.check_clock(path, entry, conditions)
         if len(self.problems) > before:
@@ -162,17 +165,32 @@ class _Reader(Reader):
         mean = None if entry.mean is None else float(entry.mean)
         return Capture(entry.id, entry.modality, lit, conditions, mean), entry.file and self.base / entry.file
 
-    def scene(self, path: Path_, name: str, layout: Layout | None) -> Scene | None:
-        """The scene of a file in the folder; None after its mistakes were noted."""
+    def scene(self, path: Path_, entry: Image, layout: Layout | None) -> Scene | None:
+        """The scene of a file in the folder, with its tiles; None after its mistakes were noted."""
         try:
-            found = scene.read(self.base / name)
+            found = scene.read(self.base / entry.file)
         except InputError as error:
-            self.say(path, str(error))
+            self.say((*path, "file"), str(error))
             return None
         if layout is not None and found.shape != layout.shape:
             has = f"{_by(found.shape)} pixels, but the layout {_by(layout.shape)}"
-            self.say(path, f"the scene {name} has {has}; give an image of the sensor's size")
-        return found
+            self.say((*path, "file"), f"the scene {entry.file} has {has}; give an image of the sensor's size")
+        return found if entry.tiles is None else replace(found, tiles=self.tiles(path, entry.tiles, found.shape))
+
+    def tiles(self, path: Path_, name: str, shape: tuple[int, int]) -> Tiles | None:
+        """The tiles of a file in the folder, on a chart of `shape`; None after its mistakes were noted."""
+        file = self.base / name
+        try:
+            facts = from_json(disk.read_file(file, _LARGEST_TILES))
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            self.say((*path, "tiles"), f"{file}: cannot be read ({reason}); the tiles of a chart are a JSON file")
+            return None
+        told = Reader(Document(str(file), facts), self.base)
+        if told.valid(manifest.TileFacts, facts, ()) is not None:
+            manifest.check_tiles(facts, shape, (), told)
+        self.problems += told.problems
+        return None if told.problems else tiles.of_facts(facts, shape)
 
     def check_parts(self, path: Path_, raw: Mapping[str, Any]) -> None:
         """Which entries stand beside each other, whatever they say."""

@@ -11,11 +11,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import capture_files, config, disk, document, units
+from .. import capture_files, config, dataset, disk, document, units
 from ..errors import InputError, SpadError
 from ..events import Layout
 from ..recording import Capture, Recording
 from ..scene import Scene
+from ..tiles import Tiles
 from .entries import FILE, FORMAT
 from .type import Measurement
 
@@ -73,6 +74,8 @@ def write(
             _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
         for shown, file in _scenes(done).items():
             _commit(root, file, shown.file())
+        for laid, file in _tiles(done).items():
+            _commit(root, file, laid)
         _check_place(root, done, layout)
         _commit(root, FILE, _yaml(name, layout, done).encode())
         _clear(root)
@@ -167,6 +170,17 @@ def _scenes(captures: Sequence[Capture]) -> dict[Scene, str]:
     return dict(zip(shown, _named([one.name.removesuffix(".npy") for one in shown], ".npy"), strict=True))
 
 
+def _tiles(captures: Sequence[Capture]) -> dict[bytes, str]:
+    """The tiles of the charts that captures are of, as their files hold them, each once, and the names of the files."""
+    shown = [capture.light.scene for capture in captures if capture.light.scene is not None]
+    laid = {_laid(one.tiles): one.name.removesuffix(".npy") for one in shown if one.tiles is not None}
+    return dict(zip(laid, _named(list(laid.values()), ".json"), strict=True))
+
+
+def _laid(tiles: Tiles) -> bytes:
+    return dataset.canonical(tiles.facts())
+
+
 @contextlib.contextmanager
 def _alone(root: Path) -> Iterator[None]:
     """Hold the folder for writing; the system lets go of it where the process is killed."""
@@ -190,8 +204,8 @@ def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> Non
         there |= {f"{own.name}/{name}" for name in os.listdir(own)} - {f"{own.name}/{disk.temporary(root).name}"}
     if layout.positions is not None:
         there.discard(_POSITIONS)
-    known = {*_files(captures), *_scenes(captures).values()}
-    parts = (".h5", ".npy")
+    known = {*_files(captures), *_scenes(captures).values(), *_tiles(captures).values()}
+    parts = (".h5", ".npy", ".json")
     strange = sorted(name for name in there if (name not in known if captures else not name.endswith(parts)))
     if strange:
         raise SpadError(f"{root} is not empty (there is {strange[0]}); choose another folder with -o, or remove it")
@@ -248,18 +262,20 @@ def _yaml(name: str, layout: Layout, captures: Sequence[Capture]) -> str:
     if layout.positions is not None:
         array = {"positions": _POSITIONS}
     lines = document.dump({"format": FORMAT, "name": name, "layout": array}) + "captures:\n"
-    scenes = _scenes(captures)
+    scenes, laid = _scenes(captures), _tiles(captures)
     for capture, file in zip(captures, _files(captures), strict=True):
-        entry = document.dump(_entry(capture, file, scenes)).splitlines()
+        entry = document.dump(_entry(capture, file, scenes, laid)).splitlines()
         lines += "".join(f"{'    ' if i else '  - '}{line}\n" for i, line in enumerate(entry))
     return lines
 
 
-def _entry(capture: Capture, file: str, scenes: Mapping[Scene, str]) -> dict[str, Any]:
+def _entry(capture: Capture, file: str, scenes: Mapping[Scene, str], laid: Mapping[bytes, str]) -> dict[str, Any]:
     lit, c = capture.light, capture.conditions
     shown: dict[str, Any] = {"kind": "dark" if lit.dark else "flat"}
     if lit.scene is not None:
         shown = {"kind": "image", "file": scenes[lit.scene]}
+        if lit.scene.tiles is not None:
+            shown["tiles"] = laid[_laid(lit.scene.tiles)]
     if lit.wavelength is not None:
         shown["wavelength"] = units.exact(lit.wavelength, "m")
         if lit.level is not None:
