@@ -146,13 +146,8 @@ class Npz(Target):
                 cls._member(archive, name, np.asarray(value))
             if recording.events is not None:
                 events, ticks, _ = _stamped(recording)
-                cls._member(archive, "time", ticks)
-                kind, count = _numbers(recording), len(ticks)
-                with archive.open(zipfile.ZipInfo("pixel.npy"), "w", force_zip64=True) as member:
-                    _put_header(member, kind, (count,))
-                    for start in range(0, count, _PIECE):
-                        pixel = events.rows_of(start, min(start + _PIECE, count))
-                        member.write(pixel.astype(kind).data)
+                cls._pieces(archive, "time", ticks.dtype, len(ticks), lambda start, stop: ticks[start:stop])
+                cls._pieces(archive, "pixel", _numbers(recording), len(ticks), events.rows_of)
             else:
                 with archive.open(zipfile.ZipInfo("frames.npy"), "w", force_zip64=True) as member:
                     _put_frames(recording, member)
@@ -161,6 +156,15 @@ class Npz(Target):
     def _member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
         with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
             np.lib.format.write_array(member, array, allow_pickle=False)
+
+    @staticmethod
+    def _pieces(
+        archive: zipfile.ZipFile, name: str, kind: Any, count: int, get: Callable[[int, int], np.ndarray]
+    ) -> None:
+        with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            _put_header(member, kind, (count,))
+            for start in range(0, count, _PIECE):
+                member.write(np.ascontiguousarray(get(start, min(start + _PIECE, count)), kind).data)
 
 
 class Npy(Target):

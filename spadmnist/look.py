@@ -16,6 +16,7 @@ from .recording import Capture, Light, Recording
 
 _CHANCE = 1e-6  # a silence at an end is noted where a constant rate leaves one as long less often
 _LONGER = 3  # times the longest silence inside, which the one at an end must exceed: light may come in bursts
+_PIECE = 1 << 20  # intervals that are looked at together
 _FRAMES_AT_ONCE = 64  # from either end, to begin with
 
 
@@ -23,9 +24,8 @@ def intervals(events: Events) -> Iterator[np.ndarray]:
     """s between the detections of a pixel, in pieces."""
     stamps = events.times if events.ticks is None else events.ticks
     tick = events.tick or 1.0
-    piece = 1 << 20
-    for start in range(0, len(stamps) - 1, piece):
-        apart = np.diff(stamps[start : start + piece + 1])
+    for start in range(0, len(stamps) - 1, _PIECE):
+        apart = np.diff(stamps[start : start + _PIECE + 1])
         inside = np.ones(len(apart), bool)
         firsts = events.offsets[np.searchsorted(events.offsets, start + 1) :]
         inside[firsts[firsts <= start + len(apart)] - start - 1] = False
