@@ -39,9 +39,12 @@ from .readout import counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
 
 OWNER = "capture_id"  # attribute of a file in a measurement that was written here: which capture it is
-_MOST_EVENTS = 1 << 29  # of a capture: 16 bytes each are 8 GiB
+# bytes of the stamps of a capture, of 4 bytes each or 8, which lie in memory; all else that is needed to read, reduce
+# and write them takes less than as much again, and so a capture costs at most 1 GB
+MOST_STAMPS = 1 << 29
 _MOST_BITS = 16  # of a count
-_LARGEST_CHUNK = 1 << 28  # bytes
+_LARGEST_CHUNK = 1 << 28  # bytes, of frames
+LARGEST_CHUNK_OF_STAMPS = 1 << 25  # bytes: a packed one takes four times as much while it is unpacked
 _LARGEST_FRAME = 1 << 28  # bytes
 _PIECE = 1 << 20  # events that are read at a time
 _FRAMES_AT_ONCE = 1 << 25  # bytes as they are stored
@@ -92,8 +95,8 @@ def opened(path: Path) -> Iterator[Any]:
         ) from None
 
 
-def _data_set(file: Any, name: str, path: Path) -> Any:
-    """A plain data set of unsigned integers (or of booleans) in the file itself."""
+def _data_set(file: Any, name: str, path: Path, largest_chunk: int = _LARGEST_CHUNK) -> Any:
+    """A plain data set of unsigned integers (or of booleans) in the file itself. largest_chunk: bytes."""
     import h5py
 
     there = ", ".join(sorted(visible(key)[:40] for key in list(file)[:10])) or "nothing"
@@ -114,9 +117,9 @@ def _data_set(file: Any, name: str, path: Path) -> Any:
         if code not in FILTERS:
             allowed = ", ".join(FILTERS.values())
             raise InputError(f"{path}: {name} is stored with the filter number {code}; allowed are {allowed}")
-    if found.chunks is not None and math.prod(found.chunks) * found.dtype.itemsize > _LARGEST_CHUNK:
+    if found.chunks is not None and math.prod(found.chunks) * found.dtype.itemsize > largest_chunk:
         raise InputError(
-            f"{path}: {name} is stored in chunks of more than {_LARGEST_CHUNK >> 20} MiB; take smaller ones"
+            f"{path}: {name} is stored in chunks of more than {largest_chunk >> 20} MiB; take smaller ones"
         )
     return found
 
@@ -147,19 +150,28 @@ def _check_chunks(found: Any, name: str, path: Path) -> None:
         raise InputError(f"{path}: {name} is packed {len(packers)} times over; store it packed once, with gzip")
     sums = 4 * codes.count(_FLETCHER)
     most = math.prod(found.chunks) * found.dtype.itemsize + sums
-    stored: list[tuple[tuple[int, ...], int, int]] = []
-    found.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size, chunk.filter_mask)))
-    for offset, size, skipped in stored:
-        large = size > most + most // 100 + 4096  # what does not shrink may grow a little
-        if not large and packers and not skipped >> packers[0] & 1 and size * _GAINS[codes[packers[0]]] > _UNPACKED:
-            behind = 4 * codes[packers[0] :].count(_FLETCHER)  # stands behind what is packed
-            raw = found.id.read_direct_chunk(offset)[1]
-            large = _unpacked(raw[: len(raw) - behind], codes[packers[0]], most) > most
-        if large:
-            raise InputError(
-                f"{path}: {name} has a chunk that unpacks to more than the {most:,} bytes of its shape; the file is "
-                "damaged or hostile: write it again"
-            )
+    large: list[tuple[int, ...]] = []
+    unsure: list[tuple[int, ...]] = []
+
+    def look(chunk: Any) -> None:
+        if chunk.size > most + most // 100 + 4096:  # what does not shrink may grow a little
+            large.append(chunk.chunk_offset)
+        packed = packers and not chunk.filter_mask >> packers[0] & 1
+        if packed and chunk.size * _GAINS[codes[packers[0]]] > _UNPACKED:
+            unsure.append(chunk.chunk_offset)
+
+    found.id.chunk_iter(look)
+    for offset in () if large else unsure:
+        behind = 4 * codes[packers[0] :].count(_FLETCHER)  # stands behind what is packed
+        raw = found.id.read_direct_chunk(offset)[1]
+        if _unpacked(raw[: len(raw) - behind], codes[packers[0]], most) > most:
+            large.append(offset)
+            break
+    if large:
+        raise InputError(
+            f"{path}: {name} has a chunk that unpacks to more than the {most:,} bytes of its shape; the file is "
+            "damaged or hostile: write it again"
+        )
 
 
 def _unpacked(raw: bytes, code: int, most: int) -> int:
@@ -300,7 +312,7 @@ def _by(shape: tuple[int, ...]) -> str:
 
 
 def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Found:
-    time, pixel = _data_set(file, "time", path), _data_set(file, "pixel", path)
+    time, pixel = (_data_set(file, name, path, LARGEST_CHUNK_OF_STAMPS) for name in ("time", "pixel"))
     for name, found in (("time", time), ("pixel", pixel)):
         if found.ndim != 1 or found.dtype.kind != "u":
             raise InputError(f"{path}: {name} is {found.dtype} of shape {found.shape}; it needs one unsigned axis")
@@ -308,14 +320,10 @@ def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Foun
         raise InputError(
             f"{path}: time has {len(time):,} entries and pixel {len(pixel):,}; both need one for each detection"
         )
-    if len(time) > _MOST_EVENTS:
-        raise InputError(
-            f"{path}: declares {len(time):,} detections; a capture may have {_MOST_EVENTS:,}, which take 8 GiB: "
-            "cut it into several"
-        )
+    tick = _tick((file, time), capture.conditions.exposure, path)
+    check_number(path, len(time), stamps_type(path, capture.conditions.exposure, tick))
     check_stored(time, "time", path)
     check_stored(pixel, "pixel", path)
-    tick = _tick((file, time), capture.conditions.exposure, path)
     # a pixel has a stamp in each tick at most, and in the one that the exposure's end cuts
     most = pixels * (no_detection(capture.conditions.exposure, tick) + 1)
     if len(time) > most:
@@ -324,6 +332,22 @@ def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Foun
             f"{units.show(tick, 's')} {pixels:,} pixels can have {most:,}: correct the tick, the exposure or the file"
         )
     return _Found(capture, tick)
+
+
+def stamps_type(path: Path, exposure: float, tick: float) -> np.dtype[Any]:
+    """The type that stamps of an exposure (s) are held in; what is rounded up may reach its end. Raises InputError."""
+    return np.dtype(stamps_for(no_detection(exposure, tick), f"{path}: time stamps"))
+
+
+def check_number(path: Path, count: int, kind: np.dtype[Any]) -> None:
+    """Raise InputError where so many detections with stamps of this type take too much memory."""
+    if count > MOST_STAMPS // kind.itemsize:
+        longer = ", or store longer ticks: up to 2^32 in an exposure take half of it" if kind.itemsize > 4 else ""
+        raise InputError(
+            f"{path}: has {count:,} detections, which take {count * kind.itemsize / 1e6:,.0f} MB of memory; a capture "
+            f"may have {MOST_STAMPS // kind.itemsize:,} ({MOST_STAMPS / 1e6:,.0f} MB): cut the recording into several "
+            f"captures, each with a shorter exposure{longer}"
+        )
 
 
 def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
@@ -423,39 +447,80 @@ def read(path: Path, capture: Capture, layout: Layout, dead_time: float) -> tupl
 def _events(file: Any, found: _Found, pixels: int, path: Path) -> tuple[Events, list[str]]:
     """Detections as rows of pixels, by counting: two passes, whatever the order in the file."""
     assert found.tick is not None
-    end = no_detection(found.capture.conditions.exposure, found.tick)  # what is rounded up may reach it
+    exposure = found.capture.conditions.exposure
+    end = no_detection(exposure, found.tick)  # what is rounded up may reach it
     time, pixel = file["time"], file["pixel"]
-    where = np.empty(len(pixel), np.uint16 if pixels <= 1 << 16 else np.uint32)
-    counts = np.zeros(pixels, np.int64)
-    for start in range(0, len(pixel), _PIECE):
-        piece = pixel[start : start + _PIECE]
+
+    def pixels_in(part: slice) -> np.ndarray:
+        piece = np.asarray(pixel[part])
         if len(piece) and int(piece.max()) >= pixels:
-            wrong = start + int(np.argmax(piece >= pixels))
+            wrong = part.start + int(np.argmax(piece >= pixels))
             raise InputError(
                 f"{path}: pixel[{wrong}] is {pixel[wrong]}, but the array has pixels 0 to {pixels - 1}; "
                 "correct the layout or the file"
             )
-        where[start : start + _PIECE] = piece
-        _count(where[start : start + _PIECE], counts)
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    ticks = np.empty(len(time), stamps_for(end, f"{path}: time stamps"))
-    place, late = offsets[:-1].copy(), 0
-    for start in range(0, len(time), _PIECE):
-        piece = time[start : start + _PIECE]
+        return piece.astype(np.uint32, copy=False)
+
+    counts = np.zeros(pixels, np.int64)
+    for part in _parts(pixel):
+        _count(pixels_in(part), counts)
+    rows = Rows(counts, stamps_type(path, exposure, found.tick))
+    for part in _parts(time):
+        piece = time[part]
         if int(piece.max()) > end:
-            wrong = start + int(np.argmax(piece > end))
+            wrong = part.start + int(np.argmax(piece > end))
             raise InputError(
                 f"{path}: time[{wrong}] is {time[wrong]} ticks of {units.show(found.tick, 's')}, beyond the exposure, "
-                f"{units.show(found.capture.conditions.exposure, 's', 9)}; correct tick, the exposure or the file"
+                f"{units.show(exposure, 's', 9)}; correct tick, the exposure or the file"
             )
-        late += _place(piece.astype(ticks.dtype), where[start : start + _PIECE], offsets, place, ticks)
+        rows.put(pixels_in(part), piece)
     notes = []
-    if late:
-        _sort_rows(ticks, offsets)
+    if rows.late:
         notes.append(
-            f"{late:,} of {len(ticks):,} detections stand behind a later one of their own pixel; they were sorted"
+            f"{rows.late:,} of {len(time):,} detections stand behind a later one of their own pixel; they were sorted"
         )
-    return Events(None, offsets, pixels, ticks, found.tick, end=found.capture.conditions.exposure), notes
+    return Events(None, rows.offsets, pixels, rows.ordered(), found.tick, end=exposure), notes
+
+
+def parts(count: int, each: int) -> Iterator[slice]:
+    """So many numbers that are stored in chunks of `each`, in pieces of whole chunks."""
+    step = max(_PIECE // each, 1) * each
+    return (slice(start, min(start + step, count)) for start in range(0, count, step))
+
+
+def _parts(stored: Any) -> Iterator[slice]:
+    return parts(len(stored), stored.chunks[0] if stored.chunks else 1)
+
+
+class Rows:
+    """Detections that come in any order, piece by piece, put into rows of pixels. counts: (pixels,) int64 of each.
+
+    late: of those that were put, how many are earlier than the one before of their own pixel; back: by how much at
+    most, in ticks. Only the stamps, of type `kind`, lie in memory.
+    """
+
+    def __init__(self, counts: np.ndarray, kind: np.dtype[Any]):
+        self.late = self.back = 0
+        self.offsets = np.concatenate([[0], np.cumsum(counts)])
+        self._place, self._stamps = self.offsets[:-1].copy(), np.empty(int(self.offsets[-1]), kind)
+
+    def put(self, pixel: np.ndarray, ticks: np.ndarray) -> None:
+        """Put some detections behind those that their pixels have. pixel, ticks: (n,). Raises ValueError where there
+        are others than were counted.
+        """
+        for start in range(0, len(ticks), _PIECE):
+            part = slice(start, start + _PIECE)
+            some = ticks[part].astype(self._stamps.dtype, copy=False), pixel[part].astype(np.uint32, copy=False)
+            late, back = _place(*some, self.offsets, self._place, self._stamps)
+            if late < 0:
+                raise ValueError("it changed while it was read")
+            self.late, self.back = self.late + int(late), max(self.back, int(back))
+
+    def ordered(self) -> np.ndarray:
+        """(detections,) the stamps, ascending within each row; all were put."""
+        if self.late:
+            _sort_rows(self._stamps, self.offsets)
+        return self._stamps
 
 
 @jit
@@ -466,15 +531,22 @@ def _count(where, counts):  # type: ignore[no-untyped-def]
 
 @jit
 def _place(times, where, offsets, place, out):  # type: ignore[no-untyped-def]
-    """Put times behind those that their pixels have; how many of them are earlier than the one before."""
+    """Put times behind those that their pixels have; how many of them are earlier than the one before, and by how much
+    at most. -1 where a pixel has more of them than it has room for.
+    """
     late = 0
+    back = np.uint64(0)
     for i in range(times.size):
         pixel = where[i]
         at = place[pixel]
-        late += at > offsets[pixel] and out[at - 1] > times[i]
+        if at >= offsets[pixel + 1]:
+            return -1, back
+        if at > offsets[pixel] and out[at - 1] > times[i]:
+            late += 1
+            back = max(back, np.uint64(out[at - 1] - times[i]))
         out[at] = times[i]
         place[pixel] = at + 1
-    return late
+    return late, back
 
 
 @jit
@@ -689,7 +761,7 @@ def _put_events(file: Any, recording: Recording, events: Events, alive: Callable
         some = slice(start, min(start + _PIECE, count))
         stamps = events.times[some] / tick if events.ticks is None else events.ticks[some]
         time[some] = stamps.astype(kind)
-        pixel[some] = np.repeat(np.arange(pixels), np.diff(events.offsets.clip(some.start, some.stop)))
+        pixel[some] = events.rows_of(some.start, some.stop)
 
 
 def _put_frames(file: Any, recording: Recording, alive: Callable[[], None]) -> None:

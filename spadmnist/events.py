@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,6 +12,7 @@ from . import kernels
 from .errors import InputError, SpadError
 
 MOST_PIXELS = 1 << 24  # of an array: each map takes 8 bytes of each, 128 MiB
+_BINS = 1 << 21  # of time that are looked at together: 16 bytes each
 _MOST_PAIRS = 1 << 24  # of pixels, in a list of who lies near whom: 24 bytes each, 400 MB
 
 
@@ -163,6 +165,12 @@ class Events:
             self._times = self.ticks * self.tick
         return self._times
 
+    def times_of(self, part: slice) -> np.ndarray:
+        """s, of some events; nothing is kept."""
+        if self.ticks is None or self.tick is None:
+            return self.times[part]
+        return self.ticks[part] * self.tick
+
     def __len__(self) -> int:
         """Number of events."""
         return int(self.offsets[-1])
@@ -189,6 +197,39 @@ class Events:
     def pixel(self) -> np.ndarray:
         """(events,) the pixel, within its image, of each event."""
         return self.rows % self.pixels if self.row_pixel is None else self.row_pixel[self.rows]
+
+    def rows_of(self, start: int, stop: int) -> np.ndarray:
+        """(stop - start,) the rows of some events, one after the other."""
+        first, last = (int(np.searchsorted(self.offsets, place, "right")) - 1 for place in (start, stop - 1))
+        ends = self.offsets[first : last + 2].clip(start, stop)
+        return np.repeat(np.arange(first, last + 1), np.diff(ends))
+
+    def in_time_order(self, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """(stamps, rows) of all events in the order of time, and of their rows where stamps are the same.
+
+        In pieces of about `most` events: ticks, or times where there are none. All that are at the same tick are in one
+        piece.
+        """
+        stamps: np.ndarray = self.times if self.ticks is None else self.ticks
+        if not len(stamps):
+            return
+        place, left = self.offsets[:-1].copy(), len(stamps)
+        begin, last = float(stamps.min()), float(stamps.max())
+        least = max(0.0 if self.ticks is None else 1.0, float(np.spacing(last)))  # what tells two stamps apart
+        width = (last - begin) * most / left
+        while left:
+            width = max(width, least)
+            ends = kernels.rows_upto(stamps, self.offsets, place, np.inf if begin + width > last else begin + width)
+            count = int((ends - place).sum())
+            if count > most and width > least:
+                width /= 2
+                continue
+            rows = np.repeat(np.arange(len(place)), ends - place)
+            piece = kernels.between(stamps, place, ends, count)
+            order = np.argsort(piece, kind="stable")
+            yield piece[order], rows[order]
+            left, place, begin = left - count, ends, begin + width
+            width *= 2 if count < most // 4 else 1
 
     def row(self, index: int) -> np.ndarray:
         """The times of one row, s."""
@@ -312,6 +353,19 @@ class Events:
         if len(times) and (times.min() < 0 or (end is not None and times.max() >= end)):
             return f"times reach from {times.min():g} s to {times.max():g} s, outside the exposure"
         return None
+
+
+def longest_gap(stamps: np.ndarray, start: float, end: float) -> tuple[float, int]:
+    """(the longest gap between neighbours of all stamps, in any order, with start and end; how many are before `end`).
+
+    No stamp is before `start`.
+    """
+    if not end > start:
+        return 0.0, 0
+    gap, count, hidden = kernels.longest_gap(stamps, start, end, max(1, len(stamps) // 8), _BINS)
+    if hidden:  # as good as never: the longest gap is shorter than eight mean ones, but never than a mean one
+        gap, _, _ = kernels.longest_gap(stamps, start, end, 2 * (count + 1), _BINS)
+    return float(gap), int(count)
 
 
 def _shifted(parent: np.ndarray | None, by: int | np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 
 from . import __version__, capture_files, disk
 from .errors import SpadError
+from .events import Events
 from .factory import Progress
 from .importers.names import safe_name
 from .measurement import Measurement
@@ -103,13 +104,20 @@ def export(
     return paths
 
 
-def _events(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """(ticks, pixel, tick in s) of all detections, pixel after pixel."""
+_PIECE = 1 << 20  # detections that are put into a file at a time
+
+
+def _stamped(recording: Recording) -> tuple[Events, np.ndarray, float]:
+    """(the detections, their ticks, s of a tick). Raises SpadError where they have no ticks."""
     events = recording.events
     if events is None or events.ticks is None or events.tick is None:
         raise SpadError(f"{recording.capture.id}: its stamps are no whole ticks; simulate it with a converter (tdc)")
-    pixels = recording.pixels
-    return events.ticks, events.pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), events.tick
+    return events, events.ticks, events.tick
+
+
+def _numbers(recording: Recording) -> Any:
+    """The type of the number of a pixel."""
+    return np.dtype(np.uint16 if recording.pixels <= 1 << 16 else np.uint32)
 
 
 class PlainHdf5(Target):
@@ -137,9 +145,9 @@ class Npz(Target):
             for name, value in facts(recording).items():
                 cls._member(archive, name, np.asarray(value))
             if recording.events is not None:
-                time, pixel, _ = _events(recording)
-                cls._member(archive, "time", time)
-                cls._member(archive, "pixel", pixel)
+                events, ticks, _ = _stamped(recording)
+                cls._pieces(archive, "time", ticks.dtype, len(ticks), lambda start, stop: ticks[start:stop])
+                cls._pieces(archive, "pixel", _numbers(recording), len(ticks), events.rows_of)
             else:
                 with archive.open(zipfile.ZipInfo("frames.npy"), "w", force_zip64=True) as member:
                     _put_frames(recording, member)
@@ -148,6 +156,15 @@ class Npz(Target):
     def _member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
         with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
             np.lib.format.write_array(member, array, allow_pickle=False)
+
+    @staticmethod
+    def _pieces(
+        archive: zipfile.ZipFile, name: str, kind: Any, count: int, get: Callable[[int, int], np.ndarray]
+    ) -> None:
+        with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            _put_header(member, kind, (count,))
+            for start in range(0, count, _PIECE):
+                member.write(np.ascontiguousarray(get(start, min(start + _PIECE, count)), kind).data)
 
 
 class Npy(Target):
@@ -166,12 +183,17 @@ class Npy(Target):
         _put_frames(recording, file)
 
 
+def _put_header(file: IO[bytes], kind: Any, shape: tuple[int, ...]) -> None:
+    """What an `.npy` stream begins with."""
+    header = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+
+
 def _put_frames(recording: Recording, file: IO[bytes]) -> None:
     """Frames as an `.npy` stream, piece by piece."""
     assert recording.frames is not None
     kind = np.asarray(recording.frames[0:1]).dtype.newbyteorder("<")
-    header = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": recording.frames.shape}
-    np.lib.format.write_array_header_1_0(file, header)
+    _put_header(file, kind, recording.frames.shape)
     for _, part in recording.chunks():
         file.write(np.ascontiguousarray(part, kind).data)
 
@@ -186,15 +208,15 @@ class PhotonHdf5(Target):
     @classmethod
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
         """What the format asks for, each field with the description that it prescribes; our own part in /user."""
-        ticks, pixel, tick = _events(recording)
-        order = np.argsort(ticks, kind="stable")
+        events, ticks, tick = _stamped(recording)
+        count, numbers = len(ticks), _numbers(recording)
         lit = recording.capture.light
         values: dict[str, Any] = {
             "acquisition_duration": recording.conditions.exposure,
             "description": recording.capture.id,
-            "photon_data/timestamps": ticks[order].astype(np.int64),
+            "photon_data/timestamps": np.dtype(np.int64),  # the type of what is put in piece by piece
             "photon_data/timestamps_specs/timestamps_unit": tick,
-            "photon_data/detectors": pixel[order],
+            "photon_data/detectors": numbers,
             "setup/num_pixels": recording.pixels,
             **dict.fromkeys(_ONE, 1),
             **dict.fromkeys(_NO, 0),
@@ -212,11 +234,23 @@ class PhotonHdf5(Target):
         def fill(made: Any, alive: Callable[[], None]) -> None:
             for name, value in values.items():
                 alive()
-                filters = {}
-                if np.ndim(value) and np.size(value):
-                    filters = {"chunks": (min(len(value), 1 << 16),), "compression": 1, "shuffle": True}
+                pieces = isinstance(value, np.dtype)
+                size = count if pieces else np.size(value) if np.ndim(value) else 0
+                filters: dict[str, Any] = {}
+                if size:
+                    filters = {"chunks": (min(size, 1 << 16),), "compression": 1, "shuffle": True}
+                if pieces:
+                    made.create_dataset(name, (count,), value, track_times=False, **filters)
+                    continue
                 data = np.bytes_(value) if isinstance(value, str) else value
                 made.create_dataset(name, data=data, track_times=False, **filters)
+            start = 0
+            for stamps, pixel in events.in_time_order(_PIECE):
+                alive()
+                place = slice(start, start + len(stamps))
+                made["photon_data/timestamps"][place] = stamps.astype(np.int64)
+                made["photon_data/detectors"][place] = pixel.astype(numbers)
+                start = place.stop
             made.create_group("user/spadmnist").attrs.update(facts(recording))
             made.attrs["TITLE"] = np.bytes_(_TITLES["/"])
             made.visititems(

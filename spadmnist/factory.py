@@ -41,7 +41,7 @@ from .foreign import from_json
 from .heap import keep_freed_memory
 from .images import Images
 from .reconstruct import median_of_nonzero
-from .workers import workers
+from .workers import clear_once, workers
 
 POSITIONS = "maps/layout.positions.csv"
 _ROUNDS = 3
@@ -160,6 +160,7 @@ def run_tasks(
     task that kills its worker is named. Errors that a task raises itself are passed on.
     """
     if jobs == 1:
+        clear_once(os.getpid())
         keep_freed_memory()
         for key, task in zip(keys, tasks(keys), strict=True):
             done(key, function(task))

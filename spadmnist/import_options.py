@@ -155,7 +155,7 @@ class Said:
         "Of a cycle.",
         modalities=_TIMES,
         own=LINOSPAD2,
-        whole=(1, 2**24),
+        whole=(1, 2**20),
         ask=("how many words a converter has in a cycle", "512"),
     )
     cycle: float | None = _option(

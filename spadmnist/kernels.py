@@ -681,6 +681,69 @@ def kept(values, mask):
 
 
 @_jit
+def longest_gap(stamps, start, end, bins, at_once):
+    """(longest gap between neighbouring stamps that are not before `start`, start and end taken as stamps; number of
+    stamps before `end`; whether a longer one may be hidden within one of the bins).
+
+    Stamps may stand in any order. Two stamps in the same bin are less than a bin apart, so only the gaps between bins
+    need to be looked at, `at_once` bins at a time.
+    """
+    low = np.empty(min(bins, at_once))
+    high = np.empty(low.size)
+    factor = bins / (end - start)
+    count = 0
+    longest = 0.0
+    last = start
+    for begin in range(0, bins, low.size):
+        low[:] = np.inf
+        high[:] = -np.inf
+        count = 0
+        for i in range(stamps.size):
+            t = np.float64(stamps[i])
+            if t < end:
+                count += 1
+                b = min(np.int64((t - start) * factor), bins - 1) - begin
+                if 0 <= b < low.size:
+                    low[b] = min(low[b], t)
+                    high[b] = max(high[b], t)
+        for b in range(low.size):
+            if high[b] >= start:
+                longest = max(longest, low[b] - last)
+                last = high[b]
+    longest = max(longest, end - last)
+    return longest, count, longest < (end - start) / bins
+
+
+@_jit
+def rows_upto(stamps, offsets, place, stop):
+    """(rows,) where each row's stamps from `place` (rows,) on reach `stop`; stamps ascend within a row."""
+    out = np.empty(place.size, np.int64)
+    for row in range(place.size):
+        low = place[row]
+        high = offsets[row + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if stamps[middle] < stop:
+                low = middle + 1
+            else:
+                high = middle
+        out[row] = low
+    return out
+
+
+@_jit
+def between(stamps, first, last, count):
+    """(count,) the stamps of all rows from `first` to `last`, both (rows,), row after row."""
+    out = np.empty(count, stamps.dtype)
+    k = 0
+    for row in range(first.size):
+        for i in range(first[row], last[row]):
+            out[k] = stamps[i]
+            k += 1
+    return out
+
+
+@_jit
 def kept_offsets(mask, offsets):
     """The offsets of the rows when only the events remain for which `mask` is true."""
     new = np.zeros_like(offsets)

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from . import units
-from .events import Events
+from .events import Events, longest_gap
 from .foreign import visible
 from .measurement import Measurement
 from .recording import Capture, Light, Recording
 
 _CHANCE = 1e-6  # a silence at an end is noted where a constant rate leaves one as long less often
 _LONGER = 3  # times the longest silence inside, which the one at an end must exceed: light may come in bursts
+_PIECE = 1 << 20  # intervals that are looked at together
 _FRAMES_AT_ONCE = 64  # from either end, to begin with
 
 
@@ -23,9 +24,8 @@ def intervals(events: Events) -> Iterator[np.ndarray]:
     """s between the detections of a pixel, in pieces."""
     stamps = events.times if events.ticks is None else events.ticks
     tick = events.tick or 1.0
-    piece = 1 << 20
-    for start in range(0, len(stamps) - 1, piece):
-        apart = np.diff(stamps[start : start + piece + 1])
+    for start in range(0, len(stamps) - 1, _PIECE):
+        apart = np.diff(stamps[start : start + _PIECE + 1])
         inside = np.ones(len(apart), bool)
         firsts = events.offsets[np.searchsorted(events.offsets, start + 1) :]
         inside[firsts[firsts <= start + len(apart)] - start - 1] = False
@@ -115,9 +115,11 @@ def _chance(count: int, last: float, end: float) -> float:
     return min(last / end, 1.0) ** count
 
 
-def _is_unusual(quiet: float, moments: np.ndarray, width: float) -> bool:
-    """Is the silence at an end too long for the moments of the detections? Each moment lasts `width`."""
-    return quiet > _LONGER * (float(np.diff(moments).max(initial=0)) - width)
+def _is_unusual(quiet: float, inside: float, width: float) -> bool:
+    """Is the silence at an end too long? inside: the longest from one moment with a detection to the next one; each
+    moment lasts `width`.
+    """
+    return quiet > _LONGER * (inside - width)
 
 
 def _silent_stamps(recorded: Recording, events: Events) -> list[str]:
@@ -127,17 +129,18 @@ def _silent_stamps(recorded: Recording, events: Events) -> list[str]:
     end, count = exposure / tick, len(stamps)
     if count < 2:
         return []
-    before, last = float(stamps.min()), float(stamps.max()) + width
+    before, latest = float(stamps.min()), float(stamps.max())
+    last = latest + width
     behind = end - last
     if min(_chance(count, end - before, end), _chance(count, last, end)) >= _CHANCE:
         return []
-    moments, notes = np.unique(stamps), []
-    if _chance(count, end - before, end) < _CHANCE and _is_unusual(before, moments, width):
+    (inside, _), notes = longest_gap(stamps, before, latest), []
+    if _chance(count, end - before, end) < _CHANCE and _is_unusual(before, inside, width):
         notes.append(
             f"nothing was recorded in the first {units.show(before * tick, 's', 3)} of {units.show(exposure, 's', 6)}; "
             "if its clock did not start at 0, import it again with --subtract-start and the --exposure since then"
         )
-    if _chance(count, last, end) < _CHANCE and _is_unusual(behind, moments, width):
+    if _chance(count, last, end) < _CHANCE and _is_unusual(behind, inside, width):
         # three digits of the shorter one, the silence or what was recorded
         step = 10.0 ** (math.floor(math.log10(min(behind, last) * tick)) - 2)
         at = units.show(math.ceil(last * tick / step) * step, "s", 12)
@@ -159,11 +162,12 @@ def _silent_frames(recorded: Recording) -> list[str]:
             return []
     some = np.concatenate([_with_a_detection(recorded, part) for _, part in recorded.chunks()])
     moments, notes = np.flatnonzero(some), []
+    inside = float(np.diff(moments).max(initial=0))
     for quiet, place, advice in (
         (before, "first", "began late, import its last"),
         (behind, "last", "broke off there, import its first"),
     ):
-        if _chance(len(moments), end - quiet, end) < _CHANCE and _is_unusual(quiet, moments, 1.0):
+        if _chance(len(moments), end - quiet, end) < _CHANCE and _is_unusual(quiet, inside, 1.0):
             notes.append(
                 f"nothing was recorded in the {place} {quiet:,} of {end:,} frames "
                 f"({units.show(quiet * c.exposure / end, 's', 3)}); if the recording {advice} {end - quiet:,} frames "

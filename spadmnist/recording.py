@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 MODALITIES = ("tr", "str", "qis", "counts")
 _FEW_TICKS = 64  # between the first stamp and the last: a rate changes within one
+_EVENTS_AT_ONCE = 1 << 20  # detections whose arithmetic needs further memory
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
 _BLOCKS = (16, 8, 4)  # of time, of which every other one makes half a capture: as many as lose no more than this
 _LOSS = 0.1
@@ -242,7 +243,9 @@ class Recording:
             return self
         if self.events is not None:
             end = no_detection(self.conditions.exposure, tick)
-            ticks = _whole(self.events.times / tick, end - 1).astype(unsigned_for(end, "time stamps"))
+            ticks = np.empty(len(self.events), unsigned_for(end, "time stamps"))
+            for part in _pieces(len(ticks)):
+                ticks[part] = _whole(self.events.times_of(part) / tick, end - 1)
             events = Events(None, self.events.offsets, self.pixels, ticks, tick, end=self.conditions.exposure)
             return replace(self, events=events, tick=tick, _kept={})
         assert self.frames is not None and self.tick is not None
@@ -274,13 +277,16 @@ class Recording:
             blocks, length = _in_ticks(c.exposure / self.tick)
         if not length:
             return None
-        block = stamps // length
-        kept = (block % 2 == second) & (block < blocks)
+        kept = np.empty(len(stamps), bool)
+        for part in _pieces(len(stamps)):
+            block = stamps[part] // length
+            kept[part] = (block % 2 == second) & (block < blocks)
         some = self.events.keep(kept)
-        number = block[kept] // 2
-        shift = ((number + second) * length).astype(stamps.dtype)
+        moved: np.ndarray = some.times if some.ticks is None else some.ticks
+        for part in _pieces(len(moved)):
+            number = moved[part] // length // 2
+            moved[part] -= ((number + second) * length).astype(moved.dtype)
         end = blocks // 2 * length * (1.0 if self.events.ticks is None else float(self.tick or 1.0))
-        moved = stamps[kept] - shift
         if self.events.ticks is None:
             events = Events(moved, some.offsets, self.pixels, end=end)
         else:
@@ -291,6 +297,11 @@ class Recording:
     def watched(self, read: Callable[[float], None]) -> Recording:
         """The same data; `read` is told which share of the frames is read, each time."""
         return self if self.frames is None else replace(self, frames=_Watched(self.frames, read))
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """So many detections, some after the other."""
+    return (slice(start, min(start + _EVENTS_AT_ONCE, count)) for start in range(0, count, _EVENTS_AT_ONCE))
 
 
 def _in_ticks(exposure: float) -> tuple[int, int]:

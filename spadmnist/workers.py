@@ -2,7 +2,8 @@
 
 Arrays for workers are files of a temporary folder, and what workers wait for are semaphores of the system. A process
 that is killed together with its workers leaves both. So all of one process bear the name of one folder, which it holds
-locked for as long as it lives: the next process of the same user that has workers removes what nobody holds.
+locked for as long as it lives: the next process of the same user that works, with workers or alone, removes what nobody
+holds.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
 
     from . import compiled
 
+    clear_once(os.getpid())
     # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers does so, too
     debugging = os.environ.get("SPADMNIST_DEBUG")
     silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
@@ -59,8 +61,7 @@ def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
 
 @functools.cache
 def _own_place(process: int) -> str | None:
-    """The folder of this process for its workers' arrays, after those of the dead are removed. None: the system's."""
-    clear()
+    """The folder of this process for its workers' arrays. None: the system's."""
     held = next(filter(None, map(_made, _places())), None)
     if held is None:
         return None
@@ -82,6 +83,12 @@ class _Names:
 
     def __next__(self) -> str:
         return f"{self.owner}-{next(self.names)}"
+
+
+@functools.cache
+def clear_once(process: int) -> None:
+    """Remove what killed processes left, the first time that this process asks for it."""
+    clear()
 
 
 def clear() -> int:

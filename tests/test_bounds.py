@@ -5,8 +5,10 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_factory import write_config
 
-from spadmnist import capture_files, config, dataset, factory, measurement, plan, store
+from spadmnist import (
+    capture_files,
+    config,
+    dataset,
+    events,
+    exporters,
+    factory,
+    look,
+    measurement,
+    plan,
+    report,
+    store,
+)
 from spadmnist.dataset import Shard
 from spadmnist.disk import Files
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.events import Layout
 from spadmnist.experiment import Level
 from spadmnist.import_options import Said
+from spadmnist.importers import detections, light
+from spadmnist.importers.captures import import_files
 from spadmnist.importers.frames import Npz, Tif
+from spadmnist.statistics.integrity import Gaps
 
 CAPTURES = """format: spadmnist-measurement/1
 name: lab
@@ -108,6 +125,79 @@ def test_a_pixel_has_one_stamp_in_a_tick(tmp_path: Path) -> None:
         InputError, match=r"declares 1,000 detections; in 200 ns of ticks of 1 ns 4 pixels can have 804"
     ):
         measurement.open(bomb(tmp_path / "lab", CHUNK * 4, "200 ns")).recording("dark")
+
+
+# --- memory ---------------------------------------------------------------------------------------------------------
+
+STAMPS = 1 << 20  # detections, of 4 bytes each where they lie in memory
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A measurement of so many detections in the order of time, of 4 pixels."""
+    folder = tmp_path_factory.mktemp("many")
+    (folder / "measurement.yaml").write_text(CAPTURES.replace("EXPOSURE", "1 s"))
+    with h5py.File(folder / "dark.h5", "w") as file:
+        file.attrs["tick"] = 1e-9
+        rng = np.random.Generator(np.random.PCG64(1))
+        file.create_dataset("time", data=np.sort(rng.integers(0, 10**9, STAMPS, np.uint32)), chunks=(1 << 12,))
+        file.create_dataset("pixel", data=rng.integers(0, 4, STAMPS, np.uint16), chunks=(1 << 12,))
+    return folder
+
+
+def _exported(format: str) -> Callable[[Path, Path], object]:
+    suffix = exporters.Target.every[format].suffix
+    return lambda lab, out: exporters.export(measurement.open(lab), out / f"a{suffix}", format)
+
+
+def _imported(lab: Path, out: Path) -> object:
+    return import_files([lab / "dark.h5"], out / "made", Said(exposure=1.0), [light("dark")])
+
+
+def _looked(lab: Path, out: Path) -> object:
+    return report.looks(measurement.open(lab), True)
+
+
+def _gaps(lab: Path, out: Path) -> object:
+    return Gaps().reduce(measurement.open(lab).recording("dark"))
+
+
+DONE: dict[str, Callable[[Path, Path], object]] = {
+    "read": lambda lab, out: measurement.open(lab).recording("dark"),
+    "inspect": _looked,
+    "gaps": _gaps,
+    "import": _imported,
+    **{f"export {format}": _exported(format) for format in ("hdf5", "npz", "photon-hdf5")},
+}
+
+
+@pytest.mark.parametrize("what", DONE)
+def test_a_detection_costs_its_stamp(what: str, many: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted by tracemalloc, what numpy takes and a little more; the same was done once before, to compile kernels.
+
+    Pieces are small here, so that what grows with the number of detections shows: 4 bytes and less than one.
+    """
+    for module in (capture_files, exporters, detections, look):
+        monkeypatch.setattr(module, "_PIECE", 1 << 12)
+    monkeypatch.setattr(detections, "_KEPT", 0)
+    monkeypatch.setattr(events, "_BINS", 1 << 14)
+    places = tmp_path / "first", tmp_path / "second"
+    for place in places:
+        place.mkdir()
+    DONE[what](many, places[0])
+    tracemalloc.start()
+    DONE[what](many, places[1])
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 4.9 * STAMPS, most / STAMPS
+
+
+def test_more_detections_than_can_be_held_are_refused(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture_files, "MOST_STAMPS", 4 * STAMPS - 4)
+    with pytest.raises(InputError, match=r"dark\.h5: has 1,048,576 detections, which take 4 MB .* cut the recording"):
+        measurement.open(many)
+    with pytest.raises(InputError, match=r"dark\.h5: has 1,048,576 detections, which take 4 MB"):
+        _imported(many, many / "out")
 
 
 # --- configs ------------------------------------------------------------------------------------------------------

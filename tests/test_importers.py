@@ -46,6 +46,7 @@ from spadmnist.events import Events, Layout
 from spadmnist.factory import Progress
 from spadmnist.importers import Said, frames
 from spadmnist.importers.captures import import_files
+from spadmnist.importers.detections import Detections
 from spadmnist.recording import Capture, Light, Recording
 
 REAL = Path(__file__).parents[2] / "shared" / "real"
@@ -719,7 +720,7 @@ def test_a_new_kind_is_one_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         @classmethod
         def read(cls, path: Path, said: Said) -> importers.Found:
             times = np.frombuffer(path.read_bytes(), np.uint8)
-            return importers.Found({"tick": 1e-9}, np.zeros(len(times), np.uint8), times)
+            return importers.Found({"tick": 1e-9}, Detections.of(path, np.zeros(len(times), np.uint8), times))
 
     (tmp_path / "a.own").write_bytes(b"cab")
     one = back(run(tmp_path / "a.own"))

@@ -132,7 +132,10 @@ TR_FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "virtual": ({"time": virtual}, ("lie in another file",)),
     "external link": ({"time": external_link}, ("is a link", "not followed")),
     "soft link": ({"time": soft_link}, ("is a link", "not followed")),
-    "bomb of 2^40": ({"time": declared((2**40,)), "pixel": declared((2**40,))}, ("1,099,511,627,776", "8 GiB")),
+    "bomb of 2^40": (
+        {"time": declared((2**40,)), "pixel": declared((2**40,))},
+        ("1,099,511,627,776", "134,217,728 (537 MB)"),
+    ),
     "bomb of 1 GiB": ({"time": declared((2**27,)), "pixel": declared((2**27,))}, ("not all of them were written",)),
     "objects": (
         {"time": lambda file, name, _: file.create_dataset(name, (500,), h5py.special_dtype(ref=h5py.Reference))},
@@ -148,7 +151,7 @@ TR_FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     ),
     "a huge chunk": (
         {"time": lambda file, name, _: file.create_dataset(name, (2**27,), "u8", chunks=(2**27,))},
-        ("chunks of more than 256 MiB",),
+        ("chunks of more than 32 MiB",),
     ),
 }
 

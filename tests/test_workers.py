@@ -20,6 +20,7 @@ import tinylab
 from commands import COMMAND
 from test_factory import alive, descendants, wait_for
 
+from spadmnist import factory
 from spadmnist import workers as workers_module
 from spadmnist.workers import safe_path, workers
 
@@ -294,3 +295,31 @@ def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monk
     os.close(handle)
     workers_module.clear()
     assert not folder.exists()
+
+
+def _alone(call: str) -> None:
+    """Work without workers, as the verbs do it with --jobs 1."""
+    if call == "tasks":
+        found: dict[int, int] = {}
+        factory.run_tasks(abs, lambda keys: iter(keys), [-1], 1, found.__setitem__)
+        assert found == {-1: 1}
+    else:
+        with factory.pool(1) as parallel:
+            assert parallel.n_jobs == 1
+
+
+@pytest.mark.skipif(not MEMORY.is_dir(), reason="semaphores are no files here")
+@pytest.mark.parametrize("call", ["tasks", "pool"])
+def test_a_run_without_workers_removes_it_too(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    folder = tmp_path / f"spadmnist-workers-{os.getpid()}{call}"
+    folder.mkdir()
+    (folder / "array").write_bytes(b"left")
+    semaphore = MEMORY / f"sem.loky-1-{folder.name}-abc"
+    semaphore.touch()
+    workers_module.clear_once.cache_clear()
+    try:
+        _alone(call)
+        assert not folder.exists() and not semaphore.exists()
+    finally:
+        semaphore.unlink(missing_ok=True)

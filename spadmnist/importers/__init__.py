@@ -15,10 +15,10 @@ import importlib
 import logging
 import math
 import pkgutil
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from ..import_options import Said, ask
 from ..recording import MODALITIES
 from ..units import LONGEST, SHORTEST
 from .lights import light
+
+if TYPE_CHECKING:
+    from .detections import Detections
 
 __all__ = ["Format", "Found", "Said", "Stack", "ask", "light"]
 
@@ -123,7 +126,7 @@ class Stack:
 class Found:
     """What a file holds: detections, or frames.
 
-    channel, ticks: (detections,) integers in any order, which input and when, in `facts["tick"]` since the start.
+    detections: in any order, which input and when, in `facts["tick"]` since the start; frames: a stack of them.
     pixels: the channels that are pixels, in the pixels' order, silent ones too; None where the file does not say.
     names: channels that the file does not call by their number. bits: each number of the frames is a bit, and they are
     `packed` where eight columns are a byte; arranged: the kind of file says which axis is which. facts: what the file
@@ -132,15 +135,14 @@ class Found:
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
-    channel: np.ndarray | None = None
-    ticks: np.ndarray | None = None
+    detections: Detections | None = None
     frames: Stack | None = None
     bits: bool = False
     packed: bool = False
     arranged: bool = False
     notes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
-    pixels: tuple[int, ...] | None = None
+    pixels: Sequence[int] | None = None
     names: Mapping[int, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
 
@@ -237,15 +239,20 @@ def refuse_fine_times(path: Path, names: Collection[str]) -> None:
             raise InputError(f"{path}: has {name} beside its times: {LASER_PULSES}")
 
 
-def whole(numbers: np.ndarray, name: str, path: Path) -> np.ndarray:
-    """Numbers that are whole, as integers: MATLAB stores most of them as doubles. Raises InputError for others."""
+def whole(numbers: np.ndarray, name: str, path: Path, start: int = 0) -> np.ndarray:
+    """Numbers that are whole, as integers: MATLAB stores most of them as doubles. Raises InputError for others.
+
+    start: which number the first of them is.
+    """
     if numbers.dtype.kind != "f":
         return numbers
     fine = are_whole(numbers)
     if not fine.all():
         at = int(fine.argmin())
         why = no_whole(numbers[at])
-        raise InputError(f"{path}: {name}[{at}] is {numbers[at]:.15g}, {why}; store ticks and pixels as integers")
+        raise InputError(
+            f"{path}: {name}[{start + at}] is {numbers[at]:.15g}, {why}; store ticks and pixels as integers"
+        )
     return numbers.astype(np.int64)
 
 

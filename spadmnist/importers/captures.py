@@ -159,7 +159,7 @@ def import_files(
             shapes.append(shape)
             if shape != shapes[0]:
                 raise InputError(f"{one.path}: has {_by(shape)} pixels, others {_by(shapes[0])}; import it by itself")
-        if found.channel is not None:
+        if found.detections is not None:
             channels.add(one.path, found)
         one.found = found if len(ones) == 1 else None
         progress.advance(one.size, one.path.name)

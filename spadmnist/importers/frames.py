@@ -37,6 +37,7 @@ from . import (
     refuse_fine_times,
     whole,
 )
+from .detections import Detections
 from .stacks import arranged, cut
 
 _COUNTED = 1 << 20  # bytes that are unpacked at a time, to be counted
@@ -131,7 +132,7 @@ class Npz(Format):
         if {"time", "pixel"} <= set(plain):
             refuse_fine_times(path, held)
             time, pixel = (whole(one_axis(plain[name], name, path), name, path) for name in ("time", "pixel"))
-            return Found(known, pixel, time, sources=sources)
+            return Found(known, Detections.of(path, pixel, time), sources=sources)
         there = ", ".join(visible(name) for name in sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"

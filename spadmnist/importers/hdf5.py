@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..capture_files import FILTERS, attribute, check_stored, opened
+from ..capture_files import FILTERS, LARGEST_CHUNK_OF_STAMPS, attribute, check_stored, opened, parts
 from ..errors import InputError
 from ..foreign import visible
 from ..import_options import BITS, PLAIN_HDF5, STACKS
 from . import (
     HDF5,
     LARGEST_PIECE,
+    MOST_CHANNELS,
     MOST_EVENTS,
     Format,
     Found,
@@ -27,6 +29,7 @@ from . import (
     said_in_words,
     whole,
 )
+from .detections import Detections, Pieces, check_lengths
 from .stacks import arranged, cut
 
 _MARK = (HDF5,)
@@ -65,7 +68,7 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
     if not {made.get_filter(i)[0] for i in range(made.get_nfilters())} <= FILTERS.keys():
         raise InputError(f"{path}: {name} is packed by a filter that HDF5 itself lacks; store it with gzip")
     taken = math.prod(found.chunks or (1,)) * found.dtype.itemsize
-    if taken > LARGEST_PIECE or (axes == 1 and found.size > MOST_EVENTS):
+    if taken > (LARGEST_PIECE if axes == 3 else LARGEST_CHUNK_OF_STAMPS) or (axes == 1 and found.size > MOST_EVENTS):
         raise InputError(f"{path}: {name} is stored in larger parts than can be read; store it in smaller ones")
     check_stored(found, name, path)
     return found
@@ -79,12 +82,30 @@ def _number(file: Any, name: str, path: Path) -> float:
     return float(np.asarray(found[()]).ravel()[0])
 
 
-def _numbers(file: Any, name: str, path: Path) -> np.ndarray:
-    """(n,) integers of a plain data set."""
-    found = _data_set(file, name, path)
-    if found.attrs.get("MATLAB_empty"):  # then the shape stands in place of the numbers
-        return np.zeros(0, np.uint64)
-    return whole(found[...].ravel(), name, path)
+def _count_of(stored: Any) -> int:
+    """How many numbers a data set holds: of what is empty MATLAB stores the shape in place of the numbers."""
+    return 0 if stored.attrs.get("MATLAB_empty") else int(stored.size)
+
+
+def _numbers(file: Any, name: str, path: Path, part: slice) -> np.ndarray:
+    """(n,) some integers of a data set that is plain."""
+    stored = _node(file, name, path)
+    along = stored.ndim - 1 if stored.shape[0] == 1 else 0
+    return whole(np.asarray(stored[(0,) * along + (part,)]).ravel(), name, path, part.start)
+
+
+def _parts(file: Any, name: str, path: Path) -> Iterator[slice]:
+    """All of a data set that is plain and whole, some after the other. Raises InputError for another one."""
+    stored = _data_set(file, name, path)
+    return parts(_count_of(stored), max(stored.chunks or (1,)))
+
+
+def _pieces(path: Path, names: Sequence[tuple[str, str]]) -> Pieces:
+    """(channel, ticks) of data sets (pixel, time), both as long, one after the other."""
+    with opened(path) as file:
+        for pixel, time in names:
+            for part in _parts(file, time, path):
+                yield _numbers(file, pixel, path, part), _numbers(file, time, path, part)
 
 
 class PhotonHdf5(Format):
@@ -127,37 +148,43 @@ class PhotonHdf5(Format):
             units = {_number(file, f"{group}/timestamps_specs/timestamps_unit", path) for group in groups}
             if len(units) > 1:
                 raise InputError(f"{path}: its spots have ticks of several lengths; store each spot in its own file")
-            ticks = [_rising(file, f"{group}/timestamps", path) for group in groups]
-            detectors = [_detectors(file, group, len(times), path) for group, times in zip(groups, ticks, strict=True)]
-            declared: tuple[int, ...] | None = None
+            for group in groups:
+                _check_rising(file, f"{group}/timestamps", path)
+            named = [_check_detectors(file, group, path) for group in groups]
+            declared: Sequence[int] | None = None
             notes: list[str] = []
-            if all(found is None for found in detectors):
+            own_numbers: list[np.ndarray] = []
+            starts: list[int] | None = None
+            if not any(named):
                 _check_spots(file, groups, path)
-                channels = [np.full(len(times), spot, np.uint32) for spot, times in enumerate(ticks)]
-                pixels: tuple[int, ...] = tuple(range(len(groups)))
-            elif any(found is None for found in detectors):
+                pixels: Sequence[int] = range(len(groups))
+            elif not all(named):
                 raise InputError(
                     f"{path}: only some of its spots name the detector of each detection; store all of them"
                 )
             else:
-                channels, notes = _unlike([found for found in detectors if found is not None], _count(file, path), path)
-                pixels, declared = _pixels(file, groups, channels, path)
+                own_numbers = [_used(file, f"{group}/detectors", path) for group in groups]
+                starts, notes = _unlike(own_numbers, _count(file, path), path)
+                used = _joined(own_numbers, starts)
+                pixels, declared = _pixels(file, groups, used, path)
                 if "rows" not in known and said.channels is None:
-                    _check_number(file, pixels, channels, path)
+                    _check_number(file, pixels, used, path)
         known["tick"], sources["tick"] = units.pop(), "timestamps_unit"
-        channel, time = np.concatenate(channels), np.concatenate(ticks)
+        kept = None if declared is None or said.channels is not None else np.array(declared)
+        others = _Others()
+
+        def read() -> Pieces:
+            return _of_spots(path, groups, own_numbers, starts, kept, others)
+
+        detections = Detections(path, read)
         left_out = []
-        if declared is not None and said.channels is None:
-            others = ~np.isin(channel, pixels)
-            numbers = np.unique(channel[others])
-            if len(numbers):
-                row = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
-                left_out.append(f"{int(others.sum()):,} entries with the number {row}, no detector's (markers)")
-            channel, time = channel[~others], time[~others]
+        if others.count:
+            numbers = others.numbers
+            row = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
+            left_out.append(f"{others.count:,} entries with the number {row}, no detector's (markers)")
         return Found(
             facts(path, known.get),
-            channel,
-            time,
+            detections,
             pixels=None if "rows" in known else pixels,
             notes=tuple(notes),
             left_out=tuple(left_out),
@@ -176,68 +203,132 @@ def _check_spots(file: Any, groups: list[str], path: Path) -> None:
         )
 
 
-def _unlike(found: list[np.ndarray], declared: int | None, path: Path) -> tuple[list[np.ndarray], list[str]]:
-    """Numbers that are unique over all spots, as the format asks; where each spot counts anew, they are numbered.
+class _Others:
+    """What is no detector's, when all entries were read."""
 
-    Raises InputError where neither is so.
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """None was read yet."""
+        self.count, self.numbers = 0, np.zeros(0, np.int64)
+
+
+def _of_spots(
+    path: Path,
+    groups: Sequence[str],
+    used: Sequence[np.ndarray],
+    starts: Sequence[int] | None,
+    kept: np.ndarray | None,
+    others: _Others,
+) -> Pieces:
+    """(channel, ticks) of all spots. used, starts: the detectors of each spot, and the channel of the first of them,
+    where spots number them anew; where no detectors are named, a spot is a channel. kept: the detectors that are
+    pixels, None where all are.
     """
-    own = [np.unique(numbers) for numbers in found]
+    others.clear()
+    with opened(path) as file:
+        for spot, group in enumerate(groups):
+            for part in _parts(file, f"{group}/timestamps", path):
+                time = _unsigned(_numbers(file, f"{group}/timestamps", path, part))
+                if not used:
+                    yield np.full(len(time), spot, np.uint32), time
+                    continue
+                channel = _numbers(file, f"{group}/detectors", path, part)
+                if starts is not None:
+                    channel = np.searchsorted(used[spot], channel) + starts[spot]
+                if kept is not None:
+                    other = ~np.isin(channel, kept)
+                    others.count += int(other.sum())
+                    others.numbers = np.union1d(others.numbers, channel[other])
+                    channel, time = channel[~other], time[~other]
+                yield channel, time
+
+
+def _used(file: Any, name: str, path: Path) -> np.ndarray:
+    """(n,) the numbers that occur in a data set, ascending. Raises InputError where they are too many."""
+    found = np.zeros(0, np.int64)
+    for part in _parts(file, name, path):
+        numbers = np.unique(_numbers(file, name, path, part))
+        found = numbers if not len(found) else np.union1d(found, numbers)
+        if len(found) > MOST_CHANNELS:
+            raise InputError(
+                f"{path}: {name} has more than {MOST_CHANNELS:,} different numbers, which are no detectors; write it "
+                "again"
+            )
+    return found
+
+
+def _unlike(own: list[np.ndarray], declared: int | None, path: Path) -> tuple[list[int] | None, list[str]]:
+    """(the channel of the first detector of each spot where each spot counts anew; None where numbers are unique over
+    all spots, as the format asks; notes). own: the numbers of each spot. Raises InputError where neither is so.
+    """
     every, times = np.unique(np.concatenate(own), return_counts=True)
     if times.max(initial=1) == 1:
-        return found, []
+        return None, []
     if times.sum() != declared:
         raise InputError(
             f"{path}: the detector {every[times > 1][0]} is of several spots, but numbers are unique over the file; "
             "number them anew, or correct setup/num_pixels"
         )
-    starts = np.cumsum([0, *(len(numbers) for numbers in own)])
-    new = [np.searchsorted(mine, numbers) + start for mine, numbers, start in zip(own, found, starts[:-1], strict=True)]
-    return new, ["its spots number their detectors anew; they are the pixels 0, 1, ... spot after spot"]
+    starts = np.cumsum([0, *(len(numbers) for numbers in own)])[:-1]
+    note = "its spots number their detectors anew; they are the pixels 0, 1, ... spot after spot"
+    return list(map(int, starts)), [note]
 
 
-def _detectors(file: Any, group: str, count: int, path: Path) -> np.ndarray | None:
-    """(count,) the detector of each entry, or None where the group does not say."""
+def _joined(own: list[np.ndarray], starts: list[int] | None) -> np.ndarray:
+    """(n,) the channels in use, ascending."""
+    if starts is not None:
+        return np.arange(sum(map(len, own)))
+    return np.unique(np.concatenate(own))
+
+
+def _check_detectors(file: Any, group: str, path: Path) -> bool:
+    """Does a spot name the detector of each entry? Raises InputError where they are not as many."""
     name = f"{group}/detectors"
     if _node(file, name, path) is None:
-        return None
-    found = _numbers(file, name, path)
-    if len(found) != count:
-        raise InputError(f"{path}: {group} has {count:,} timestamps and {len(found):,} detectors; it needs as many")
-    return found
+        return False
+    count, found = (_count_of(_data_set(file, key, path)) for key in (f"{group}/timestamps", name))
+    if found != count:
+        raise InputError(f"{path}: {group} has {count:,} timestamps and {found:,} detectors; it needs as many")
+    return True
 
 
-def _rising(file: Any, name: str, path: Path) -> np.ndarray:
-    """Times as the format asks for them. Raises InputError where they fall back: a converter lost an overflow."""
-    times = _numbers(file, name, path)
-    if times.dtype.kind == "u" and int(times.max(initial=0)) < 2**63:
-        times = times.astype(np.int64)  # spots may be stored in types of their own
-    earlier = times[1:] < times[:-1]
-    if earlier.any():
-        at = int(earlier.argmax())
-        raise InputError(
-            f"{path}: {name} falls back from {times[at]} to {times[at + 1]} at entry {at + 1:,}; the format asks for "
-            "rising times: convert the recording again"
-        )
-    return times
+def _unsigned(times: np.ndarray) -> np.ndarray:
+    """Spots may be stored in types of their own."""
+    return times.astype(np.int64) if times.dtype.kind == "u" and int(times.max(initial=0)) < 2**63 else times
 
 
-def _pixels(
-    file: Any, groups: list[str], channels: list[np.ndarray], path: Path
-) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
+def _check_rising(file: Any, name: str, path: Path) -> None:
+    """Raise InputError where times fall back, which the format forbids: a converter lost an overflow."""
+    last: list[np.ndarray] = []
+    for part in _parts(file, name, path):
+        times = np.concatenate([*last, _numbers(file, name, path, part)])
+        earlier = times[1:] < times[:-1]
+        if earlier.any():
+            at = int(earlier.argmax())
+            entry = part.start - len(last) + at + 1
+            raise InputError(
+                f"{path}: {name} falls back from {times[at]} to {times[at + 1]} at entry {entry:,}; the format asks "
+                "for rising times: convert the recording again"
+            )
+        last = [times[-1:]]
+
+
+def _pixels(file: Any, groups: list[str], used: np.ndarray, path: Path) -> tuple[Sequence[int], Sequence[int] | None]:
     """(the numbers of the detectors that are pixels, the same where the file lists them, else None).
 
     Two lists may stand there: what the spots' `detectors_specs` name, and `setup/detectors/id`, which markers may be
-    among. That one counts which has as many as `setup/num_pixels` says.
+    among. That one counts which has as many as `setup/num_pixels` says. used: the channels in use, ascending.
     """
-    used = sorted({int(n) for found in channels for n in np.unique(found)})
     declared = _count(file, path)
     lists = [sorted(_specified(file, groups, path)), sorted(_identified(file, path))]
     lists = [numbers for numbers in lists if numbers and (declared is None or len(numbers) == declared)]
     if lists:
         return tuple(lists[0]), tuple(lists[0])
-    if declared is not None and not set(used) - set(range(declared)):
-        return tuple(range(declared)), None  # numbered from 0, silent ones too
-    return tuple(used), None
+    if declared is not None and (not len(used) or 0 <= int(used[0]) <= int(used[-1]) < declared):
+        return range(declared), None  # numbered from 0, silent ones too
+    return used.tolist(), None
 
 
 def _count(file: Any, path: Path) -> int | None:
@@ -272,12 +363,11 @@ def _listed(file: Any, name: str, path: Path) -> set[int]:
 _MOST_DETECTORS = 1 << 20
 
 
-def _check_number(file: Any, pixels: tuple[int, ...], channels: list[np.ndarray], path: Path) -> None:
+def _check_number(file: Any, pixels: Sequence[int], used: np.ndarray, path: Path) -> None:
     """Raise InputError where the file says that it has another number of pixels."""
     declared = _count(file, path)
     if declared is None or declared == len(pixels):
         return
-    used = sorted({int(n) for found in channels for n in np.unique(found)})
     if len(used) > declared:
         row = ", ".join(map(str, used[:20]))
         raise InputError(
@@ -322,8 +412,8 @@ class PlainHdf5(Format):
             known |= said_in_words(path, lambda key: attribute(nodes, key, path), detections, said)
             if detections:
                 refuse_fine_times(path, set(file))
-                time, pixel = (_numbers(file, key, path) for key in ("time", "pixel"))
-                return Found(known, pixel, time, sources=sources)
+                check_lengths(path, *(_count_of(_data_set(file, key, path)) for key in ("time", "pixel")))
+                return Found(known, Detections(path, lambda: _pieces(path, [("pixel", "time")])), sources=sources)
             shape, dtype = stored.shape, stored.dtype
             matlab = "MATLAB_class" in stored.attrs
         packed = is_packed(path, shape, known, said)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from .. import disk, image_files, units
 from ..errors import InputError
 from ..import_options import LINOSPAD2
-from . import PICOSECOND, Format, Found, Said, ask, frames_in_file
+from . import PICOSECOND, Format, Found, Said, Stack, ask, frames_in_file
+from .detections import Detections, Pieces
 
 _CLOCK, _CODES = 2500, 140  # ps, codes in it
-_AT_ONCE = 1 << 22  # words
+_AT_ONCE = 1 << 20  # words, of which each takes 60 bytes as it is worked out
 _LARGEST_TABLE = 1 << 24  # bytes of a calibration
 _LONGEST_OFFSET = 1e9  # ps
 
@@ -75,33 +77,12 @@ class LinoSpad2(Format):
                 f"--cycle: {cycles:,} cycles of {units.show(said.cycle, 's')} have more ticks of "
                 f"{units.show(tick, 's')} than can be counted; give another --cycle or --tick"
             )
-        words = frames_in_file(path, 0, "<u4", (cycles, lines, said.timestamps))
-        channels, ticks, outside, full = [np.zeros(0, np.uint8)], [np.zeros(0, np.uint64)], 0, 0
-        step = max(1, _AT_ONCE // each)
-        for start in range(0, cycles, step):
-            some = words[start : start + step][:, :kept]
-            valid = some >> 31 == 1
-            full += int(valid.all(axis=2).sum())
-            behind = valid[:, :, 1:] & ~valid[:, :, :-1]
-            if behind.any():
-                bad, list_, word_ = (int(x) for x in np.argwhere(behind)[0])
-                raise InputError(
-                    f"{path}: in cycle {start + bad} of the list {list_} a time stands behind an empty word (at "
-                    f"{word_ + 1}), where none can; give another --timestamps or --firmware"
-                )
-            cycle, line, _ = np.nonzero(valid)
-            word = some[valid].astype(np.int64)
-            address, codes = word >> 28 & 3, word & 0xFFFFFFF
-            pixel = {"2212b": 4 * line + address, "2212s": line + 64 * address}.get(str(firmware), line)
-            if ends is not None:
-                time = codes // _CODES * _CLOCK + ends[pixel, codes % _CODES] + offsets[pixel]
-                codes = np.rint(time * (PICOSECOND / tick)).astype(np.int64)
-            inside = (codes >= 0) & (codes < length)
-            outside += int((~inside).sum())
-            channels.append(pixel[inside].astype(np.uint8))
-            ticks.append((codes + (start + cycle) * length)[inside].astype(np.uint64))
+        words = frames_in_file(path, 0, "<u4", (cycles * lines, 1, said.timestamps))
+        recording = _Recording(path, words, lines, kept, str(firmware), tick, length, ends, offsets)
+        found = Detections(path, recording.pieces)
         if said.tick is not None and ends is None:
             raise InputError("--tick: without --tdc the ticks are the codes; give --tdc as well, or leave out --tick")
+        outside, full = recording.outside, recording.full
         notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
         if uncalibrated:
             notes.append(f"{uncalibrated} pixels are not calibrated by --tdc; their codes are taken as equally long")
@@ -111,14 +92,57 @@ class LinoSpad2(Format):
         left_out = (f"{outside:,} time stamps that lie outside their cycle",) if outside else ()
         facts = {"tick": tick, "exposure": cycles * said.cycle, "rows": 1, "columns": 256}
         sources = {"exposure": f"{cycles:,} cycles", "tick": "--tdc" if ends is not None else "its codes"}
-        return Found(
-            facts,
-            np.concatenate(channels),
-            np.concatenate(ticks),
-            notes=tuple(notes),
-            left_out=left_out,
-            sources=sources,
-        )
+        return Found(facts, found, notes=tuple(notes), left_out=left_out, sources=sources)
+
+
+@dataclass
+class _Recording:
+    """The lists of words of a file, `lines` of them to a cycle, of which the first `kept` are of pixels.
+
+    words: (lists, 1, words); tick: s; length: of a cycle, in ticks; ends: see `_calibration`, None without; offsets:
+    (256,) ps. outside, full: time stamps outside their cycle and full lists, when all were read.
+    """
+
+    path: Path
+    words: Stack
+    lines: int
+    kept: int
+    firmware: str
+    tick: float
+    length: int
+    ends: np.ndarray | None
+    offsets: np.ndarray
+    outside: int = 0
+    full: int = 0
+
+    def pieces(self) -> Pieces:
+        """(pixel, ticks), some lists after the other. Raises InputError where a list cannot be one."""
+        self.outside = self.full = 0
+        step = max(1, _AT_ONCE // self.words.shape[2])
+        for first in range(0, self.words.shape[0], step):
+            some = self.words[first : first + step][:, 0]
+            cycle, line = np.divmod(np.arange(first, first + len(some)), self.lines)
+            of_pixels = line < self.kept
+            some, cycle, line = some[of_pixels], cycle[of_pixels], line[of_pixels]
+            valid = some >> 31 == 1
+            self.full += int(valid.all(axis=1).sum())
+            behind = valid[:, 1:] & ~valid[:, :-1]
+            if behind.any():
+                bad, word_ = (int(x) for x in np.argwhere(behind)[0])
+                raise InputError(
+                    f"{self.path}: in cycle {cycle[bad]} of the list {line[bad]} a time stands behind an empty word "
+                    f"(at {word_ + 1}), where none can; give another --timestamps or --firmware"
+                )
+            row, _ = np.nonzero(valid)
+            cycle, line, word = cycle[row], line[row], some[valid].astype(np.int64)
+            address, codes = word >> 28 & 3, word & 0xFFFFFFF
+            pixel = {"2212b": 4 * line + address, "2212s": line + 64 * address}.get(self.firmware, line)
+            if self.ends is not None:
+                time = codes // _CODES * _CLOCK + self.ends[pixel, codes % _CODES] + self.offsets[pixel]
+                codes = np.rint(time * (PICOSECOND / self.tick)).astype(np.int64)
+            inside = (codes >= 0) & (codes < self.length)
+            self.outside += int((~inside).sum())
+            yield pixel[inside].astype(np.uint8), (codes + cycle * self.length)[inside].astype(np.uint64)
 
 
 def _calibration(path: Path) -> tuple[np.ndarray, int]:

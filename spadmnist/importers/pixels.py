@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from .. import units
+from .. import capture_files, units
 from ..errors import InputError
 from ..events import Events, Layout
 from ..import_options import MOST_ROWS
 from ..readout import no_detection, stamps_for
 from ..recording import Capture, Recording
 from . import MOST_CHANNELS, Found, Said
+from .detections import Detections, Pieces
 
 _NO_PIXEL = -1
 _MOST_NAMED = 20  # channels that a sentence lists
@@ -43,7 +45,8 @@ class Channels:
 
     def add(self, path: Path, found: Found) -> None:
         """Take in what a file holds."""
-        here = np.bincount(channels_of(path, found)).astype(bool)
+        assert found.detections is not None
+        here = found.detections.counts > 0
         self.where = self.where or path
         self.used = _either(self.used, here)
         here[[c for c in found.names if c < len(here)]] = False
@@ -97,20 +100,6 @@ def _either(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     return out
 
 
-def channels_of(path: Path, found: Found) -> np.ndarray:
-    """The channel of each detection, as numbers that can be indices. Raises InputError for one that can be none."""
-    channel, ticks = found.channel, found.ticks
-    assert channel is not None and ticks is not None
-    if channel.shape != ticks.shape:
-        raise InputError(f"{path}: has {len(ticks):,} times and {len(channel):,} pixels; it needs as many of both")
-    if len(channel):
-        low, high = int(channel.min()), int(channel.max())
-        if low < 0 or high >= MOST_CHANNELS:
-            wrong = low if low < 0 else high
-            raise InputError(f"{path}: has a channel {wrong}; channels are 0 to {MOST_CHANNELS - 1}: correct the file")
-    return channel.astype(np.int64) if channel.dtype.itemsize > 4 or channel.dtype.kind == "b" else channel
-
-
 def array(
     path: Path, said: Said, shapes: Sequence[tuple[int, int]], channels: Channels, positions: np.ndarray | None
 ) -> Array:
@@ -160,54 +149,50 @@ class Placed:
 
 def events(path: Path, found: Found, said: Said, capture: Capture, array: Array, channels: Channels) -> Placed:
     """The detections of a file. Raises InputError for a channel that is no pixel and a time outside the exposure."""
-    channel, ticks, exposure = channels_of(path, found), found.ticks, capture.conditions.exposure
-    pixels = array.layout.pixels
+    detections, exposure = found.detections, capture.conditions.exposure
     tick = found.facts.get("tick", said.tick)
-    assert ticks is not None and tick is not None
-    ticks = ticks.astype(np.int64 if ticks.dtype.kind == "i" else np.uint64, copy=False)
+    assert detections is not None and tick is not None
     notes, left_out = [], []
     if path == channels.where and said.channels is not None and array.channels is not None:
         used = channels.in_use
         if silent := [c for c in array.channels if c not in used]:
             is_of = f"s {channels.called(silent)} have" if len(silent) > 1 else f" {channels.called(silent)} has"
             notes.append(f"the channel{is_of} no detection in any file")
-    pixel = _pixels(path, channel, array, channels)
-    outside = pixel == _NO_PIXEL
-    if outside.any():
-        others = sorted(set(map(int, np.unique(channel[outside]))))
-        which = f"the channel{'s' * (len(others) > 1)} {channels.called(others)}"
-        left_out.append(f"{int(outside.sum()):,} detections of {which} (--channels)")
-        pixel, ticks = pixel[~outside], ticks[~outside]
-    if said.subtract_start and len(ticks):
-        start = ticks.min()
+    pixel_of = _pixels(path, detections.counts, array, channels)
+    outside = np.flatnonzero((pixel_of == _NO_PIXEL) & (detections.counts > 0))
+    if len(outside):
+        which = f"the channel{'s' * (len(outside) > 1)} {channels.called(list(map(int, outside)))}"
+        left_out.append(f"{int(detections.counts[outside].sum()):,} detections of {which} (--channels)")
+    some = _Chosen(detections, pixel_of, bool(len(outside)))
+    counts = np.zeros(array.layout.pixels, np.int64)
+    counts[pixel_of[pixel_of != _NO_PIXEL]] = detections.counts[pixel_of != _NO_PIXEL]
+    start, number = 0, int(counts.sum())
+    low, high = some.ends
+    if said.subtract_start and number:
+        start = low
         notes.append(f"its clock is counted from the first detection, at {units.show(float(start) * tick, 's', 12)}")
-        ticks = ticks - start
-    end = _check_times(path, ticks, tick, exposure, said)
-    _check_wrapped(path, channel if not outside.any() else channel[~outside], ticks, tick, exposure)
-    # the stable sort of 16-bit integers counts them
-    order = np.argsort(pixel.astype(np.uint16 if pixels <= 1 << 16 else np.uint32), kind="stable")
-    offsets = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))]).astype(np.int64)
-    ticks = ticks[order].astype(stamps_for(end, f"{path}: time stamps"))
-    earlier = ticks[1:] < ticks[:-1]
-    firsts = offsets[1:-1]
-    earlier[firsts[(firsts > 0) & (firsts < len(ticks))] - 1] = False
-    if earlier.any():
-        back = units.show(float((ticks[:-1][earlier] - ticks[1:][earlier]).max()) * tick, "s")
-        notes.append(
-            f"its times fall back {int(earlier.sum()):,} times within a pixel, by up to {back}; they were sorted"
-        )
-        ticks = ticks[np.lexsort((ticks, np.repeat(np.arange(pixels), np.diff(offsets))))]
-    made = Recording(capture, array.layout, Events(None, offsets, pixels, ticks, tick, end=exposure), None, tick)
-    return Placed(made, tuple(notes), tuple(left_out))
+    end = _check_times(path, number, low - start, high - start, tick, exposure, said)
+    kind = np.dtype(stamps_for(end, f"{path}: time stamps"))
+    capture_files.check_number(path, number, kind)
+    in_use = int(np.count_nonzero(counts))
+    _check_wrapped(path, some, number, in_use, start, high - start, tick, exposure)
+    rows = capture_files.Rows(counts, kind)
+    for pixel, ticks in some.pieces():
+        rows.put(pixel, ticks - ticks.dtype.type(start))
+    if rows.late:
+        back = units.show(float(rows.back) * tick, "s")
+        notes.append(f"its times fall back {rows.late:,} times within a pixel, by up to {back}; they were sorted")
+    placed = Events(None, rows.offsets, array.layout.pixels, rows.ordered(), tick, end=exposure)
+    return Placed(Recording(capture, array.layout, placed, None, tick), tuple(notes), tuple(left_out))
 
 
-def _pixels(path: Path, channel: np.ndarray, array: Array, channels: Channels) -> np.ndarray:
-    """The pixel of each detection; `_NO_PIXEL` where it is of none."""
+def _pixels(path: Path, counts: np.ndarray, array: Array, channels: Channels) -> np.ndarray:
+    """The pixel of each channel; `_NO_PIXEL` where it is of none. counts: (channels,) detections of the file."""
     if array.channels is None:
         used = channels.in_use
         unnumbered = [c for c in used if c in channels.names]
         beyond = [c for c in used if c not in channels.names and c >= array.layout.pixels]
-        wrong = [c for c in [*unnumbered, *beyond] if c <= int(channel.max(initial=0)) and (channel == c).any()]
+        wrong = [c for c in [*unnumbered, *beyond] if c < len(counts) and counts[c] > 0]
         if wrong:
             why = "has no number" if wrong[0] in channels.names else f"lies beyond the {_by(array.layout.shape)} pixels"
             listed = channels.called(used).replace(" ", "")
@@ -215,10 +200,37 @@ def _pixels(path: Path, channel: np.ndarray, array: Array, channels: Channels) -
                 f"{path}: the channel {channels.called(wrong[:1])} {why}; say with --channels {listed} which channels "
                 "the pixels are, in their order, or give other --rows and --columns"
             )
-        return channel
-    pixel_of = np.full(max(int(channel.max(initial=0)), *array.channels) + 1, _NO_PIXEL, np.int32)
+        return np.arange(len(counts), dtype=np.int32)
+    pixel_of = np.full(max(len(counts) - 1, 0, *array.channels) + 1, _NO_PIXEL, np.int32)
     pixel_of[list(array.channels)] = np.arange(len(array.channels))
-    return np.asarray(pixel_of[channel])
+    return pixel_of[: len(counts)]
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The detections of a file that are of pixels. pixel_of: (channels,); others: are there other ones?"""
+
+    detections: Detections
+    pixel_of: np.ndarray
+    others: bool
+
+    def pieces(self) -> Pieces:
+        """(pixel, ticks) piece after piece."""
+        for channel, ticks in self.detections.pieces():
+            pixel = self.pixel_of[channel]
+            if self.others:
+                kept = pixel != _NO_PIXEL
+                pixel, ticks = pixel[kept], ticks[kept]
+            if len(pixel):
+                yield pixel, ticks
+
+    @cached_property
+    def ends(self) -> tuple[int, int]:
+        """The first and the last tick; 0 where there is none."""
+        if not self.others:
+            return self.detections.first, self.detections.last
+        found = [int(end) for _, ticks in self.pieces() for end in (ticks.min(), ticks.max())] or [0]
+        return min(found), max(found)
 
 
 _COUNTERS = (16, 24, 32, 40, 48)  # bits of counters of time, as converters have them
@@ -226,52 +238,81 @@ _FEW = 30  # detections below which an order in the file tells nothing of a coun
 _FILLED = 15  # mean intervals that the last time may lie below the counter's end: by chance it lies lower in e^-15
 
 
-def _check_wrapped(path: Path, channel: np.ndarray, ticks: np.ndarray, tick: float, exposure: float) -> None:
+def _check_wrapped(
+    path: Path, some: _Chosen, number: int, in_use: int, start: int, most: int, tick: float, exposure: float
+) -> None:
     """Raise InputError where the times, in the order of the file, look like those of a counter that began anew.
 
     It counts less far than the exposure lasts, the times fill it, and where they fall back by more than a hundredth of
     it, they nearly always fall back by more than half. In a file that is in the order of its pixels, times fall back
-    from one pixel to the next.
+    from one pixel to the next. number: of detections, in_use: of pixels with one; start: the tick that is 0, most: the
+    last one since then.
     """
-    if len(ticks) < _FEW:
+    if number < _FEW:
         return
-    most = int(ticks.max())
     bits = next((bits for bits in _COUNTERS if most < 1 << bits), None)
-    if bits is None or exposure / tick <= 1 << bits or most < (1 << bits) * (1 - _FILLED / len(ticks)):
+    if bits is None or exposure / tick <= 1 << bits or most < (1 << bits) * (1 - _FILLED / number):
         return
-    fall = np.where(ticks[:-1] > ticks[1:], ticks[:-1] - ticks[1:], 0)
-    changes = channel[1:] != channel[:-1]
-    if np.count_nonzero(changes) < len(np.unique(channel)):
-        fall[changes] = 0
-    wide, far = np.count_nonzero(fall > (1 << bits) // 100), fall > 1 << (bits - 1)
-    if far.any() and np.count_nonzero(far) >= 0.9 * wide:
-        at = int(far.argmax())
-        times = units.show(float(ticks[at]) * tick, "s"), units.show(float(ticks[at + 1]) * tick, "s")
+    falls = [_Falls(), _Falls()]  # of all detections, and of those of the same pixel
+    changes = 0
+    before: tuple[np.ndarray, np.ndarray] | None = None
+    for pixel, ticks in some.pieces():
+        if before is not None:
+            pixel, ticks = (np.concatenate([a[-1:], b]) for a, b in zip(before, (pixel, ticks), strict=True))
+        before = pixel, ticks
+        fall = np.where(ticks[:-1] > ticks[1:], ticks[:-1] - ticks[1:], 0)
+        other = pixel[1:] != pixel[:-1]
+        changes += int(np.count_nonzero(other))
+        falls[0].add(fall, ticks, bits)
+        falls[1].add(np.where(other, 0, fall), ticks, bits)
+    found = falls[changes < in_use]
+    if found.far and found.far >= 0.9 * found.wide:
+        times = [units.show(float(int(t) - start) * tick, "s") for t in found.first]
         raise InputError(
-            f"{path}: its times fall back {int(far.sum()):,} times by more than half of what {bits} bits count (first "
+            f"{path}: its times fall back {found.far:,} times by more than half of what {bits} bits count (first "
             f"from {times[0]} to {times[1]}): the counter began anew; store times that go on, in 64 bits, or, where "
             "the recording was no longer than them, sort them"
         )
 
 
-def _check_times(path: Path, ticks: np.ndarray, tick: float, exposure: float, said: Said) -> int:
-    """The last tick of the exposure. Raises InputError where a stamp lies outside."""
+@dataclass
+class _Falls:
+    """How often times fall back: by more than a hundredth of a counter (wide), by more than half of it (far); the first
+    such pair of ticks.
+    """
+
+    wide: int = 0
+    far: int = 0
+    first: tuple[int, int] = (0, 0)
+
+    def add(self, fall: np.ndarray, ticks: np.ndarray, bits: int) -> None:
+        """Take in some detections. fall: (n - 1,) by how much each time is less than the one before; ticks: (n,)."""
+        self.wide += int(np.count_nonzero(fall > (1 << bits) // 100))
+        far = fall > 1 << (bits - 1)
+        if not self.far and far.any():
+            at = int(far.argmax())
+            self.first = int(ticks[at]), int(ticks[at + 1])
+        self.far += int(np.count_nonzero(far))
+
+
+def _check_times(path: Path, number: int, low: int, high: int, tick: float, exposure: float, said: Said) -> int:
+    """The last tick of the exposure. Raises InputError where a stamp lies outside: number of them, from low to high."""
     if tick > exposure:
         times = units.show(tick, "s", 9), units.show(exposure, "s", 9)
         raise InputError(f"{path}: its ticks of {times[0]} are longer than the exposure of {times[1]}; correct one")
     end = no_detection(exposure, tick)
-    if not len(ticks) or (int(ticks.min()) >= 0 and int(ticks.max()) <= end):
+    if not number or (low >= 0 and high <= end):
         return end
     # as many digits as tell the last time from the exposure
     digits = next(
-        (n for n in (9, 12, 15) if units.show(float(ticks.max()) * tick, "s", n) != units.show(exposure, "s", n)), 17
+        (n for n in (9, 12, 15) if units.show(float(high) * tick, "s", n) != units.show(exposure, "s", n)), 17
     )
-    low, high = (units.show(float(t) * tick, "s", digits) for t in (ticks.min(), ticks.max()))
+    first, last = (units.show(float(t) * tick, "s", digits) for t in (low, high))
     advice = "give another --exposure"
-    if 0 <= int(ticks.max()) - int(ticks.min()) <= end and not said.subtract_start:
+    if 0 <= high - low <= end and not said.subtract_start:
         advice = "if its clock does not start at 0, give --subtract-start, otherwise another --exposure"
     raise InputError(
-        f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {low} to {high}, outside the exposure "
+        f"{path}: its times, in ticks of {units.show(tick, 's')}, reach from {first} to {last}, outside the exposure "
         f"of {units.show(exposure, 's', digits)}; {advice}"
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from . import LASER_PULSES, MOST_EVENTS, Format, Found, Said, damaged, facts, heard, library
+from .detections import Detections, Pieces
 
 _MOST_TICKS = 1 << 63  # that are added up here
 _BLOCK = 1 << 20  # records that are decoded at a time
@@ -55,19 +57,17 @@ class Decoded:
     unknown: int
 
 
-def decode(records: np.ndarray | _Records, layout: Layout) -> Decoded:
-    """Detections from raw T2 records: overflows are added up in 64 bits. Raises ValueError where that is not possible.
+def decoded(records: np.ndarray | _Records, layout: Layout) -> Iterator[Decoded]:
+    """Detections from raw T2 records, a block of them at a time: overflows are added up in 64 bits.
 
-    records: an array of uint32, or what gives one where it is sliced: a block of them at a time is in memory, besides
-    the detections (9 bytes each).
+    records: an array of uint32, or what gives one where it is sliced. Raises ValueError where that is not possible.
 
     Source: PicoQuant, demonstration readers of the "Unified TTTR File Format".
     """
-    # memory that is not filled is not taken
-    channels, ticks = np.empty(len(records), np.uint8), np.empty(len(records), np.uint64)
-    count = markers = unknown = rounds = 0  # rounds: how often the clock has gone round before the block
+    rounds = 0  # how often the clock has gone round before the block
     for start in range(0, len(records), _BLOCK):
         block = records[start : start + _BLOCK]
+        unknown = 0
         time = block & np.uint32((1 << layout.time) - 1)
         channel = (block >> np.uint32(layout.time) & np.uint32((1 << layout.channel) - 1)).astype(np.uint8)
         if layout.special:
@@ -77,7 +77,7 @@ def decode(records: np.ndarray | _Records, layout: Layout) -> Decoded:
             sync = special & (channel == 0)
             channel[sync] = SYNC
             detection = ~special | sync
-            unknown += int((special & ~(overflow | marker | sync)).sum())
+            unknown = int((special & ~(overflow | marker | sync)).sum())
         else:
             extra = channel == 15
             overflow = extra & (time & np.uint32(15) == 0)
@@ -87,19 +87,15 @@ def decode(records: np.ndarray | _Records, layout: Layout) -> Decoded:
             if wrong.any():
                 at = int(wrong.argmax())
                 raise ValueError(f"record {start + at:,} is of channel {channel[at]}, which is none")
-        markers += int(marker.sum())
         gone = overflow.astype(np.int64)
         if layout.numbered:
             gone[overflow] = np.maximum(time[overflow], 1)  # early firmware leaves the number 0
         gone = rounds + np.cumsum(gone)
         rounds = int(gone[-1])
-        end = count + int(detection.sum())
-        channels[count:end] = channel[detection]
-        ticks[count:end] = (gone[detection] * layout.wrap + time[detection]).astype(np.uint64)
-        count = end
-    if rounds >= _MOST_TICKS // layout.wrap:
-        raise ValueError(f"its clock goes round {rounds:,} times")
-    return Decoded(channels[:count], ticks[:count], markers, unknown)
+        if rounds >= _MOST_TICKS // layout.wrap:
+            raise ValueError(f"its clock goes round {rounds:,} times")
+        ticks = (gone[detection] * layout.wrap + time[detection]).astype(np.uint64)
+        yield Decoded(channel[detection], ticks, int(marker.sum()), unknown)
 
 
 @dataclass(frozen=True)
@@ -147,24 +143,20 @@ class Ptu(Format):
             raise InputError(f"{path}: has records of the type {kind!r:.40}, which is no T2; record in T2 mode")
         known, sources = _header(path, tags)
         layout, (records, notes) = LAYOUTS[kind], _records(path, tags, start)
-        try:
-            found = decode(records, layout)
-        except ValueError as error:
-            raise damaged(path, error) from None
-        _check_order(path, found.ticks, layout.wrap)
-        left_out = [f"{found.markers:,} markers, which are no detections"] if found.markers else []
-        if found.unknown:
-            left_out.append(f"{found.unknown:,} special records of an unknown kind")
-        sync = int((found.channel == SYNC).sum())
-        if sync and said.channels is None and (found.channel != SYNC).any():
+        beside = _Beside()
+        found = Detections(path, lambda: _pieces(path, records, layout, beside))
+        left_out = [f"{beside.markers:,} markers, which are no detections"] if beside.markers else []
+        if beside.unknown:
+            left_out.append(f"{beside.unknown:,} special records of an unknown kind")
+        sync = int(found.counts[SYNC : SYNC + 1].sum())
+        if sync and said.channels is None and sync < len(found):
             notes.append(
                 f"the sync input has {sync:,} detections and is the first pixel; if they are pulses of a laser, choose "
                 "the others with --channels"
             )
         return Found(
             facts(path, known.get),
-            found.channel,
-            found.ticks,
+            found,
             notes=tuple(notes),
             left_out=tuple(left_out),
             names={SYNC: "sync"},
@@ -207,15 +199,39 @@ def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[_Records, li
     return _Records(path, start, declared), notes
 
 
-def _check_order(path: Path, ticks: np.ndarray, wrap: int) -> None:
+@dataclass
+class _Beside:
+    """What stands among the detections, when all records were read."""
+
+    markers: int = 0
+    unknown: int = 0
+
+
+def _pieces(path: Path, records: _Records, layout: Layout, beside: _Beside) -> Pieces:
+    """(channel, ticks) piece after piece. Raises InputError where the records are damaged."""
+    beside.markers = beside.unknown = count = 0
+    last = np.zeros(0, np.uint64)
+    try:
+        for block in decoded(records, layout):
+            _check_order(path, np.concatenate([last, block.ticks]), count - len(last), layout.wrap)
+            beside.markers += block.markers
+            beside.unknown += block.unknown
+            count += len(block.ticks)
+            last = block.ticks[-1:] if len(block.ticks) else last
+            yield block.channel, block.ticks
+    except ValueError as error:
+        raise damaged(path, error) from None
+
+
+def _check_order(path: Path, ticks: np.ndarray, first: int, wrap: int) -> None:
     """Raise InputError where a time falls back by more than half an overflow: one is missing, and all later times are
-    wrong. Less is disorder between inputs.
+    wrong. Less is disorder between inputs. first: the number of the first of these detections.
     """
-    for start in range(0, len(ticks), _BLOCK):
-        lost = np.diff(ticks[start : start + _BLOCK + 1].astype(np.int64)) < -(wrap // 2)
-        if lost.any():
-            at = start + int(lost.argmax())
-            raise InputError(
-                f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {at + 1:,}; "
-                "records are missing there: copy it again from where it was made"
-            )
+    lost = np.diff(ticks.astype(np.int64)) < -(wrap // 2)
+    if lost.any():
+        at = int(lost.argmax())
+        number = first + at + 1
+        raise InputError(
+            f"{path}: its times fall back from {ticks[at]:,} to {ticks[at + 1]:,} ticks at detection {number:,}; "
+            "records are missing there: copy it again from where it was made"
+        )

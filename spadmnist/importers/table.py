@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ import numpy as np
 from .. import image_files, units
 from ..errors import InputError
 from . import LASER_PULSES, MOST_CHANNELS, PICOSECOND, Format, Found, Said
+from .detections import Detections, Pieces
 
-_AT_ONCE = 1 << 24  # characters
+_AT_ONCE = 1 << 22  # characters
 _LONGEST_LINE = 1000  # characters
 _MOST_TICKS = 2**53  # up to which a number with a decimal point is exact
 _HOW = "write pixel,time (ps) (or x,y,time (ns)) into the first line"
@@ -54,35 +56,45 @@ class Table(Format):
     def read(cls, path: Path, said: Said) -> Found:
         """Times are read as they are written, and rounded to ticks once: exact below 2^53 of them."""
         tick = said.tick or PICOSECOND
-        channels, ticks = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint64)]
-        try:
-            with open(path, encoding="utf-8-sig") as file:
-                first = file.readline(_LONGEST_LINE)
-                head = _head(first, path)
-                shape = _shape(head, said, path)
-                for line, lines, table in _pieces(file, path, head):
-                    channel, where = _channels(head, table, shape)
-                    time = sum((table[:, i] * _ratio(scale, tick) for i, scale, _ in head.times), np.zeros(len(table)))
-                    if time.max(initial=0) >= _ROUNDED:
-                        time = _exact(lines, head, tick)
-                    whole = np.rint(time)
-                    fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
-                    fine &= (time >= 0) & (whole < _MOST_TICKS)
-                    if not fine.all():
-                        row = int(fine.argmin())
-                        at, unit = table[row, head.times[0][0]], head.times[0][2]
-                        line = [n for n, text in enumerate(lines, line) if text.strip()][row]
-                        raise InputError(
-                            f"{path}:{line}: {where(row)} at {at:.15g} {unit} is no pixel (0, 1, ...) and a time "
-                            "from 0 on, below 2^53 ticks; correct it, or give a longer --tick"
-                        )
-                    channels.append(channel.astype(np.uint32))
-                    ticks.append(whole.astype(np.uint64))
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); store the table as UTF-8") from None
+        with _text(path) as file:
+            shape = _shape(_head(file.readline(_LONGEST_LINE), path), said, path)
         facts = {"tick": tick} | ({} if shape is None else {"rows": shape[0], "columns": shape[1]})
         source = "--tick" if said.tick is not None else "a table's times are rounded to it"
-        return Found(facts, np.concatenate(channels), np.concatenate(ticks), sources={"tick": source})
+        detections = Detections(path, lambda: _detections(path, shape, tick))
+        return Found(facts, detections, sources={"tick": source})
+
+
+@contextlib.contextmanager
+def _text(path: Path) -> Iterator[Any]:
+    """The table, open. Raises InputError where it is no text."""
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            yield file
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); store the table as UTF-8") from None
+
+
+def _detections(path: Path, shape: tuple[int, int] | None, tick: float) -> Pieces:
+    """(channel, ticks) of the lines of a table, piece after piece."""
+    with _text(path) as file:
+        head = _head(file.readline(_LONGEST_LINE), path)
+        for line, lines, table in _pieces(file, path, head):
+            channel, where = _channels(head, table, shape)
+            time = sum((table[:, i] * _ratio(scale, tick) for i, scale, _ in head.times), np.zeros(len(table)))
+            if time.max(initial=0) >= _ROUNDED:
+                time = _exact(lines, head, tick)
+            whole = np.rint(time)
+            fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
+            fine &= (time >= 0) & (whole < _MOST_TICKS)
+            if not fine.all():
+                row = int(fine.argmin())
+                at, unit = table[row, head.times[0][0]], head.times[0][2]
+                line = [n for n, text in enumerate(lines, line) if text.strip()][row]
+                raise InputError(
+                    f"{path}:{line}: {where(row)} at {at:.15g} {unit} is no pixel (0, 1, ...) and a time "
+                    "from 0 on, below 2^53 ticks; correct it, or give a longer --tick"
+                )
+            yield channel.astype(np.uint32), whole.astype(np.uint64)
 
 
 _ROUNDED = 2.0**49  # ticks from which on a double may round a decimal to another tick

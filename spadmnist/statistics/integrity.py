@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..events import longest_gap
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
@@ -106,34 +107,6 @@ def faults(stamps, offsets, end):
                 smaller += stamps[i] < stamps[i - 1]
                 equal += stamps[i] == stamps[i - 1]
     return smaller, equal, late
-
-
-@jit
-def longest_gap(stamps, end, bins):
-    """(longest gap between neighbouring stamps of the whole array, the ends of the exposure taken as stamps; number of
-    stamps before `end`; whether a longer one may be hidden within one of the bins).
-
-    Two stamps in the same bin are less than a bin apart, so only the gaps between bins need to be looked at.
-    """
-    low = np.full(bins, np.inf)
-    high = np.full(bins, -1.0)
-    factor = bins / end
-    count = 0
-    for i in range(stamps.size):
-        t = np.float64(stamps[i])
-        if t < end:
-            count += 1
-            b = min(np.int64(t * factor), bins - 1)
-            low[b] = min(low[b], t)
-            high[b] = max(high[b], t)
-    longest = 0.0
-    last = 0.0
-    for b in range(bins):
-        if high[b] >= 0.0:
-            longest = max(longest, low[b] - last)
-            last = high[b]
-    longest = max(longest, end - last)
-    return longest, count, longest < end / bins
 
 
 class RepeatedFrames(Statistic):
@@ -340,9 +313,7 @@ class Gaps(Statistic):
         found, unit = stamps(recording)
         exposure = recording.conditions.exposure
         end = exposure / unit
-        gap, events, hidden = longest_gap(found, end, max(1, len(found) // 8))
-        if hidden:  # as good as never: the longest gap is shorter than eight mean ones
-            gap = float(np.diff(np.sort(found[found < end].astype(np.float64)), prepend=0.0, append=end).max())
+        gap, events = longest_gap(found, 0.0, end)
         log_expected = np.log(events + 1.0) + events * np.log1p(-min(gap / end, 1.0 - 1e-15))
         expected_longer = np.exp(min(log_expected, 700.0))
         if expected_longer > 0.7:
