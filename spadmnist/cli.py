@@ -933,7 +933,9 @@ def diagnose(
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
             last.callback(lambda: _say(f"Report: {pages.diagnosis(found, output)}"))
-        what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement))
+        what = next_step.after_diagnosis(
+            found, quoted(sensor), quoted(measurement), quoted(found.file or "next/sensor.yaml")
+        )
         last.callback(lambda: _print_lines(f"{results.table(found)}\n\nNext: {what}"))
         last.callback(lambda: _write_answer(json_file, results.canonical(found)))
     if found.unwritten:
@@ -976,7 +978,7 @@ def fit(
     found = named_fit.fit_named(model, data, added, freed, mapped, seed, jobs or processors(), progress=_say)
     _write_next(found, sensor, output, model)
     _write_answer(json_file, results.canonical(found))
-    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement))
+    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), quoted(found.file or output))
     _print_lines(f"{results.table(found)}\n\nNext: {what}")
     if found.unwritten:
         sys.exit(2)

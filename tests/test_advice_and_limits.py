@@ -151,7 +151,7 @@ def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, 
 def with_residuals(evaluation: Evaluation, sizes: dict[str, float]) -> Evaluation:
     """It with residuals as large as that in the cells of these statistics of the flat field, 0 elsewhere."""
     own = {cell: np.full(len(z), sizes.get(cell[1], 0.0)) for cell, z in evaluation.residuals.items()}
-    return replace(evaluation, residuals=own, exact=[])
+    return replace(evaluation, residuals=own, judgements={})
 
 
 def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):

@@ -20,16 +20,17 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
     return f"spadmnist diagnose {sensor} {measurement} -o next finds what the model lacks."
 
 
-def after_diagnosis(found: Diagnosis, sensor: str = SENSOR, measurement: str = MEASUREMENT) -> str:
-    """What follows a diagnosis or a fit; arguments as of `after_comparison`."""
-    new = found.file or "next/sensor.yaml"
+def after_diagnosis(
+    found: Diagnosis, sensor: str = SENSOR, measurement: str = MEASUREMENT, new: str = "next/sensor.yaml"
+) -> str:
+    """What follows a diagnosis or a fit. new: the next sensor file; other arguments as of `after_comparison`."""
     if not found.finished:
         return f"spadmnist diagnose {sensor} {measurement} -o next --within none goes on to the end."
     if found.asked == "fit":
         return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
     if found.verdict == "adequate":
         return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
-    if found.verdict == "setup":
+    if found.verdict == "setup" and found.setup:
         entry = found.setup[0]
         return (
             f"measure the {entry['quantity']} of {entry['capture'] or 'all captures'} again, correct measurement.yaml, "

@@ -101,7 +101,7 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "verdict": word,
         "look": look,
         "sentence": results.sentence(found),
-        "then": next_step.after_diagnosis(found),
+        "then": next_step.after_diagnosis(found, new=Path(found.file).name if found.file else "next/sensor.yaml"),
         "headline": headline(found.in_sample) if found.in_sample is not None else "",
         "next": Path(found.file).name if found.file else None,
         "ladder": ladder,
