@@ -284,10 +284,10 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
 
 
 @cli.command("schema", short_help="Print the JSON Schema of the YAML files, for editors.")
-@click.argument("kind", required=False, default="config", metavar="[config|sensor|measurement]")
+@click.argument("kind", required=False, default="config")
 @_plugin
 def schema_(kind: str, plugin_files: tuple[Path, ...]) -> None:
-    """Print the JSON Schema of a config (or of a sensor's file, or of measurement.yaml), made from the classes.
+    """Print the JSON Schema of a config, made from the classes; or, KIND being sensor or measurement, that of theirs.
 
     An editor that knows YAML completes and checks with it, where the first line of the file names the schema's:
 
@@ -674,7 +674,7 @@ def import_(
 
 
 @cli.command(short_help="Write images or captures to files that other programs read.")
-@click.argument("source", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--output",
     "-o",
@@ -702,7 +702,7 @@ def import_(
 )
 @_json
 def export(
-    source: Path,
+    dataset: Path,
     output: Path | None,
     format_: str | None,
     ids: tuple[str, ...],
@@ -729,16 +729,16 @@ def export(
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
     choice = image_exporters.Choice(levels, splits, limit, methods, readouts)
-    if image_exporters.is_of_images(source, format_, choice):
+    if image_exporters.is_of_images(dataset, format_, choice):
         if ids:
-            raise SpadError(f"--capture: belongs to a measurement, and these are images of {source}: leave it out")
+            raise SpadError(f"--capture: belongs to a measurement, and these are images of {dataset}: leave it out")
         if format_ == "png" and readouts:
             raise SpadError("--readout: png holds flux images alone; leave it out, or take npz, parquet or webdataset")
         with _terminal() as progress:
-            paths = image_exporters.export(source, output, format_, choice, progress)
+            paths = image_exporters.export(dataset, output, format_, choice, progress)
     else:
-        _check_captures(source, format_, choice)
-        opened = library.open(source, readouts[0] if readouts else None)
+        _check_captures(dataset, format_, choice)
+        opened = library.open(dataset, readouts[0] if readouts else None)
         with _terminal() as progress:
             paths = exporters.export(opened, output, format_, ids, progress)
         if opened.layout.positions is not None:
