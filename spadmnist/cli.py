@@ -284,10 +284,10 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
 
 
 @cli.command("schema", short_help="Print the JSON Schema of the YAML files, for editors.")
-@click.argument("kind", required=False, default="config", metavar="[config|sensor|measurement]")
+@click.argument("kind", required=False, default="config")
 @_plugin
 def schema_(kind: str, plugin_files: tuple[Path, ...]) -> None:
-    """Print the JSON Schema of a config (or of a sensor's file, or of measurement.yaml), made from the classes.
+    """Print the JSON Schema of a config, made from the classes; or, KIND being sensor or measurement, that of theirs.
 
     An editor that knows YAML completes and checks with it, where the first line of the file names the schema's:
 
@@ -673,59 +673,101 @@ def import_(
         _say(f"Made: {made.folder}. Look at it:  spadmnist inspect {quoted(made.folder)}")
 
 
-@cli.command(short_help="Write captures to files that other programs read.")
-@click.argument("measurement", type=click.Path(path_type=Path))
+@cli.command(short_help="Write images or captures to files that other programs read.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--output",
     "-o",
     type=_Place(),
     metavar="OUT",
-    help="A file, or a folder for several.",
+    help="A folder, or a file for one capture, or (.npz) for one level and split.",
 )
 @click.option(
     "--format",
     "format_",
-    type=click.Choice(["photon-hdf5", "hdf5", "npz", "npy"]),
-    help="photon-hdf5: time stamps; npy: frames, QIS packed; hdf5, npz: all.",
+    type=click.Choice(["photon-hdf5", "hdf5", "npz", "npy", "png", "parquet", "webdataset"]),
+    help="Captures: photon-hdf5 (stamps), npy (frames), hdf5, npz. Images: npz, png (fluxes), parquet, webdataset.",
 )
 @click.option("--capture", "ids", multiple=True, metavar="ID", help="Only this capture (repeatable).")
-@click.option("--readout", type=click.Choice(["tr", "str", "qis", "counts"]), default=None, help="Of a dataset.")
+@click.option("--lux", "levels", multiple=True, metavar="LEVEL", help="Of images: only this light level (repeatable).")
+@click.option("--split", "splits", multiple=True, metavar="SPLIT", help="Of images: only this split (repeatable).")
+@click.option("--limit", type=click.IntRange(1), metavar="N", help="Of images: the first N of each level and split.")
+@click.option("--method", "methods", multiple=True, metavar="METHOD", help="Of images: only this flux (repeatable).")
+@click.option(
+    "--readout",
+    "readouts",
+    multiple=True,
+    type=click.Choice(["tr", "str", "qis", "counts"]),
+    help="Of a dataset: only this readout (of images repeatable).",
+)
 @_json
 def export(
-    measurement: Path,
+    dataset: Path,
     output: Path | None,
     format_: str | None,
     ids: tuple[str, ...],
-    readout: str | None,
+    levels: tuple[str, ...],
+    splits: tuple[str, ...],
+    limit: int | None,
+    methods: tuple[str, ...],
+    readouts: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Write the captures of MEASUREMENT (or of a dataset of uniform images) to OUT.
+    """Write the captures of MEASUREMENT (or of a dataset of uniform images), or the images of DATASET, to OUT.
 
-    Files say how a capture was recorded, so that `import` gives it back as it was; .npy alone does not.
+    Files of captures say how each was recorded, so that `import` gives it back as it was; .npy alone does not. Of
+    images, OUT holds <level>/<split>/ as the dataset does, a row an image; parquet has a card and croissant.json.
 
     \b
     spadmnist export lab -o dark.hdf5 --format photon-hdf5 --capture dark
+    spadmnist export out -o rows --format parquet --lux "2560 mlux"
     """
-    from . import exporters
+    from . import exporters, image_exporters
     from . import measurement as library
     from .errors import SpadError
 
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
-    opened = library.open(measurement, readout)
-    with _terminal() as progress:
-        paths = exporters.export(opened, output, format_, ids, progress)
-    if opened.layout.positions is not None:
-        _say("Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv.")
-    if any(capture.light.scene for capture in opened.captures if not ids or capture.id in ids):
-        _say(
-            "Note: these files do not hold the scene that was seen; to import them again, give --light image:FILE.npy."
-        )
+    choice = image_exporters.Choice(levels, splits, limit, methods, readouts)
+    if image_exporters.is_of_images(dataset, format_, choice):
+        if ids:
+            raise SpadError(f"--capture: belongs to a measurement, and these are images of {dataset}: leave it out")
+        if format_ == "png" and readouts:
+            raise SpadError("--readout: png holds flux images alone; leave it out, or take npz, parquet or webdataset")
+        with _terminal() as progress:
+            paths = image_exporters.export(dataset, output, format_, choice, progress)
+    else:
+        _check_captures(dataset, format_, choice)
+        opened = library.open(dataset, readouts[0] if readouts else None)
+        with _terminal() as progress:
+            paths = exporters.export(opened, output, format_, ids, progress)
+        if opened.layout.positions is not None:
+            _say("Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv.")
+        if any(capture.light.scene for capture in opened.captures if not ids or capture.id in ids):
+            _say(
+                "Note: these files do not hold the scene that was seen; to import them again, give --light "
+                "image:FILE.npy."
+            )
     if as_json:
         _print_json({"files": [str(path) for path in paths]})
         return
     for path in paths:
         _print(str(path))
+
+
+def _check_captures(source: Path, format_: str, choice: Any) -> None:
+    """Refuse what only images of a dataset have."""
+    from .errors import SpadError
+    from .exporters import Target
+
+    if format_ not in Target.every:
+        others = ", ".join(Target.every)
+        raise SpadError(f"--format {format_}: holds images of a dataset, and {source} is none; take one of {others}")
+    if choice.named or len(choice.readouts) > 1:
+        raise SpadError(
+            f"--lux, --split, --limit, --method and several --readout: choose images of a dataset, and as {format_} "
+            f"{source} gives captures; leave them out"
+        )
 
 
 @cli.command("effects", short_help="List physical effects, describe one, or begin one of your own.")

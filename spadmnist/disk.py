@@ -120,6 +120,52 @@ def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
         _sync(path.parent)
 
 
+@contextlib.contextmanager
+def whole_folder(path: str | os.PathLike[str], size: int) -> Iterator[Path]:
+    """A folder among the user's own, to be filled: there as a whole or not at all; see `whole`.
+
+    What is there already is left alone: raises SpadError.
+    """
+    path = Path(path)
+    check_outside(path)
+    taken = SpadError(f"{path}: is there already, and is not written over; remove it, or name another with -o")
+    part = path.with_name(f".{path.name}.part")
+    with writing(path, size):
+        if os.path.lexists(path):
+            raise taken
+        _make_folder(part)
+        handle = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise SpadError(f"{path}: another run is writing it; wait for it, or choose another -o") from None
+            try:
+                _empty(part)
+                yield part
+                for folder, _, names in os.walk(part):
+                    for name in names:
+                        _sync(Path(folder, name))
+                    _sync(Path(folder))
+                try:
+                    os.rename(part, path)  # over an empty folder at most
+                except OSError as error:
+                    if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                        raise taken from None
+                    raise
+            except BaseException:
+                shutil.rmtree(part, ignore_errors=True)
+                raise
+        finally:
+            os.close(handle)
+        _sync(path.parent)
+
+
+def _empty(folder: Path) -> None:
+    for entry in list(os.scandir(folder)):
+        shutil.rmtree(entry.path) if entry.is_dir(follow_symlinks=False) else os.unlink(entry.path)
+
+
 def put_file(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file among the user's own; see `whole`."""
     with whole(path, len(data)) as file:

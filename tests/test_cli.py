@@ -278,6 +278,7 @@ def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
         "reconstruct": [made[1], "--method", "countz"],
         "effects": ["dead_tme"],
         "methods": ["countz"],
+        "init": [made[0]],  # a file: a folder that is not there is made
         **{key: ["/nonexistent/nothing", made[1], "-o", "/nonexistent/out"] for key in ("simulate", "fit")},
         **{key: ["/nonexistent/nothing", made[1]] for key in ("compare", "diagnose")},
     }.get(verb, ["/nonexistent/nothing"])

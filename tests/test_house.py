@@ -38,7 +38,7 @@ LAYERS = [
     {"inference"},
     {"plan", "verify", "report", "pages", "starting", "testing"},
     {"importers"},
-    {"exporters", "fluxes", "torch"},
+    {"exporters", "fluxes", "image_exporters", "torch"},
     {"library"},
     {"experiments"},
     {"cli"},
@@ -135,6 +135,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ("click", {"cli.py"}),
         ("torch", {"torch.py", "experiments/_lenet.py"}),
         ("tqdm", {"cli.py"}),
+        ("pyarrow", {"image_exporters.py"}),
         ("yaml", {"document.py"}),
         (
             "joblib",

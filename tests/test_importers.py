@@ -39,7 +39,7 @@ from importfiles import (
     t2,
 )
 
-from spadmnist import cli, exporters, importers, measurement
+from spadmnist import cli, exporters, image_exporters, importers, measurement
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Events, Layout
@@ -705,7 +705,8 @@ def test_every_kind_is_told_of(tmp_path: Path) -> None:
         assert kind.about.removeprefix("NumPy ") in told, kind.about
         assert (kind.__doc__ or "").strip()
     (choice,) = (p.type for p in cli.cli.commands["export"].params if p.name == "format_")
-    assert sorted(choice.choices) == sorted(exporters.Target.every)  # type: ignore[attr-defined]
+    every = {*exporters.Target.every, *image_exporters.ImageTarget.every}
+    assert sorted(choice.choices) == sorted(every)  # type: ignore[attr-defined]
 
 
 def test_a_new_kind_is_one_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
