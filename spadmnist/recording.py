@@ -336,6 +336,7 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
     if none >= 1 << 32:
         frame, tick = (show(x, "s") for x in (capture.conditions.frame_time, first.tick))
         raise InputError(f"{capture.id}: STR stamps of {tick} in frames of {frame} need more than 32 bits")
-    stamps = kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, none)[: one.frames.frames]
+    stamps = np.full((one.frames.frames, layout.pixels), none, np.uint32)
+    kernels.stamps_first(one.frames.bits, first.offsets, first.ticks, stamps)
     totals: dict[str, object] = {"totals": np.diff(first.offsets)}
     return Recording(capture, layout, None, stamps.reshape(-1, rows, columns), first.tick, dead_time, totals)

@@ -694,6 +694,9 @@ def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> 
         ticks = rng.integers(0, 1000, int(offsets[-1])).astype(kind)
         wanted = np.full((pixels, frames), 1000, np.uint32)
         wanted[ones] = ticks
-        found = kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, 1000)
-        assert found.dtype == np.uint32 and np.array_equal(found[:frames], wanted.T)
-        assert np.all(found[frames:] == 1000)
+        found = np.full((frames, pixels), 1000, np.uint32)
+        kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, found)
+        assert np.array_equal(found, wanted.T)
+    bits = np.full((frames, pixels), 7, np.uint8)
+    kernels.bits_first(np.packbits(ones, axis=1), bits)
+    assert np.array_equal(bits, ones.T)
