@@ -81,9 +81,10 @@ class Frames:
         """
         if self.first is None:
             raise SpadError("STR was not recorded")
-        out = np.full((len(self.bits) // self.pixels, self.frames, self.pixels), self.frame_time, kind)
+        out = np.empty((len(self.bits) // self.pixels, self.frames, self.pixels), kind)
         times, offsets = self.first.times.astype(kind, copy=False), self.first.offsets
         for image, rows in enumerate(self._rows(len(out))):
+            out[image] = self.frame_time  # just before, so that it is still in the cache
             kernels.stamps_first(self.bits[rows], offsets[rows.start : rows.stop + 1], times, out[image])
         return out
 
