@@ -411,7 +411,10 @@ TILES = {"size": [2, 2], "corners": [[0, 0], [1, 2]], "numbers": [4, 7], "labels
         ({"labels": [3, 256]}, "chart.json: labels[1]: 256 is not possible; it must be at most 255"),
         ({"numbers": None}, "chart.json: numbers: None is not possible; it must be a list"),
         ({"size": [2, 0]}, "chart.json: size[1]: 0 is not possible; it must be at least 1"),
-        ({"places": []}, "chart.json: places is not an entry here. Did you mean labels? Allowed are size, corners, numbers, lab"),
+        (
+            {"places": []},
+            "chart.json: places is not an entry here. Did you mean labels? Allowed are size, corners, numbers, lab",
+        ),
         (None, "chart.json: cannot be read (it is not JSON); the tiles of a chart are a JSON file"),
     ],
 )
