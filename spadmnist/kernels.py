@@ -55,6 +55,8 @@ def _double(typingctx: Any, x: Any) -> Any:
 
 _TILE = 16384.0  # expected events of the pixels that the fused line takes at a time
 
+_SIDE_BY_SIDE = 4096  # pixels whose bits are turned over together: their lines stay in the cache
+
 BATCH = 128  # exponentials that are made at a time: long enough to fill the SIMD unit, short enough for a dim image
 
 _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
@@ -1234,6 +1236,49 @@ def fill_stamps(offsets, stamps, pixels, out):
     for f in range(out.shape[0]):
         for i in range(offsets[f], offsets[f + 1]):
             out[f, pixels[i]] = stamps[i]
+
+
+@_jit
+def bits_first(bits, out):
+    """Turn bits pixel by pixel (pixels, bytes), high bit first, into frames: out (frames, pixels) of 0 and 1."""
+    frames, pixels = out.shape
+    eights = np.empty(min(pixels, _SIDE_BY_SIDE), np.uint8)
+    for first in range(0, pixels, eights.size):
+        count = np.uint64(min(eights.size, pixels - first))
+        for byte in range(bits.shape[1]):
+            for p in range(count):
+                eights[p] = bits[np.uint64(first) + p, byte]
+            for frame in range(8 * byte, min(8 * byte + 8, frames)):
+                row, shift = out[frame, first:], np.uint8(7 - (frame & 7))
+                for p in range(count):
+                    row[p] = (eights[p] >> shift) & np.uint8(1)
+
+
+@_jit
+def stamps_first(bits, offsets, stamps, out):
+    """Put stamps pixel by pixel, one for each bit set, into frames: out (frames, pixels); all else in it stays.
+
+    bits: (pixels, bytes), high bit first; offsets: (pixels + 1,) into stamps.
+    """
+    frames, pixels = out.shape
+    place = offsets[:-1].copy()
+    most = stamps.size - 1
+    # some pixels at a time, which share their lines of the cache
+    for first in range(0, pixels, 16):
+        for byte in range(bits.shape[1]):
+            for p in range(np.uint64(first), np.uint64(min(first + 16, pixels))):
+                eight = np.uint64(bits[p, byte])
+                if eight == 0:
+                    continue
+                k = place[p]
+                # every place is written, for whether a bit is set is hard to foresee
+                for bit in range(min(8, frames - 8 * byte)):
+                    one = np.int64((eight >> np.uint64(7 - bit)) & np.uint64(1))
+                    frame, stamp = np.uint64(8 * byte + bit), stamps[np.uint64(min(k, most))]
+                    before = out[frame, p]
+                    out[frame, p] = stamp if one else before
+                    k += one
+                place[p] = k
 
 
 @_jit

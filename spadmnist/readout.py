@@ -69,16 +69,28 @@ class Frames:
 
     def unpacked(self) -> np.ndarray:
         """(images, frames, pixels) uint8, 0 or 1: QIS."""
-        bits = np.unpackbits(self.bits, axis=1, count=self.frames)
-        return bits.reshape(-1, self.pixels, self.frames).transpose(0, 2, 1)
+        out = np.empty((len(self.bits) // self.pixels, self.frames, self.pixels), np.uint8)
+        for image, rows in enumerate(self._rows(len(out))):
+            kernels.bits_first(self.bits[rows], out[image])
+        return out
 
-    def stamps(self) -> np.ndarray:
-        """(images, frames, pixels) float64, s since the start of the frame; the frame time where there is none: STR."""
+    def stamps(self, kind: type[np.floating] = np.float64) -> np.ndarray:
+        """(images, frames, pixels), s since the start of the frame; the frame time where there is none: STR.
+
+        kind: of floats.
+        """
         if self.first is None:
             raise SpadError("STR was not recorded")
-        out = np.full((self.bits.shape[0], self.frames), self.frame_time)
-        out[np.unpackbits(self.bits, axis=1, count=self.frames).view(bool)] = self.first.times
-        return out.reshape(-1, self.pixels, self.frames).transpose(0, 2, 1)
+        out = np.empty((len(self.bits) // self.pixels, self.frames, self.pixels), kind)
+        times, offsets = self.first.times.astype(kind, copy=False), self.first.offsets
+        for image, rows in enumerate(self._rows(len(out))):
+            out[image] = self.frame_time  # just before, so that it is still in the cache
+            kernels.stamps_first(self.bits[rows], offsets[rows.start : rows.stop + 1], times, out[image])
+        return out
+
+    def _rows(self, images: int) -> list[slice]:
+        """The rows of each image."""
+        return [slice(image * self.pixels, (image + 1) * self.pixels) for image in range(images)]
 
     def images(self, start: int, stop: int) -> Frames:
         rows = slice(start * self.pixels, stop * self.pixels)

@@ -544,11 +544,12 @@ class Simulated(Dataset[Any]):
             dense, kind = np.moveaxis(made.tally.reshape(len(numbers), made.pixels, -1), -1, 1), np.int32
         else:
             assert made.frames is not None
-            dense = made.frames.unpacked() if self.returns == "qis" else made.frames.stamps()
-            kind = np.uint8 if self.returns == "qis" else np.float32  # type: ignore[assignment]
+            dense = made.frames.unpacked() if self.returns == "qis" else made.frames.stamps(np.float32)
+            kind = dense.dtype.type
         dense = dense.reshape(*dense.shape[:2], *channels, *layout.shape)
         dense = np.moveaxis(dense, 2, 1) if channels else dense
-        frames = torch.from_numpy(np.ascontiguousarray(dense[wanted].astype(kind, copy=False)))
+        dense = dense if len(wanted) == len(dense) and (wanted[1:] > wanted[:-1]).all() else dense[wanted]
+        frames = torch.from_numpy(np.ascontiguousarray(dense.astype(kind, copy=False)))
         return list(zip(frames.unbind(), labels, strict=True))
 
     def _levels(self, numbers: np.ndarray, epoch: int) -> np.ndarray:

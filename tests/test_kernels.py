@@ -715,3 +715,10 @@ def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> 
         filled = np.full((frames, pixels), 1000, np.uint32)
         kernels.fill_stamps(begins, stamps, whose, filled)
         assert np.array_equal(filled, wanted.T)
+
+        found = np.full((frames, pixels), 1000, np.uint32)
+        kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, found)
+        assert np.array_equal(found, wanted.T)
+    bits = np.full((frames, pixels), 7, np.uint8)
+    kernels.bits_first(np.packbits(ones, axis=1), bits)
+    assert np.array_equal(bits, ones.T)
