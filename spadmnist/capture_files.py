@@ -39,9 +39,9 @@ from .readout import counts_type, no_detection, stamps_for, unsigned_for
 from .recording import Capture, Recording
 
 OWNER = "capture_id"  # attribute of a file in a measurement that was written here: which capture it is
-# bytes of the stamps of a capture, of 4 bytes each or 8, which lie in memory; all else that is needed to read, reduce
-# and write them takes less than as much again, and so a capture costs at most 1 GB
-MOST_STAMPS = 1 << 29
+# bytes of the stamps of a capture, of 4 bytes each or 8, which lie in memory; the program and all that it needs besides
+# to read, look at and write them take up to 0.5 GB (measured), and so a capture costs at most 1 GB
+MOST_STAMPS = 3 << 27
 _MOST_BITS = 16  # of a count
 _LARGEST_CHUNK = 1 << 28  # bytes, of frames
 LARGEST_CHUNK_OF_STAMPS = 1 << 25  # bytes: a packed one takes four times as much while it is unpacked
