@@ -87,6 +87,11 @@ class FirstStamps(NamedTuple):
     stamps: np.ndarray
     pixels: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return sum(array.nbytes for array in self)
+
     def of(self, start: int, stop: int) -> FirstStamps:
         """Those of the frames from `start` to `stop`."""
         some = slice(int(self.offsets[start]), int(self.offsets[stop]))

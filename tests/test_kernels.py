@@ -10,7 +10,7 @@ from fractions import Fraction
 import laws
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -696,6 +696,7 @@ def test_paper_line_with_too_little_room(expected: list[float], probability: flo
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 50), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
+@example(300, 200, 0.5, 1)  # each byte there is
 def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> None:
     """Beside a literal one; with frames, and pixels, that fill no whole bytes."""
     rng = np.random.default_rng(seed)

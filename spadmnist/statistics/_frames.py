@@ -17,17 +17,26 @@ from ..kernels import inline, jit
 from ..recording import FirstStamps, Recording, StampedFrames
 
 _MANY = 100.0  # counts for which whole numbers are no matter
-_SMALL = 2**23  # pixels times frames up to which a form of the frames is kept with the recording
+_SMALL = 2**26  # bytes of a form of the frames, up to which it is kept with the recording
 
 
-def _kept(recording: Recording, name: str, make: Callable[[], Iterator[Any]]) -> Iterator[Any]:
-    """What `make` yields, which is kept if the capture is small."""
-    if recording.n_frames * recording.pixels > _SMALL:
-        yield from make()
+def _kept(recording: Recording, name: str, make: Callable[[], Iterator[tuple[int, Any]]]) -> Iterator[tuple[int, Any]]:
+    """What `make` yields, which is kept if it turns out to be small."""
+    known = recording._kept.get(name)
+    if known is not None:
+        yield from known  # type: ignore[misc]
         return
-    if name not in recording._kept:
-        recording._kept[name] = list(make())
-    yield from recording._kept[name]  # type: ignore[misc]
+    held: list[tuple[int, Any]] = []
+    size = 0
+    for first, part in make():
+        size += part.nbytes
+        if size <= _SMALL:
+            held.append((first, part))
+        else:
+            held.clear()
+        yield first, part
+    if size <= _SMALL:
+        recording._kept[name] = held
 
 
 def first_stamps(recording: Recording) -> Iterator[tuple[int, FirstStamps]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,21 @@ def test_how_long_first_detections_were_waited_for(frames: int, pixels: int, sha
             wanted_pixels[p] += waited
             wanted_frames[f] += waited
     assert of_pixels.tolist() == wanted_pixels and of_frames.tolist() == wanted_frames
+
+
+def test_frames_are_read_once_where_their_stamps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many frames there are: it is a matter of the stamps' bytes."""
+    monkeypatch.setattr("spadmnist.recording._CHUNK", 1)
+    whole = stamped(3, (403, 6, 11), 0.2)
+    size = sum(part.nbytes for _, part in first_stamps(replace(whole, _kept={})))
+    for most, times in ((size, 1), (size - 1, 2)):
+        monkeypatch.setattr("spadmnist.statistics._frames._SMALL", most)
+        shares: list[float] = []
+        recording = replace(whole, _kept={}).watched(shares.append)
+        once, again = (list(first_stamps(recording)) for _ in range(2))
+        assert math.isclose(sum(shares), times, abs_tol=1e-9)
+        assert [first for first, _ in once] == [first for first, _ in again] and len(once) > 10
+        assert all(np.array_equal(a.stamps, b.stamps) for (_, a), (_, b) in zip(once, again, strict=True))
 
 
 @pytest.mark.parametrize("kind", ["qis", "str", "counts", "counter"])
