@@ -15,7 +15,7 @@ from decimal import Decimal
 _DIMENSIONS: dict[str, tuple[str, dict[str, str], str]] = {
     "s": (
         "time",
-        {"s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9", "ps": "1e-12", "min": "60", "h": "3600"},
+        {"s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9", "ps": "1e-12"},
         "50 ns",
     ),
     "Hz": ("rate", {"Hz": "1", "mHz": "1e-3", "kHz": "1e3", "MHz": "1e6", "GHz": "1e9"}, "100 Hz"),

@@ -97,7 +97,7 @@ def test_candidates_come_from_the_registry(tmp_path):
     for name in Effect.registry:
         if name not in {e.name for e in sensor.effects}:
             kind = Effect.registry.find(name)
-            can = [p for p in kind.parameters.values() if p.off is not None and p.scan is not None]
+            can = [p for p in kind.parameters.values() if p.off is not None and p.search is not None]
             assert bool(can and not kind.of_scene) == (f"add {name}" in names), name
 
 

@@ -7,6 +7,7 @@ The clock only stops a run that takes three times as long.
 from __future__ import annotations
 
 import math
+import re
 import time
 from dataclasses import dataclass, field
 
@@ -17,6 +18,7 @@ from ..recording import Capture
 # s of two idle cores, measured with `rules: device` and all statistics: per detection, per pixel of a frame, per
 # recording
 _DETECTION, _PIXEL_FRAME, _RECORDING = 1.5e-7, 2e-9, 2e-3
+_LONG, _LONG_UNITS = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(min|h)\s*", re.ASCII), {"min": 60.0, "h": 3600.0}
 _SLOW = 3.0  # times the budget, after which the clock ends a run
 _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis
 # shares of the budget after which no further step, and no further fit or test of the steps, begins
@@ -79,10 +81,14 @@ def seconds_of(within: str | float | None, quick: bool) -> float:
         return _QUICK if quick else _DEFAULT
     if isinstance(within, str) and within.strip().lower() == "none":
         return math.inf
+    stated = _LONG.fullmatch(within) if isinstance(within, str) else None
     try:
-        seconds = float(units.parse(within, "s")) if isinstance(within, str) else float(within)
+        if stated is not None:
+            seconds = float(stated[1]) * _LONG_UNITS[stated[2]]
+        else:
+            seconds = float(units.parse(within, "s")) if isinstance(within, str) else float(within)
     except (TypeError, ValueError) as error:
-        raise InputError(f"within: {error}; or write none, for no end") from None
+        raise InputError(f"within: {error}; minutes and hours too, 10 min, or none for no end") from None
     if not seconds > 0:
         raise InputError(f"within is {within!r}; it is a time of more than 0, for example 10 min, or none for no end")
     return seconds
