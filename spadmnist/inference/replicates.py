@@ -208,6 +208,7 @@ def _task(
     keep_freed_memory()
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
+    models[0].load_plugins()  # statistics are among them
     known = [s for s in statistics_for(capture) if not (hasty and s.costly)]
 
     def take(recording: Recording) -> None:
@@ -450,11 +451,15 @@ class Packed:
         """The packed sensor."""
         return Packed(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
 
+    def load_plugins(self) -> None:
+        """Run the user's plug-in files, where that has not been done in this process."""
+        for file in self.files:
+            plugins.load_file(file)
+
     @property
     def sensor(self) -> Sensor:
         """The unpacked sensor."""
-        for file in self.files:
-            plugins.load_file(file)
+        self.load_plugins()
         return _unpacked(self.packed)
 
 
