@@ -928,8 +928,11 @@ class Sensor:
 
     def _checked(self, effect: Effect, after: Any, events: Events) -> Events:
         if not effect.counted:
+            end = events.end
+            if end is not None and len(events):  # a clock that rounds to the nearest tick may have reached the end
+                end = max(end, float(np.nextafter(events.times.max(), np.inf)))
             wrong = (
-                after.problem(events.end)
+                after.problem(end)
                 if isinstance(after, Events)
                 else f"it is a {type(after).__name__}, not Events"
             )
