@@ -931,11 +931,7 @@ class Sensor:
             end = events.end
             if end is not None and len(events):  # a clock that rounds to the nearest tick may have reached the end
                 end = max(end, float(np.nextafter(events.times.max(), np.inf)))
-            wrong = (
-                after.problem(end)
-                if isinstance(after, Events)
-                else f"it is a {type(after).__name__}, not Events"
-            )
+            wrong = after.problem(end) if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
             if not wrong and len(after.offsets) != len(events.offsets):
                 wrong = f"it has {len(after.offsets) - 1} rows, not {len(events.offsets) - 1}"
             if not wrong and events.cause is not None and (after.cause is None or len(after.cause) != len(after)):
