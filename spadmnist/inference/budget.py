@@ -87,10 +87,13 @@ def seconds_of(within: str | float | None, quick: bool) -> float:
             seconds = float(stated[1]) * _LONG_UNITS[stated[2]]
         else:
             seconds = float(units.parse(within, "s")) if isinstance(within, str) else float(within)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"within: {error}; minutes and hours too, 10 min, or none for no end") from None
+    except (TypeError, ValueError):
+        seconds = math.nan
     if not seconds > 0:
-        raise InputError(f"within is {within!r}; it is a time of more than 0, for example 10 min, or none for no end")
+        raise InputError(
+            f"within: {within!r} is no time of more than 0; write a number and h, min or s, for example 10 min, or "
+            "none for no end"
+        )
     return seconds
 
 

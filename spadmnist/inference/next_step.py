@@ -50,6 +50,4 @@ def after_diagnosis(
             f"spadmnist compare {new} {measurement} shows what remains; spadmnist effects --new NAME writes the file "
             "of an effect for it."
         )
-    return (
-        f"spadmnist compare {new} {measurement} checks the new model; a measurement that it was not fitted to tests it."
-    )
+    return f"spadmnist compare {new} {measurement} checks the new model; {_ANOTHER}."
