@@ -91,7 +91,7 @@ def test_positions_become_a_layout_in_metres(tmp_path: Path) -> None:
 def test_spellings_of_the_same_file(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(text.encode())
     (tmp_path / "b.csv").write_text(PLACES)
-    one, other = read_positions(tmp_path / "a.csv"), config.read_positions(tmp_path / "b.csv")
+    one, other = read_positions(tmp_path / "a.csv"), read_positions(tmp_path / "b.csv")
     assert one.dtype == np.float64 and one.tobytes() == other.tobytes()
 
 
