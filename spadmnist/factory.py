@@ -40,6 +40,7 @@ from .experiment import Experiment
 from .foreign import from_json
 from .heap import keep_freed_memory
 from .images import Images
+from .positions import positions_text
 from .reconstruct import median_of_nonzero
 from .workers import clear_once, workers
 
@@ -406,7 +407,7 @@ def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
     layout = experiment.sensor.layout
     maps: dict[str, bytes] = {}
     if layout.positions is not None:
-        maps[POSITIONS] = config.positions_text(layout.positions).encode()
+        maps[POSITIONS] = positions_text(layout.positions).encode()
         resolved["sensor"]["layout"]["positions"] = POSITIONS
     for name, values in resolved["sensor"]["effects"].items():
         for key, raw in values.items():

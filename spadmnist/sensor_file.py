@@ -15,6 +15,7 @@ from . import config, disk, document, units
 from .effects import Effect
 from .errors import InputError, SpadError
 from .plugins import ByWavelength, Distribution, MapFile, Parameter
+from .positions import positions_text
 from .sensor import Sensor
 from .window import Window
 
@@ -103,7 +104,7 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = Fal
         np.save(held, array)
         disk.put_file(out.parent / file, held.getvalue())
     if at.positions is not None:
-        disk.put_file(out.parent / layout["positions"], config.positions_text(at.positions).encode())
+        disk.put_file(out.parent / layout["positions"], positions_text(at.positions).encode())
     disk.put_file(out, _headed(text).encode())
     config.read_sensor(out)
     return out

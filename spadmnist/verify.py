@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, factory, store
+from . import config, dataset, disk, document, factory, store
 from .dataset import CONFIG, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
@@ -253,7 +253,7 @@ def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did
             did += _clear_way(root, POSITIONS)
             disk.commit_file(root / POSITIONS, manifest["maps"][POSITIONS]["text"].encode(), disk.temporary(root))
             did.append(f"made again: {POSITIONS}")
-    return config.build(config.document.parse(text, str(root / CONFIG)), root)
+    return config.build(document.parse(text, str(root / CONFIG)), root)
 
 
 def _images(

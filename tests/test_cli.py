@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import shutil
@@ -14,17 +15,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner
 from commands import COMMAND, run, run_anew
 from test_factory import assert_same, assert_sentence, make, tree, write_config
 
+from spadmnist import cli as command_line
 from spadmnist.cli import cli
 
 VERBS = sorted(cli.commands)
 IMPORTS = (
     "import sys; sys.argv = {argv!r}\ntry:\n    from spadmnist.cli import main; main()\nexcept SystemExit:\n    pass\n"
 )
+
+
+def test_a_file_of_verbs_is_found_by_being_there() -> None:
+    """And `--help` lists every verb by its hour, of which no two are the same."""
+    folder = Path(command_line.__path__[0])
+    homes = {Path(inspect.getsourcefile(inspect.unwrap(verb.callback))) for verb in cli.commands.values()}
+    assert homes == set(folder.glob("[!_]*.py"))
+    listed = cli.list_commands(click.Context(cli))
+    assert len(set(cli._hours.values())) == len(listed) == len(VERBS) and sorted(listed) == VERBS
+    assert listed[:2] == ["generate", "init"] and listed[-1] == "experiment"
 
 
 @pytest.fixture(scope="module")
@@ -605,7 +618,6 @@ def test_an_end_in_the_middle_of_compiled_code_is_no_fault(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], number: int, code: int
 ) -> None:
     """Compiled code turns what a signal raises into a SystemError."""
-    from spadmnist import cli as command_line
     from spadmnist import interrupts
 
     def stopped(*given: object, **more: object) -> None:
@@ -623,8 +635,6 @@ def test_no_warning_of_a_library_reaches_a_user(
 ) -> None:
     """Not where it is raised in the verb; a programmer sees it with SPADMNIST_DEBUG, or with -W."""
     import warnings
-
-    from spadmnist import cli as command_line
 
     def warned(*given: object, **more: object) -> None:
         warnings.warn("A worker stopped while some jobs were given to the executor.", UserWarning, stacklevel=1)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spadmnist import config, document, factory, plugins, reference
+from spadmnist import config, document, factory, plugins, reference, units
 from spadmnist.effects import Effect
 from spadmnist.errors import ConfigError, InputError
 from spadmnist.light import photons_from_irradiance, photons_from_lux
@@ -892,7 +892,7 @@ def test_the_irradiances_are_solved_from_the_paper_s_means() -> None:
     small = shipped("spad23.yaml")
     parts = small["sensor"]["effects"]["dark_counts"]["rate"]["mixture"]
     dark = sum(
-        p["share"] * config.units.parse(p["lognormal"]["median"], "Hz") * np.exp(p["lognormal"]["sigma"] ** 2 / 2)
+        p["share"] * units.parse(p["lognormal"]["median"], "Hz") * np.exp(p["lognormal"]["sigma"] ** 2 / 2)
         for p in parts
     )
     for mean, wavelength, pde in ((17.0e3, 500e-9, 0.422), (2.27e3, 700e-9, 0.162)):

@@ -21,9 +21,8 @@ import pytest
 import tinylab
 from test_factory import alive, descendants, wait_for, workers, write_config
 
-import spadmnist.cli as command_line
 from spadmnist import disk
-from spadmnist.cli import _run
+from spadmnist.cli import _limits, _run
 from spadmnist.errors import SpadError
 from spadmnist.inference.replicate_cache import keep, recall
 from spadmnist.inference.replicates import CaptureReplicates
@@ -93,8 +92,8 @@ def ended_with(process: psutil.Popen) -> tuple[int, str]:
 def test_a_signal_in_the_final_moves_or_in_a_callback(number: int, status: int) -> None:
     final = "import atexit, os, time\natexit.register(lambda: (os.kill(os.getpid(), {n}), time.sleep(9)))\n"
     callback = (
-        "import os, spadmnist.cli as c\nclass A:\n    def __del__(self): os.kill(os.getpid(), {n})\n"
-        "c._check_limits = A\n"
+        "import os, spadmnist.cli._limits as c\nclass A:\n    def __del__(self): os.kill(os.getpid(), {n})\n"
+        "c.check = A\n"
     )
     for code in (final, callback):
         code = code.format(n=int(number)) + "from spadmnist.start import main; main()"
@@ -106,8 +105,8 @@ def test_a_signal_in_the_final_moves_or_in_a_callback(number: int, status: int) 
 
 def test_what_does_not_end_is_left_all_the_same() -> None:
     code = (
-        "import os, time, spadmnist.cli as c\ndef stuck():\n    try:\n        os.kill(os.getpid(), 2)\n    finally:\n"
-        "        time.sleep(60)\nc._check_limits = stuck\nfrom spadmnist.start import main; main()"
+        "import os, time, spadmnist.cli._limits as c\ndef stuck():\n    try:\n        os.kill(os.getpid(), 2)\n"
+        "    finally:\n        time.sleep(60)\nc.check = stuck\nfrom spadmnist.start import main; main()"
     )
     done = subprocess.run([sys.executable, "-c", code, "effects"], capture_output=True, text=True, timeout=20)
     assert (done.returncode, done.stderr.strip()) == (130, SENTENCE)
@@ -156,7 +155,7 @@ def test_no_thread_is_to_be_had(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setattr(threading.Thread, "start", refused)
     assert _run(["effects"]) == 2
     said = capsys.readouterr().err
-    assert said == f"Error: {command_line._ALONE}\n"
+    assert said == f"Error: {_limits.ALONE}\n"
 
 
 def test_no_process_is_to_be_had(
@@ -178,7 +177,7 @@ def test_no_process_is_to_be_had(
     monkeypatch.setattr(popen_loky_posix.Popen, "_launch", refused)
     file = write_config(tmp_path / "c.yaml")
     assert _run(["generate", str(file), "-o", str(tmp_path / "out"), "--jobs", "2"]) == 2
-    assert capsys.readouterr().err.endswith(f"Error: {command_line._ALONE}\n")
+    assert capsys.readouterr().err.endswith(f"Error: {_limits.ALONE}\n")
     assert len(launched) == 1 and not psutil.pid_exists(launched[0])
 
 

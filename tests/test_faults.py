@@ -44,8 +44,8 @@ measurement.open = opened
 """
 # a program that refuses without a word
 SILENT = """
-from spadmnist import cli
-cli._say = lambda text: None
+from spadmnist.cli import _terminal
+_terminal.say = lambda text: None
 """
 
 

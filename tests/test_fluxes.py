@@ -17,9 +17,8 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-import spadmnist.cli as command_line
 from spadmnist import fluxes, measurement, pictures, plugins, twin
-from spadmnist.cli import cli
+from spadmnist.cli import _terminal, cli
 from spadmnist.effects import Conditions
 from spadmnist.effects.dead_time import DeadTime
 from spadmnist.effects.detection import Detection
@@ -455,7 +454,7 @@ def test_the_bar_is_told(lab: measurement.Measurement, tmp_path: Path, monkeypat
         def __exit__(self, *_: object) -> None:
             pass
 
-    monkeypatch.setattr(command_line, "_terminal", Told)
+    monkeypatch.setattr(_terminal, "progress", Told)
     arguments = ["reconstruct", str(tmp_path / "lab"), "-o", str(tmp_path / "out")]
     assert CliRunner().invoke(cli, arguments).exit_code == 0 and sum(steps) == pytest.approx(6.0)
 

@@ -40,6 +40,7 @@ from importfiles import (
 )
 
 from spadmnist import cli, exporters, image_exporters, importers, measurement
+from spadmnist.cli import _terminal
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Events, Layout
@@ -889,7 +890,7 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypat
     assert (status, told.strip()) == (0, str(tmp_path / "b.hdf5")), said
     steps: list[float] = []
     progress = Progress(advance=lambda work, note: steps.append(work))
-    monkeypatch.setattr(cli, "_terminal", lambda: contextlib.nullcontext(progress))
+    monkeypatch.setattr(_terminal, "progress", lambda: contextlib.nullcontext(progress))
     assert spadmnist("export", lab, "-o", tmp_path / "c", "--format", "npz")[0] == 0 and steps == [1]
     for wrong in (["--exposure", "1"], ["--exposure", "-1 ms"], ["--light", "blue"], []):
         status, told, said = spadmnist("import", file, "-o", tmp_path / "n", *wrong)

@@ -21,9 +21,11 @@ import pytest
 from pydantic import Field
 
 from spadmnist import config, document, factory, images
+from spadmnist.config import _sections
 from spadmnist.effects import Effect, parameter
 from spadmnist.errors import ConfigError
 from spadmnist.section import LATER, Section
+from spadmnist.validated import Time
 
 KEYS = Path(__file__).parent / "data" / "keys.json"
 
@@ -173,7 +175,7 @@ class Tinted(images.Uniform):
 
     source: Literal["tinted"] = "tinted"  # type: ignore[assignment]
     tint: Annotated[int, LATER] = 0
-    fade: Annotated[config.Time, LATER] = Field(default="5 ns")  # type: ignore[assignment]
+    fade: Annotated[Time, LATER] = Field(default="5 ns")  # type: ignore[assignment]
     words: Annotated[list[str], LATER] = Field(default_factory=lambda: ["warm"])
     note: Annotated[str | None, LATER] = None
     old: int = 7
@@ -248,7 +250,7 @@ class Place(Section):
     shelf: int = 1
 
 
-class Output(config._Output):
+class Output(_sections._Output):
     """A section that got a key, and a group of keys, later."""
 
     level: Annotated[int, LATER] = 1

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from commands import run
 from test_factory import assert_same, assert_sentence, make, tree, write_config
@@ -205,7 +206,7 @@ def test_nothing_else_is_written_inside_a_dataset(root: Path, capsys: pytest.Cap
         for option in options:
             # the name of an experiment is looked at first, for its own options
             given = "accuracy" if name == "experiment" else "x"
-            needed = [given] * sum(isinstance(p, cli.click.Argument) for p in cli.cli.commands[name].params)
+            needed = [given] * sum(isinstance(p, click.Argument) for p in cli.cli.commands[name].params)
             for place in (root / "new", root / "images" / "new.x"):
                 assert cli._run([name, *needed, option.opts[0], str(place)]) == 2
                 assert capsys.readouterr().err.startswith(f"Error: {place}: lies inside the dataset {root}")

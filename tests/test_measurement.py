@@ -23,9 +23,8 @@ from measured import (
 )
 
 import spadmnist
-import spadmnist.cli as command_line
 from spadmnist import config, document, factory, look, measurement, report
-from spadmnist.cli import cli, main
+from spadmnist.cli import _terminal, cli, main
 from spadmnist.effects import Conditions
 from spadmnist.errors import ConfigError, SpadError
 from spadmnist.measurement import Measurement
@@ -218,7 +217,7 @@ def test_simulate_from_the_command_line(
     progress = factory.Progress(
         lambda what, total, done: totals.append(total), lambda work, note: steps.append(work), lambda: None
     )
-    monkeypatch.setattr(command_line, "_terminal", lambda: contextlib.nullcontext(progress))
+    monkeypatch.setattr(_terminal, "progress", lambda: contextlib.nullcontext(progress))
     arguments[4] = str(tmp_path / "again")
     assert CliRunner().invoke(cli, arguments).exit_code == 0
     assert len(totals) == 1 and sum(steps) == pytest.approx(totals[0]) and len(steps) > len(CAPTURES)

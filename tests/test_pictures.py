@@ -14,7 +14,9 @@ from spadmnist import config, dataset, document, fluxes, measurement, pictures, 
 from spadmnist.cli import cli
 from spadmnist.effects import Conditions
 from spadmnist.events import Events, Layout
+from spadmnist.positions import positions_text
 from spadmnist.recording import Capture, Light, Recording
+from spadmnist.report import _sheet
 
 
 def hexagonal(rows: int, columns: int, pitch: float = 23e-6) -> np.ndarray:
@@ -85,23 +87,23 @@ sensor:
 
 def test_the_sheet_of_a_dataset_shows_pixels_where_they_lie(tmp_path: Path) -> None:
     places = hexagonal(3, 4)
-    (tmp_path / "places.csv").write_text(config.positions_text(places))
+    (tmp_path / "places.csv").write_text(positions_text(places))
     grey = (np.arange(12) * 23).astype(np.uint8)
     np.save(tmp_path / "images.npy", grey[None, None])
     simulated = dataset.simulated(config.build(document.parse(CONFIG, "test"), tmp_path))
     report.sheet(simulated, tmp_path / "x.png", places=places)
     with Image.open(tmp_path / "x.png") as image:
         page = np.asarray(image.convert("RGB"))
-    pixel, _ = pictures.pixel_at(places, report._LARGE)
+    pixel, _ = pictures.pixel_at(places, _sheet._LARGE)
     white = np.repeat((grey / grey.max() * 255 + 0.5).astype(np.uint8)[:, None], 3, axis=1)
     left = 32 + 8 * len("2560 mlux")
-    cell = page[report._TOP :, left:][: pixel.shape[0], : pixel.shape[1]]
-    assert np.array_equal(cell, pictures.placed(white, pixel, np.array(report._PAGE, np.uint8)))
+    cell = page[_sheet._TOP :, left:][: pixel.shape[0], : pixel.shape[1]]
+    assert np.array_equal(cell, pictures.placed(white, pixel, np.array(_sheet._PAGE, np.uint8)))
 
 
 def test_inspect_finds_the_places_of_a_dataset(tmp_path: Path) -> None:
     """From the file that the dataset keeps; a grid has none."""
-    (tmp_path / "places.csv").write_text(config.positions_text(hexagonal(3, 4)))
+    (tmp_path / "places.csv").write_text(positions_text(hexagonal(3, 4)))
     np.save(tmp_path / "images.npy", np.full((2, 1, 12), 200, np.uint8))
     (tmp_path / "c.yaml").write_text(CONFIG)
     grid = CONFIG.replace("positions: places.csv", "rows: 1, columns: 12")

@@ -15,6 +15,7 @@ import spadmnist
 from spadmnist import config, document, factory, verify
 from spadmnist.effects import Effect
 from spadmnist.errors import ConfigError, InputError, SpadError
+from spadmnist.positions import positions_text, read_positions
 
 ROOT = Path(__file__).parents[1]
 TEXT = """\
@@ -90,20 +91,18 @@ def test_positions_become_a_layout_in_metres(tmp_path: Path) -> None:
 def test_spellings_of_the_same_file(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(text.encode())
     (tmp_path / "b.csv").write_text(PLACES)
-    one, other = config.read_positions(tmp_path / "a.csv"), config.read_positions(tmp_path / "b.csv")
+    one, other = read_positions(tmp_path / "a.csv"), read_positions(tmp_path / "b.csv")
     assert one.dtype == np.float64 and one.tobytes() == other.tobytes()
 
 
 def test_what_is_written_is_read_back_to_the_bit(tmp_path: Path) -> None:
     rng = np.random.Generator(np.random.Philox(1))
     places = rng.normal(0, 1e-4, (2000, 2)) * 10.0 ** rng.integers(-1, 3, (2000, 2))
-    text = config.positions_text(places)
+    text = positions_text(places)
     (tmp_path / "a.csv").write_text(text)
-    again = config.read_positions(tmp_path / "a.csv")
-    assert again.tobytes() == places.tobytes() and config.positions_text(again) == text
-    assert config.positions_text(np.array([[2.3e-5, -0.0], [1e-12, 0.5]])) == (
-        "x (um),y (um)\n23,-0\n0.000001,500000\n"
-    )
+    again = read_positions(tmp_path / "a.csv")
+    assert again.tobytes() == places.tobytes() and positions_text(again) == text
+    assert positions_text(np.array([[2.3e-5, -0.0], [1e-12, 0.5]])) == ("x (um),y (um)\n23,-0\n0.000001,500000\n")
 
 
 MISTAKES = [
@@ -163,20 +162,20 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("loop.csv", "cannot be read"),
     ):
         with pytest.raises(InputError, match=f"{name}: .*{says}"):
-            config.read_positions(tmp_path / name)
+            read_positions(tmp_path / name)
     with pytest.raises(InputError, match="is not the name of a file"):
-        config.read_positions(tmp_path / "a\0.csv")
+        read_positions(tmp_path / "a\0.csv")
     (tmp_path / "link.csv").symlink_to("places.csv")
-    assert len(config.read_positions(tmp_path / "link.csv")) == 5
+    assert len(read_positions(tmp_path / "link.csv")) == 5
 
 
 def test_at_most_so_many_pixels(tmp_path: Path) -> None:
     lines = [f"{i % 400},{i // 400}" for i in range(100_001)]
     (tmp_path / "a.csv").write_text("\n".join(["x,y", *lines]))
     with pytest.raises(InputError, match=r"a\.csv:100002: there are more than 100000 pixels"):
-        config.read_positions(tmp_path / "a.csv")
+        read_positions(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("\n".join(["x,y", *lines[:-1]]))
-    assert config.read_positions(tmp_path / "a.csv").shape == (100_000, 2)
+    assert read_positions(tmp_path / "a.csv").shape == (100_000, 2)
 
 
 @pytest.mark.parametrize(

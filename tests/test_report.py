@@ -15,6 +15,7 @@ import spadmnist
 from spadmnist import config, dataset, document, factory, report
 from spadmnist.dataset import Dataset
 from spadmnist.errors import SpadError
+from spadmnist.report import _sheet
 
 CONFIG = """
 seed: 3
@@ -185,28 +186,28 @@ def test_rows_go_from_dark_to_bright_and_hold_the_originals(tmp_path: Path) -> N
     page = picture(ds, tmp_path / "both.png", count=1)
     one = picture(ds, tmp_path / "one.png", levels=["2560 mlux"], count=1)
     cell = 168  # 28 pixels, six points each
-    assert page.shape[0] - one.shape[0] == cell + report._CAPTION
+    assert page.shape[0] - one.shape[0] == cell + _sheet._CAPTION
     x = _left_edge(one)
-    original = one[report._TOP :: 6, x::6][:28, :28]
+    original = one[_sheet._TOP :: 6, x::6][:28, :28]
     shown = ds["2560 mlux", "train"].images[0]
     assert np.array_equal(original, np.repeat(np.round(shown / shown.max() * 255)[..., None], 3, -1))
-    bright = page[report._TOP + cell + report._CAPTION :][:cell, x : x + cell]
-    assert np.array_equal(bright, one[report._TOP :][:cell, x : x + cell])
+    bright = page[_sheet._TOP + cell + _sheet._CAPTION :][:cell, x : x + cell]
+    assert np.array_equal(bright, one[_sheet._TOP :][:cell, x : x + cell])
     assert len(np.unique(one.reshape(-1, 3), axis=0)) > 100
 
 
 def _left_edge(page: np.ndarray) -> int:
     """Where the first cell begins: the first column that is black from the top of the cells on."""
-    inside = page[report._TOP : report._TOP + 12]
+    inside = page[_sheet._TOP : _sheet._TOP + 12]
     return int(np.flatnonzero((inside == 0).all(axis=(0, 2)))[0])
 
 
 def test_different_labels_are_shown(tmp_path: Path) -> None:
     part = simulated(tmp_path)["40 mlux", "train"]
     assert part.labels is not None
-    indices = report._different(part, 6)
+    indices = _sheet._different(part, 6)
     assert len({int(part.labels[i]) for i in indices}) == 6
-    assert len(report._different(part, 100)) == 12
+    assert len(_sheet._different(part, 100)) == 12
 
 
 @pytest.mark.parametrize("readouts", ["[tr]", "[str]", "[qis]"])
@@ -238,22 +239,22 @@ def test_colour_and_large_images(tmp_path: Path, channels: int, size: tuple[int,
     np.save(tmp_path / "images.npy", pixels if channels > 1 else pixels[:, 0])
     ds = simulated(tmp_path, images="{source: array, path: images.npy}", shape=size)
     page = picture(ds, tmp_path / "colour.png")
-    inside = page[report._TOP : report._TOP + 100, 110:200].astype(int)
+    inside = page[_sheet._TOP : _sheet._TOP + 100, 110:200].astype(int)
     assert (np.ptp(inside, axis=2).max() > 100) == (channels == 3)
 
 
 def test_means_over_squares_and_their_smaller_edges() -> None:
     image = np.arange(15, dtype=np.uint8).reshape(1, 3, 5, 1) * 10
-    reduced = report._reduced(image, 2)[0, :, :, 0]
+    reduced = _sheet._reduced(image, 2)[0, :, :, 0]
     assert reduced.tolist() == [[30, 50, 65], [105, 125, 140]]
 
 
 def test_the_scale_of_times_is_round() -> None:
     times = np.array([1.3e-6, 0.97e-3, np.inf])
-    assert report._time_scale([times]) == pytest.approx((1e-6, 1e-3))
-    assert report._time_scale([np.array([3e-6])]) == pytest.approx((5e-7, 5e-6))
-    assert report._time_scale([np.array([np.inf])]) is None
-    assert report._time_scale([]) is None
+    assert _sheet._time_scale([times]) == pytest.approx((1e-6, 1e-3))
+    assert _sheet._time_scale([np.array([3e-6])]) == pytest.approx((5e-7, 5e-6))
+    assert _sheet._time_scale([np.array([np.inf])]) is None
+    assert _sheet._time_scale([]) is None
 
 
 def test_a_level_or_a_place_that_is_not_there(tmp_path: Path) -> None:

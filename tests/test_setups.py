@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from spadmnist import cli, config, sensor_file
 from spadmnist import measurement as measurements
+from spadmnist.cli import comparing
 from spadmnist.errors import InputError
 from spadmnist.inference.comparison import _between_wavelengths, compare
 from spadmnist.inference.model_selection import diagnose
@@ -242,11 +243,11 @@ def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
     data, answer = tmp_path / "flat.h5", tmp_path / "answer.json"
     data.write_bytes(b"\x89HDF\r\n" * 100)
     with pytest.raises(InputError, match="it is left alone"):
-        cli._check_answer(data)
+        comparing._check_answer(data)
     with pytest.raises(InputError, match="is a folder"):
-        cli._check_answer(tmp_path)
+        comparing._check_answer(tmp_path)
     answer.write_text('{\n "format": "spadmnist-diagnosis/1"}')
     for free in (answer, tmp_path / "new.json", None):
-        cli._check_answer(free)
+        comparing._check_answer(free)
     done = CliRunner().invoke(cli.cli, ["compare", str(tmp_path / "s.yaml"), str(tmp_path), "--json", str(data)])
     assert done.exit_code != 0 and data.read_bytes().startswith(b"\x89HDF")

@@ -19,6 +19,7 @@ import spadmnist
 from spadmnist import config, document, factory, importers, units, verify
 from spadmnist.errors import ConfigError
 from spadmnist.experiment import Level
+from spadmnist.positions import read_positions
 from spadmnist.recording import Light
 
 # every unit that may be written -> the SI unit of its dimension, and its size as an exact fraction
@@ -338,7 +339,7 @@ def test_light_on_the_command_line(sign: str) -> None:
 @pytest.mark.parametrize("sign", ["u", *MICRO], ids=ascii)
 def test_the_header_of_positions(sign: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"x ({sign}m),Y({sign}m)\n0,0\n5,-1\n", encoding="utf-8")
-    assert config.read_positions(tmp_path / "a.csv").tolist() == [[0, 0], [5e-6, -1e-6]]
+    assert read_positions(tmp_path / "a.csv").tolist() == [[0, 0], [5e-6, -1e-6]]
 
 
 @pytest.mark.parametrize("sign", MICRO, ids=ascii)

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .. import config, look, measurement, units
+from .. import look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
 from ..foreign import visible
 from ..import_options import UNCERTAIN, without_effect, word
 from ..measurement.entries import MOST_FRAMES
+from ..positions import read_positions
 from ..recording import Capture, Light, Recording
 from . import FACTS, Format, Found, Said, ask, lights, pixels, plan, recognise, stacks
 from .names import safe_name
@@ -164,7 +165,7 @@ def import_files(
         one.found = found if len(ones) == 1 else None
         progress.advance(one.size, one.path.name)
     _check_options([(one.path, one.kind, (one.made.modality,), one.packed) for one in ones], said)
-    places = None if said.positions is None else config.read_positions(said.positions)
+    places = None if said.positions is None else read_positions(said.positions)
     if planned is not None:
         places = planned.layout.positions
     array = pixels.array(files[0], said, shapes, channels, places)

@@ -11,12 +11,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import capture_files, config, dataset, disk, document, manifest, scene, tiles, units
+from .. import capture_files, dataset, disk, document, manifest, scene, tiles, units
 from ..document import Document, Path_
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
 from ..events import MOST_PIXELS, Layout
 from ..foreign import from_json
+from ..positions import read_positions
 from ..recording import Capture, Light, Recording
 from ..scene import Scene
 from ..tiles import Tiles
@@ -121,7 +122,7 @@ class _Reader(Reader):
             return None
         if array.positions is not None:
             try:
-                positions = config.read_positions(self.base / array.positions)
+                positions = read_positions(self.base / array.positions)
             except InputError as error:
                 self.say((*path, "positions"), str(error))
                 return None

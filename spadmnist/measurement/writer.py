@@ -11,9 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import capture_files, config, dataset, disk, document, units
+from .. import capture_files, dataset, disk, document, units
 from ..errors import InputError, SpadError
 from ..events import Layout
+from ..positions import positions_text
 from ..recording import Capture, Recording
 from ..scene import Scene
 from ..tiles import Tiles
@@ -71,7 +72,7 @@ def write(
                     root.rmdir()
             raise
         if layout.positions is not None:
-            _commit(root, _POSITIONS, config.positions_text(layout.positions).encode())
+            _commit(root, _POSITIONS, positions_text(layout.positions).encode())
         for shown, file in _scenes(done).items():
             _commit(root, file, shown.file())
         for laid, file in _tiles(done).items():

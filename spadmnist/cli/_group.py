@@ -1,0 +1,48 @@
+"""The program itself, to which every verb adds itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from . import _limits as limits
+
+
+class Verbs(click.Group):
+    """Verbs in the order of a day's work, not of the alphabet."""
+
+    def __init__(self, *args: Any, **named: Any):
+        super().__init__(*args, **named)
+        self._hours: dict[str, int] = {}
+
+    def verb(self, hour: int, *args: Any, **named: Any) -> Callable[[Callable[..., Any]], click.Command]:
+        """`click.Group.command` of a verb that `--help` lists by its `hour` in a day's work, in steps of ten."""
+        made: Callable[[Callable[..., Any]], click.Command] = self.command(*args, **named)
+
+        def add(function: Callable[..., Any]) -> click.Command:
+            command = made(function)
+            assert command.name is not None
+            self._hours[command.name] = hour
+            return command
+
+        return add
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        return sorted(self.commands, key=self._hours.__getitem__)
+
+
+@click.group(
+    cls=Verbs,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Begin with:  spadmnist generate configs/quick.yaml -o out  and then  spadmnist inspect out --plot out.png",
+)
+@click.version_option(package_name="spadmnist", message="%(package)s %(version)s")
+def cli() -> None:
+    """What a single-photon (SPAD) camera would have recorded.
+
+    A config (YAML) names images, light levels, a sensor and its effects; `generate` makes the dataset: time stamps
+    (TR), first time stamps of frames (STR), 1-bit frames (QIS), and flux images made from them.
+    """
+    limits.check()

@@ -1,0 +1,122 @@
+"""Options that several verbs have, and what is given with them: plug-ins, a model, a place to write to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from ..sensor import Sensor
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def plugin(command: F) -> F:
+    """`--plugin FILE.py`, as `plugin_files`; see `load_plugins`."""
+    return click.option(
+        "--plugin",
+        "plugin_files",
+        multiple=True,
+        type=click.Path(path_type=Path),
+        metavar="FILE.py",
+        help="Load a file with effects or methods of your own (it is run as a program; repeatable).",
+    )(command)
+
+
+class Place(click.Path):
+    """A place to write to. Refused before the work begins where it lies inside a dataset."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        place = super().convert(value, param, ctx)
+        from .. import disk
+
+        disk.check_outside(os.fsdecode(place))
+        return place
+
+
+def jobs(command: F) -> F:
+    """`--jobs N`."""
+    return click.option(
+        "--jobs",
+        "-j",
+        type=click.IntRange(1, 4096),
+        default=None,
+        metavar="N",
+        help="Workers at a time. The result does not depend on it.  [default: one per processor]",
+    )(command)
+
+
+def as_json(command: F) -> F:
+    """`--json`, as `as_json`."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
+
+
+def crop(command: F) -> F:
+    """`--crop ROW:ROW,COLUMN:COLUMN`; see `model_of`."""
+    return click.option(
+        "--crop",
+        metavar="ROW:ROW,COLUMN:COLUMN",
+        help="The part of SENSOR that was measured, stops excluded, as 100:150,200:250: its own maps, cut.",
+    )(command)
+
+
+def beside(command: F) -> F:
+    """What every verb has that sets a model beside a measurement."""
+    path = click.Path(path_type=Path)
+    for part in (
+        plugin,
+        crop,
+        jobs,
+        click.option(
+            "--seed",
+            type=click.IntRange(0, 2**63 - 1),
+            default=0,
+            metavar="N",
+            help="Of the simulations.  [default: 0]",
+        ),
+        click.option("--json", "json_file", type=Place(), metavar="FILE", help="Write the answer there, as JSON."),
+        click.argument("measurement", type=path),
+        click.argument("sensor", type=path),
+    ):
+        command = part(command)
+    return command
+
+
+def load_plugins(plugin_files: tuple[Path, ...]) -> None:
+    """Run the files of `--plugin`: their effects and methods are known from then on."""
+    from .. import plugins
+
+    for file in plugin_files:
+        plugins.load_file(file)
+
+
+def model_of(sensor: Path, crop: str | None) -> Sensor:
+    """The sensor of a file, or the part of it that `--crop` names."""
+    from .. import config, window
+
+    model = config.read_sensor(sensor)
+    return model if crop is None else model.cropped(*window.parse(crop))
+
+
+class writing:
+    """Turn a failure to write a file into a sentence."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        from ..errors import SpadError
+
+        if isinstance(error, OSError):
+            raise SpadError(f"{self.path}: cannot be written ({error.strerror or error}); name another file") from None

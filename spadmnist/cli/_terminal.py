@@ -1,0 +1,82 @@
+"""The terminal: the one place that writes to it. Names and texts of files never reach it as they are."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..foreign import short, visible, visible_lines
+
+if TYPE_CHECKING:
+    from ..factory import Progress
+
+
+def say(text: str) -> None:
+    """One line, for people."""
+    # where nobody can be told there is nothing to do about it
+    with contextlib.suppress(OSError, ValueError):
+        click.echo(visible(short(text)), err=True)
+
+
+def print_line(text: str) -> None:
+    """One line that a program may read."""
+    click.echo(visible(text))
+
+
+def print_lines(text: str) -> None:
+    """A table or a page: who made it has seen to it that only its own lines end."""
+    click.echo(visible_lines(text))
+
+
+def print_json(answer: Any) -> None:
+    """All but DEL is escaped by itself."""
+    click.echo(json.dumps(answer).replace("\x7f", "\\u007f"))
+
+
+def duration(seconds: float) -> str:
+    """`4.2 s`, or `3.5 min` where it is two minutes or more."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min"
+
+
+class progress:
+    """A progress bar on standard error, where that is a terminal."""
+
+    def __enter__(self) -> Progress:
+        from tqdm import tqdm
+
+        from ..factory import Progress
+
+        tqdm.monitor_interval = 0  # no thread that watches the bar
+
+        bar: list[Any] = []
+
+        def start(what: str, total: float, done: float) -> None:
+            bar.append(
+                tqdm(
+                    total=total,
+                    initial=done,
+                    desc=visible(what),
+                    disable=None,
+                    leave=False,
+                    bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
+                )
+            )
+
+        def advance(work: float, note: str) -> None:
+            bar[-1].set_postfix_str(visible(note), refresh=False)
+            bar[-1].update(work)
+
+        def stop() -> None:
+            while bar:
+                bar.pop().close()
+
+        self._stop = stop
+        return Progress(start, advance, stop, say)
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()

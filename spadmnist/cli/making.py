@@ -1,0 +1,349 @@
+"""Verbs that make data, add to them and keep them whole."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..foreign import quoted
+from ..workers import processors
+from . import _options as options
+from . import _terminal as terminal
+from ._group import cli
+
+if TYPE_CHECKING:
+    from ..sensor import Sensor
+
+
+@cli.verb(10, short_help="Make the dataset of a config.")
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=options.Place(),
+    metavar="OUT",
+    help="Folder of the dataset.  [default: the config's name]",
+)
+@click.option(
+    "--lux",
+    "levels",
+    multiple=True,
+    metavar="LEVEL",
+    help='Only this light level, as the config writes it: --lux "5 mlux" (repeatable).',
+)
+@click.option(
+    "--limit",
+    type=click.IntRange(1),
+    default=None,
+    metavar="N",
+    help="Only the first N images of each split.",
+)
+@click.option(
+    "--images-dir",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Where the images lie. Without it MNIST is looked for in $SPADMNIST_DATA, then downloaded once.",
+)
+@options.jobs
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    default=None,
+    metavar="N",
+    help="Another seed than the config's.",
+)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["zarr", "hdf5"]),
+    default=None,
+    help="Another format than the config's.",
+)
+@click.option("--causes", is_flag=True, help="Store of every detection what made it, and its parent.")
+@click.option("--dry-run", is_flag=True, help="Say photons, bytes, memory and time, and make nothing.")
+@options.plugin
+@options.as_json
+def generate(
+    config: Path,
+    output: Path | None,
+    levels: tuple[str, ...],
+    limit: int | None,
+    images_dir: Path | None,
+    jobs: int | None,
+    seed: int | None,
+    format_: str | None,
+    causes: bool,
+    dry_run: bool,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Make the dataset that CONFIG describes.
+
+    The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
+    drawn value of what is made.
+
+    Pictures of your own are `source: folder` (spadmnist init writes such a config). A pixel's photons follow its grey
+    level. With `gamma: srgb` the level is first taken back from sRGB to light: half of white gets 21 % of its photons.
+
+    \b
+    spadmnist generate configs/quick.yaml -o out
+    spadmnist generate configs/spad_mnist.yaml -o full --images-dir ~/mnist
+    spadmnist generate configs/spad_mnist.yaml -o dim --lux "5 mlux" --limit 1000
+    """
+    from .. import config as configs
+    from .. import factory
+    from .. import images as sources
+
+    options.load_plugins(plugin_files)
+    experiment = configs.read(config, seed, format_, levels, limit, causes)
+    for note in experiment.notes:
+        terminal.say(f"Note: {note}")
+    images = experiment.load_images(images_dir)
+    for note in sources.notes(images):
+        terminal.say(f"Note: {note}")
+    root = output if output is not None else Path(config.stem)
+    workers = jobs or factory.most_workers(experiment, images, processors())
+    if dry_run:
+        from .. import plan
+
+        estimate = plan.estimate(experiment, images, workers)
+        if as_json:
+            terminal.print_json(estimate)
+        else:
+            terminal.print_lines(plan.text(estimate, root))
+        return
+    with terminal.progress() as progress:
+        outcome = factory.generate(experiment, images, root, workers, progress)
+    if as_json:
+        terminal.print_json(
+            {"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds}
+        )
+        return
+    from .. import report
+
+    terminal.print_lines(report.level_table(outcome.manifest))
+    if outcome.made == 0 and outcome.kept == 0:
+        terminal.say("")
+        again = f"spadmnist verify {quoted(root)} reads every byte of it"
+        terminal.say(f"{root} was complete already; nothing was done. {again}.")
+    else:
+        kept = f", {outcome.kept} were there already" if outcome.kept else ""
+        terminal.say("")
+        terminal.say(f"Made {outcome.made} shards in {terminal.duration(outcome.seconds)}{kept}: {root}")
+        terminal.say(f"Look at it:  spadmnist inspect {quoted(root)} --plot {quoted(f'{root.name}.png')}")
+
+
+@cli.verb(20, short_help="Begin: a config and a sensor, or a plan for a bench, every line explained.")
+@click.argument("folder", type=options.Place())
+@click.option("--images", type=click.Path(path_type=Path), metavar="DIR", help="A folder of pictures of your own.")
+@click.option(
+    "--sensor",
+    type=click.Choice(["spad23", "spad512", "spad_mnist"]),
+    default="spad_mnist",
+    help="The sensor to begin with.  [default: spad_mnist]",
+)
+@click.option("--measurement", is_flag=True, help="A plan of captures instead, which `import -o FOLDER` fills.")
+@options.as_json
+def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_json: bool) -> None:
+    """Write FOLDER/config.yaml and FOLDER/sensor.yaml, which run as they are, or FOLDER/measurement.yaml.
+
+    Beside them lie their JSON Schemas, with which an editor completes and checks. A config for pictures has gamma:
+    srgb. Light is linear and pictures are not: a value of half of white then gets 21 % of white's photons.
+
+    \b
+    spadmnist init my --images photos --sensor spad512
+    spadmnist generate my/config.yaml -o my_dataset
+    spadmnist init bench --sensor spad512 --measurement
+    """
+    from .. import starting
+    from ..errors import SpadError
+
+    if measurement and images is not None:
+        raise SpadError("--images: belongs to a config, and a plan of captures has none; leave it or --measurement out")
+    files = starting.measurement(folder, sensor) if measurement else starting.dataset(folder, sensor, images)
+    written = starting.write(folder, files)
+    if as_json:
+        terminal.print_json({"files": [str(path) for path in written]})
+        return
+    for path in written:
+        terminal.print_line(str(path))
+    last = quoted(written[-1])
+    if measurement:
+        terminal.say(f"Then fill it:  spadmnist import FILE... -o {quoted(folder)}")
+    else:
+        terminal.say(f"What it costs:  spadmnist generate {last} --dry-run")
+        terminal.say(f"Then:  spadmnist generate {last} -o {quoted(f'{folder.resolve().name}_dataset')}")
+
+
+@cli.verb(40, "reconstruct", short_help="Make flux images of a dataset or a measurement.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    metavar="METHOD",
+    help="A method (repeatable).  [default: all that the readouts allow]",
+)
+@click.option(
+    "--output",
+    "-o",
+    type=options.Place(),
+    metavar="FOLDER",
+    help="Of a measurement: folder of its images.  [default: NAME-flux, here]",
+)
+@click.option(
+    "--sensor",
+    type=click.Path(path_type=Path),
+    metavar="SENSOR",
+    help="Of a measurement: whose PDP and dead time the methods are told.  [default: 1, and 0 s]",
+)
+@options.crop
+@options.jobs
+@options.plugin
+@options.as_json
+def reconstruct_(
+    dataset: Path,
+    methods: tuple[str, ...],
+    output: Path | None,
+    sensor: Path | None,
+    crop: str | None,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Make flux images from the raw streams of DATASET, and add them to it; or from the captures of MEASUREMENT, and
+    write them to a folder: <capture>.<method>.npy, and sheet.png.
+
+    The dataset is then, byte for byte, what `generate` makes of a config that lists these methods. A measurement's
+    images are photons/s where SENSOR (a sensor file, or a config) is given, otherwise detections/s.
+
+    \b
+    spadmnist reconstruct out --method inter_photon
+    spadmnist reconstruct lab --sensor sensor.yaml -o flux
+    """
+    from .. import factory, measurement, report
+    from .. import reconstruct as library
+    from ..errors import SpadError
+
+    options.load_plugins(plugin_files)
+    for name in methods:
+        try:
+            library.find(name)
+        except KeyError as error:
+            raise SpadError(f"--method: {error.args[0]}") from None
+    if measurement.is_measurement(dataset):
+        if jobs is not None:
+            raise SpadError(
+                f"--jobs: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
+            )
+        if crop is not None and sensor is None:
+            raise SpadError("--crop: is the part of a sensor; give --sensor as well, or leave it out")
+        model = None if sensor is None else options.model_of(sensor, crop)
+        _reconstruct_measurement(dataset, methods, output, model, as_json)
+        return
+    for option, given in (("--output", output), ("--sensor", sensor), ("--crop", crop)):
+        if given is not None:
+            raise SpadError(
+                f"{option}: belongs to a measurement, and {dataset} is none; a dataset keeps its images and knows its "
+                "sensor: leave it out"
+            )
+    with terminal.progress() as progress:
+        added, manifest = factory.add_reconstructions(dataset, methods, jobs or processors(), progress)
+    if as_json:
+        terminal.print_json({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
+        return
+    if added:
+        terminal.say(f"Added to {dataset}: {', '.join(added)}")
+    else:
+        terminal.say(f"{dataset} holds these reconstructions already; nothing was done.")
+    terminal.say("")
+    terminal.print_lines(report.level_table(manifest))
+
+
+def _reconstruct_measurement(
+    path: Path, methods: tuple[str, ...], output: Path | None, model: Sensor | None, as_json: bool
+) -> None:
+    from .. import fluxes, measurement, report
+
+    opened = measurement.open(path)
+    folder = output if output is not None else fluxes.place_of(opened)
+    fluxes.check_place(folder)
+    with terminal.progress() as progress:
+        found = fluxes.of_measurement(opened, methods, model, progress)
+    fluxes.write(found, folder)
+    for note in found.notes:
+        terminal.say(f"Note: {note}")
+    rows = found.rows()
+    if as_json:
+        answer = {"measurement": opened.name, "folder": str(folder), "images": rows, "notes": found.notes}
+        terminal.print_json(answer)
+        return
+    terminal.print_lines(report.flux_table(rows))
+    terminal.say("")
+    terminal.say(f"Made {len(rows)} image{'s' if len(rows) > 1 else ''}: {folder}. Look at {folder / fluxes.SHEET}")
+
+
+@cli.verb(70, short_help="Compare every byte with the manifest; repair.")
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--repair", is_flag=True, help="Make exactly the damaged files again.")
+@click.option(
+    "--images-dir",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="For --repair: where the images lie, if the dataset's own copy is damaged.",
+)
+@options.jobs
+@options.plugin
+@options.as_json
+def verify(
+    dataset: Path,
+    repair: bool,
+    images_dir: Path | None,
+    jobs: int | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Compare every byte of DATASET with its manifest; name each file that is changed, missing or extra.
+
+    Exit status 0: as it was made; 1: damage was found (and not repaired).
+    """
+    from .. import verify as library
+
+    options.load_plugins(plugin_files)
+    with terminal.progress() as progress:
+        damage = library.verify(dataset, progress)
+        left, did = damage, []
+        if repair:
+            did = library.repair(dataset, damage, jobs or processors(), images_dir, progress)
+            left = library.verify(dataset, progress) if damage else damage
+    if as_json:
+        found = {
+            "changed": damage.changed,
+            "missing": damage.missing,
+            "extra": damage.extra,
+            "files": damage.files,
+        }
+        terminal.print_json({"dataset": str(dataset), **found, "repaired": did, "intact": not left})
+    else:
+        for kind in ("changed", "missing", "extra"):
+            for name in getattr(damage, kind):
+                terminal.print_line(f"{kind}: {name}")
+        for line in did:
+            terminal.print_line(line)
+        if not damage:
+            terminal.print_line(f"{dataset}: all {damage.files} files are as they were made")
+        elif not left:
+            terminal.print_line(f"{dataset}: repaired; all {left.files} files are as they were made")
+        else:
+            again = f"spadmnist verify {quoted(dataset)} --repair makes them again"
+            terminal.print_line(f"{dataset}: {_count(damage)} not as made; {again}")
+    if left:
+        sys.exit(1)
+
+
+def _count(damage: Any) -> str:
+    n = len(damage.changed) + len(damage.missing) + len(damage.extra)
+    return f"{n} file is" if n == 1 else f"{n} files are"

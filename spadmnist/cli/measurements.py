@@ -1,0 +1,313 @@
+"""Verbs that bring measurements in and out, show them and simulate their twins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..foreign import quoted
+from . import _options as options
+from . import _terminal as terminal
+from ._group import cli
+
+
+@cli.verb(50, short_help="Say and show what a dataset or a measurement holds.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
+@click.option(
+    "--plot",
+    type=options.Place(),
+    metavar="FILE.png",
+    help="Draw a sheet: images in all readouts and methods, or maps, rates and intervals of captures.",
+)
+@options.as_json
+def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
+    """Say what DATASET holds: per light level detections, empty and saturated pixels, bytes, bits per detection; or
+    MEASUREMENT: per capture detections, rates, empty, hot and dead pixels, intervals.
+
+    \b
+    spadmnist inspect out
+    spadmnist inspect out --plot sheet.png
+    """
+    from .. import dataset as library
+    from .. import measurement, report
+    from ..errors import SpadError
+
+    if plot is not None and plot.suffix.lower() != ".png":
+        raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
+    if measurement.is_measurement(dataset):
+        _inspect_measurement(dataset, plot, as_json)
+        return
+    manifest = library.intact_manifest(dataset)
+    if as_json:
+        terminal.print_json(
+            {
+                "levels": report.level_rows(manifest),
+                "normalisation": manifest["normalisation"],
+                "config": manifest["config"],
+            }
+        )
+    else:
+        terminal.print_lines(report.level_table(manifest))
+    if plot is not None:
+        with options.writing(plot):
+            report.sheet(library.open(dataset), plot, places=report.places_of(manifest, dataset))
+        terminal.say(f"Drawn: {plot}")
+
+
+def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
+    from .. import measurement, report
+
+    opened = measurement.open(path, planned=True)
+    looks = report.looks(opened, plot is not None)
+    if as_json:
+        missing = {"missing": list(opened.missing)} if opened.missing else {}
+        terminal.print_json({"measurement": opened.name, "captures": [one.numbers for one in looks], **missing})
+    else:
+        terminal.print_lines(report.capture_table(opened, looks))
+    if opened.missing:
+        terminal.say(f"Not recorded yet: {', '.join(opened.missing)}. Next:  spadmnist import FILE -o {quoted(path)}")
+    if plot is not None:
+        with options.writing(plot):
+            report.capture_sheet(opened, looks, plot)
+        terminal.say(f"Drawn: {plot}")
+
+
+@cli.verb(60, short_help="Make the model's twin of a measurement.")
+@click.argument("sensor", type=click.Path(path_type=Path))
+@click.argument("measurement", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=options.Place(),
+    metavar="OUT",
+    required=True,
+    help="Folder of the twin, which is a measurement too.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the draws.  [default: 0]"
+)
+@options.crop
+@options.plugin
+@options.as_json
+def simulate(
+    sensor: Path,
+    measurement: Path,
+    output: Path,
+    seed: int,
+    crop: str | None,
+    plugin_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Simulate the captures of MEASUREMENT as SENSOR (a sensor file, or a config) would have recorded them.
+
+    \b
+    spadmnist simulate sensor.yaml lab -o twin
+    spadmnist inspect twin --plot twin.png
+    """
+    from .. import measurement as library
+    from .. import twin
+
+    options.load_plugins(plugin_files)
+    model = options.model_of(sensor, crop)
+    opened = library.open(measurement, planned=True)
+    with terminal.progress() as progress:
+        twin.simulate(model, opened, output, seed, progress)
+    if as_json:
+        terminal.print_json({"measurement": str(output), "captures": [c.id for c in opened.captures]})
+    else:
+        terminal.say(f"Simulated {len(opened.captures)} captures: {output}")
+        terminal.say(f"Look at them:  spadmnist inspect {quoted(output)} --plot {quoted(f'{output.name}.png')}")
+
+
+class _ImportCommand(click.Command):
+    """Its options are those of `import_options.Said`, made of that table when they are asked for."""
+
+    def get_params(self, context: click.Context) -> list[click.Parameter]:
+        from .. import import_options
+
+        if all(param.name != "modality" for param in self.params):
+            declared = import_options.options().items()
+            self.params[-1:-1] = [_import_option(name, one, import_options.about(one)) for name, one in declared]
+        return super().get_params(context)
+
+
+def _import_option(name: str, declared: Any, about: str) -> click.Option:
+    words = [f"--{word.replace('_', '-')}" for word in (name, *declared.names)]
+    if declared.flag:
+        return click.Option([*words, name], is_flag=True, help=about)
+    kind: Any = click.STRING
+    if declared.whole is not None:
+        kind = click.IntRange(*declared.whole)
+    elif declared.choices:
+        kind = click.Choice(declared.choices)
+    elif declared.path:
+        kind = click.Path(path_type=Path)
+    metavar = declared.metavar or ("N" if declared.whole else "TIME" if declared.unit == "s" else None)
+    return click.Option([*words, name], type=kind, default=None, metavar=metavar, help=about)
+
+
+@cli.verb(80, "import", cls=_ImportCommand, short_help="Make a measurement of files that other programs wrote.")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
+@click.option("--output", "-o", type=options.Place(), metavar="MEASUREMENT", help="Its folder.")
+@click.option("--name", metavar="NAME", help="Of the measurement.  [default: that of the file or folder]")
+@click.option(
+    "--light",
+    "lights",
+    multiple=True,
+    metavar="LIGHT",
+    help=(
+        'What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2", or a scene, '
+        '"image:chart.npy 80 mlux". Once for all files, or once for each.'
+    ),
+)
+@click.option(
+    "--capture", "ids", multiple=True, metavar="ID", help="Of a plan: the capture that a file is, once for each file."
+)
+@options.as_json
+def import_(
+    files: tuple[Path, ...],
+    output: Path | None,
+    name: str | None,
+    lights: tuple[str, ...],
+    ids: tuple[str, ...],
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Make a measurement of FILES, each a capture that is named as its file.
+
+    The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
+    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits; counts with --bits),
+    CSV of pixel and time. What no file says is asked for. Times are written with their unit: --exposure "100 ms".
+
+    Where MEASUREMENT is a plan, a measurement.yaml whose captures have no files yet, FILES become its captures: by
+    name, by --capture, or in order. Light, clock and pixels are then the plan's, and a contradiction is an error.
+
+    \b
+    spadmnist import t2.ptu -o lab --light free
+    spadmnist import dark.npy flat.npy -o lab --frame-time "10 us" --frame-period "10 us" \\
+        --light dark --light "500 nm 75.67 nW/cm^2"
+    """
+    from ..errors import SpadError
+    from ..importers import Said, light
+    from ..importers.captures import import_files
+
+    if output is None:
+        raise SpadError("--output: name the folder of the measurement that is made, for example -o lab")
+    said = Said.of(**given)
+    shone = [light(text, said.relative_uncertainty) for text in lights]
+    with terminal.progress() as progress:
+        made = import_files(files, output, said, shone, name, progress, ids)
+    if as_json:
+        captures = [one.as_data() for one in made.took]
+        told = {"measurement": str(made.folder), "captures": captures, "notes": made.notes, "missing": made.missing}
+        terminal.print_json(told)
+    else:
+        for one in made.took:
+            terminal.print_lines(one.text())
+    for note in made.notes:
+        terminal.say(f"Note: {note}.")
+    if made.missing:
+        terminal.say(f"Still missing: {', '.join(made.missing)}. Next:  spadmnist import FILE -o {quoted(made.folder)}")
+    elif not as_json:
+        terminal.say(f"Made: {made.folder}. Look at it:  spadmnist inspect {quoted(made.folder)}")
+
+
+@cli.verb(90, short_help="Write images or captures to files that other programs read.")
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    type=options.Place(),
+    metavar="OUT",
+    help="A folder, or a file for one capture, or (.npz) for one level and split.",
+)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["photon-hdf5", "hdf5", "npz", "npy", "png", "parquet", "webdataset"]),
+    help="Captures: photon-hdf5 (stamps), npy (frames), hdf5, npz. Images: npz, png (fluxes), parquet, webdataset.",
+)
+@click.option("--capture", "ids", multiple=True, metavar="ID", help="Only this capture (repeatable).")
+@click.option("--lux", "levels", multiple=True, metavar="LEVEL", help="Of images: only this light level (repeatable).")
+@click.option("--split", "splits", multiple=True, metavar="SPLIT", help="Of images: only this split (repeatable).")
+@click.option("--limit", type=click.IntRange(1), metavar="N", help="Of images: the first N of each level and split.")
+@click.option("--method", "methods", multiple=True, metavar="METHOD", help="Of images: only this flux (repeatable).")
+@click.option(
+    "--readout",
+    "readouts",
+    multiple=True,
+    type=click.Choice(["tr", "str", "qis", "counts"]),
+    help="Of a dataset: only this readout (of images repeatable).",
+)
+@options.as_json
+def export(
+    dataset: Path,
+    output: Path | None,
+    format_: str | None,
+    ids: tuple[str, ...],
+    levels: tuple[str, ...],
+    splits: tuple[str, ...],
+    limit: int | None,
+    methods: tuple[str, ...],
+    readouts: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Write the captures of MEASUREMENT (or of a dataset of uniform images), or the images of DATASET, to OUT.
+
+    Files of captures say how each was recorded, so that `import` gives it back as it was; .npy alone does not. Of
+    images, OUT holds <level>/<split>/ as the dataset does, a row an image; parquet has a card and croissant.json.
+
+    \b
+    spadmnist export lab -o dark.hdf5 --format photon-hdf5 --capture dark
+    spadmnist export out -o rows --format parquet --lux "2560 mlux"
+    """
+    from .. import exporters, image_exporters
+    from .. import measurement as library
+    from ..errors import SpadError
+
+    if output is None or format_ is None:
+        raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
+    choice = image_exporters.Choice(levels, splits, limit, methods, readouts)
+    if image_exporters.is_of_images(dataset, format_, choice):
+        if ids:
+            raise SpadError(f"--capture: belongs to a measurement, and these are images of {dataset}: leave it out")
+        if format_ == "png" and readouts:
+            raise SpadError("--readout: png holds flux images alone; leave it out, or take npz, parquet or webdataset")
+        with terminal.progress() as progress:
+            paths = image_exporters.export(dataset, output, format_, choice, progress)
+    else:
+        _check_captures(dataset, format_, choice)
+        opened = library.open(dataset, readouts[0] if readouts else None)
+        with terminal.progress() as progress:
+            paths = exporters.export(opened, output, format_, ids, progress)
+        if opened.layout.positions is not None:
+            terminal.say(
+                "Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv."
+            )
+        if any(capture.light.scene for capture in opened.captures if not ids or capture.id in ids):
+            terminal.say(
+                "Note: these files do not hold the scene that was seen; to import them again, give --light "
+                "image:FILE.npy."
+            )
+    if as_json:
+        terminal.print_json({"files": [str(path) for path in paths]})
+        return
+    for path in paths:
+        terminal.print_line(str(path))
+
+
+def _check_captures(source: Path, format_: str, choice: Any) -> None:
+    """Refuse what only images of a dataset have."""
+    from ..errors import SpadError
+    from ..exporters import Target
+
+    if format_ not in Target.every:
+        others = ", ".join(Target.every)
+        raise SpadError(f"--format {format_}: holds images of a dataset, and {source} is none; take one of {others}")
+    if choice.named or len(choice.readouts) > 1:
+        raise SpadError(
+            f"--lux, --split, --limit, --method and several --readout: choose images of a dataset, and as {format_} "
+            f"{source} gives captures; leave them out"
+        )
