@@ -203,12 +203,13 @@ def pooled_score(number: float, law: Pairs, share: float) -> float:
     score = float(gamma_score(number + share - 0.5, law))
     if mean >= _SPARSE:
         return score
-    places = np.array([number - 0.5 if number > 0 else -np.inf, number + 0.5])
-    shape = 4.0 * variance**3 / third**2
-    steps = np.maximum(shape + (places - mean) * 2.0 * variance / third, 0.0)  # from where the law begins, in its scale
-    weights = np.array([1.0 - share, share])
-    lower, upper = (float(weights @ tail(shape, steps)) for tail in (special.gammainc, special.gammaincc))
-    exact = float(_from_tails(np.asarray(lower), np.asarray(upper)))
+    shape, scale = 4.0 * variance**3 / third**2, 2.0 * variance / third
+    # from where the law begins, in its scale; plain numbers, for this is called for every cell
+    upto = max(shape + (number + 0.5 - mean) * scale, 0.0)
+    from_ = max(shape + (number - 0.5 - mean) * scale, 0.0) if number > 0 else 0.0
+    lower = float((1.0 - share) * special.gammainc(shape, from_) + share * special.gammainc(shape, upto))
+    upper = float((1.0 - share) * special.gammaincc(shape, from_) + share * special.gammaincc(shape, upto))
+    exact = float(special.ndtri(lower) if lower < upper else -special.ndtri(upper))
     return exact if abs(exact) < 6.7 else math.copysign(max(abs(score), 6.7), exact)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from . import Recording, Statistic, Summary
-from ._counting import Surplus, of_detections, of_pairs, span, tick_of
-from ._walk import RANKS, SIZES, crowd_edges, gaps, spacing_edges, walk
+from ._counting import of_detections, per_cent, span, tick_of
+from ._scores import Pairs, number_at, pooled_score, shares
+from ._walk import RANKS, SIZES, crowd_edges, crowd_scatter, gaps, spacing_edges, walk
 
 
 class Spacing(Statistic):
@@ -46,10 +47,11 @@ class Crowds(Statistic):
     """Crowds of 3, 5, 9, 17 and 33 successive detections of the whole array, by the time from the first to the last.
 
     Only those that are so close together that in steady light of the same total less than one detection in 10,000,
-    1000, 100 or 10 ends such a crowd. Each cell is the normal score of their number beside that of steady light.
-    Crowds overlap, and those of steady light scatter more than independent numbers, up to three times as much. Too few:
-    a readout that falls behind where many come, as it serves one at a time from a queue that is soon full; too many:
-    bursts, or light that fluctuates.
+    1000, 100 or 10 ends such a crowd. Each cell is the normal score of their number. Its law is that of steady light:
+    crowds overlap, so they come in clumps of geometric size, and their number scatters up to three times as much as
+    independent ones; a gamma law of the same mean, variance and third cumulant describes it. Too few: a readout that
+    falls behind where many come, as it serves one at a time from a queue that is soon full; too many: bursts, or light
+    that fluctuates.
     """
 
     modalities = ("tr",)
@@ -62,15 +64,28 @@ class Crowds(Statistic):
             return None
         tick = tick_of(recording)
         edges, chance = crowd_edges(recording)
-        found = Surplus(walk(recording).crowds.ravel().astype(np.float64), chance.ravel(), chance.ravel())
+        numbers = walk(recording).crowds.ravel().astype(np.float64)
+        ratio = np.maximum(crowd_scatter().ravel(), 1.0)
+        mean = np.maximum(chance.ravel(), 1e-6)  # a little above 0, for where no crowds are possible
+        # clumps of geometric size: E S^2 / E S = ratio, E S^3 / E S = 1.5 ratio^2 - 0.5
+        laws = [Pairs(*law) for law in zip(mean, ratio * mean, (1.5 * ratio**2 - 0.5) * mean, strict=True)]
+        share = shares(np.append(recording.totals, len(mean)), len(mean))
+        scores = [pooled_score(*each) for each in zip(numbers, laws, share, strict=True)]
 
         def where(cell: int) -> str:
             rank, bin = divmod(cell, edges.shape[1])
             low, high = (edges[rank, bin - 1] if bin else 0) * tick, edges[rank, bin] * tick
             return f"{RANKS[rank] + 1} successive detections of the whole array within {span(low, high)}"
 
-        size = of_pairs(found, float(recording.totals.sum()))
-        return Summary(found.scores(recording.totals), "normal", where, size)
+        total = max(float(recording.totals.sum()), 1.0)
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            law = laws[cell]
+            usual = number_at(expected, lambda number, part: pooled_score(number, law, part), float(law.mean))
+            found, usual = ((float(number) - float(law.mean)) / total for number in (numbers[cell], usual))
+            return f"{per_cent(found)} of detections beyond steady light, {per_cent(usual)} expected", found - usual
+
+        return Summary(np.array(scores), "normal", where, size)
 
 
 class Multiplicity(Statistic):
