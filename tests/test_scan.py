@@ -17,6 +17,7 @@ from spadmnist.inference.candidates import first_strengths
 from spadmnist.inference.coordinates import Coordinate
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
 from spadmnist.inference.gauss_newton import Fit
+from spadmnist.inference.laws import Law
 from spadmnist.inference.light_levels import levels_about
 from spadmnist.inference.map_trials import candidate_maps
 from spadmnist.inference.model_path import begin, edge_errors, open_ends, sharpen
@@ -387,7 +388,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0, law="normal")
+    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law())
     now, there = (
         SimpleNamespace(nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)})
         for x, y in ((1.0, 1.1), (3.0, 1.0))

@@ -9,6 +9,7 @@ import pytest
 from tinylab import bench_of
 
 from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.laws import Poisson
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.shifts import beyond_noise, mean_shift
 from spadmnist.inference.signature import Signature, _signature
@@ -39,7 +40,7 @@ def learnt(law: str, values: np.ndarray, totals: np.ndarray) -> Null:
 
 def shift_of(null: Null, values: np.ndarray, base: np.ndarray, few: int) -> np.ndarray:
     expected = null.expected(1000.0)[0]
-    spread = np.maximum(null.spread_at(expected), 0.3 if null.law == "poisson" else 1e-30)
+    spread = np.maximum(null.spread_at(expected), 0.3 if isinstance(null.law, Poisson) else 1e-30)
     shift, left, beta = mean_shift(values - expected, base[:few] - expected, spread)
     chance = left + 3.0 * (1 - beta) / null.recordings
     return beyond_noise(shift, spread, chance, null, expected, few, True)

@@ -20,7 +20,7 @@ from .candidates import with_values
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
 from .light_levels import CaptureNull, central_level, law_of, of_mean, own_totals, totals_residuals
-from .null_distribution import Judgement, Null, learn, powers_of, replicate_residuals, scatter_of
+from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
 from .replicates import TOTALS, CaptureReplicates, Cell, Model, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
@@ -72,9 +72,7 @@ class Evaluation:
     @property
     def exact(self) -> list[Cell]:
         """Statistics of law "exact" whose measured value is not that of the replicates."""
-        return [
-            cell for cell, found in self.judgements.items() if self.nulls[cell].law == "exact" and found.p_value < 0.5
-        ]
+        return [cell for cell, found in self.judgements.items() if self.nulls[cell].law.exact and found.p_value < 0.5]
 
     @property
     def fluctuates(self) -> bool:
@@ -176,7 +174,7 @@ def _evaluate(
             cell = id, name
             evaluation.nulls[cell] = null
             evaluation.judgements[cell] = judged = null.judge(summary.values, replicates.seen[id].total)
-            if null.law != "exact":
+            if not null.law.exact:
                 evaluation.residuals[cell] = judged.residuals
                 evaluation.replicate_residuals[cell] = replicate_residuals(null, made, made.values[name])
     evaluation.residuals[TOTALS] = totals_residuals(
@@ -236,11 +234,9 @@ def log_likelihood_ratio(
             out += float(z @ z - there @ there)
             continue
         null, new = evaluation.nulls[cell], other.nulls[cell]
-        if null.law == "exponential":  # the scatter of a power is its mean
-            powers, relative = powers_of(z * null.factor), powers_of(there * new.factor)
-            fall, wider = 2 * (powers - relative), np.log(powers / relative)
-        else:
-            fall, wider = z**2 - there**2, np.log(new.breadth / null.breadth)
+        factors = null.factor, new.factor
+        fall = null.law.fall(z, there, factors)
+        wider = null.law.wider(z, there, (null.breadth, new.breadth), factors)
         # a cell that never varies has no scatter: the log of its ratio is bounded
         gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
         if fluctuates and template is not None:

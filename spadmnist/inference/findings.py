@@ -70,7 +70,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation) -> list[
     out: list[Trace] = []
     for block in failing(block_checks(replicates, start, start.residuals)):
         id, name = block.cell
-        if id == "" or block.cell not in last.nulls or start.nulls[block.cell].law == "exact":
+        if id == "" or block.cell not in last.nulls or start.nulls[block.cell].law.exact:
             continue
         if any(t.statistic == name for t in out):
             continue

@@ -19,7 +19,7 @@ from .. import twin
 from ..effects import Conditions
 from ..recording import Capture
 from ..sensor import Sensor
-from .null_distribution import poisson_scores
+from .laws import poisson_scores
 from .replicates import InTheDark, ReducedCapture, Replicates
 
 if TYPE_CHECKING:

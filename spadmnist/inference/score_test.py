@@ -19,7 +19,6 @@ from . import map_fits, pixel_maps
 from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, stacked
-from .null_distribution import scores_of_powers
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, signatures, template_of
 from .spectral_lines import Line
@@ -36,7 +35,6 @@ _SMALL, _FOLDS = 32, 4  # cells of a statistic whose covariance can be estimated
 _LEAST_VARIANCE = 0.3  # of a cell
 # the scatter beyond which the cells of a signature are dependent; the least degrees of freedom then
 _TOGETHER, _FEWEST = 1.25, 3.0
-_EVENTS = 25.0  # events in a cell that is nearly normal
 # safety factor on the variance of independent squares; the ratio to it from which on values are dependent
 _SURER, _JOINED = 1.1, 1.6
 _Weigh = Callable[[np.ndarray], np.ndarray]  # template (cells,) -> weights (cells,)
@@ -259,8 +257,8 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     for key in keys:
         whole, *parts = _weightings(evaluation, key)
         t, null = template[key], evaluation.nulls.get(key)
-        if null is not None and null.law == "exponential":
-            t = scores_of_powers(t)
+        if null is not None:
+            t = null.law.scores(t)
         w = whole(t)
         for part, weigh in zip(_folds(many), parts, strict=True):
             own[part] += evaluation.replicate_residuals[key][part] @ weigh(t)
@@ -281,10 +279,9 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
 def _nearly_normal(replicates: Replicates, evaluation: Evaluation, key: Cell) -> np.ndarray:
     """Which cells are counts of so many events that they are nearly normal, (cells,) bool."""
     null = evaluation.nulls.get(key)
-    if null is None or null.law != "poisson":
+    if null is None:
         return np.zeros(len(evaluation.residuals[key]), bool)
-    # the number of independent events is that of the bursts
-    return np.asarray(null.expected(replicates.seen[key[0]].total)[0] >= _EVENTS * max(null.factor, 1.0) ** 2)
+    return null.law.nearly_normal(null.expected(replicates.seen[key[0]].total)[0], null.factor)
 
 
 def _folds(recordings: int) -> list[slice]:

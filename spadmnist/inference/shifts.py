@@ -8,11 +8,10 @@ import math
 import numpy as np
 from scipy import stats
 
-from .null_distribution import Null, poisson_scores
+from .null_distribution import Null
 
 # p-values: of the noise of a whole block, and of any of its cells by itself; a shift is beyond them
 _CHANCE, _CHANCE_CELL = 1e-4, 4e-8
-_FEW_COUNTS = 20.0  # counts of a cell in all the replicates together, beyond which they are normal enough
 _LEAST_LINE = 100.0  # in variances: the least square of a shift in one cell of a spectrum
 
 
@@ -54,7 +53,7 @@ def beyond_noise(
     most = 1 / few + 3.0 / null.recordings  # the variance of replicates with no common noise
     square = (shift / spread) ** 2
     noise = max(noise, 1e-12)
-    if null.law == "exponential":
+    if null.law.spectrum:
         return np.where(square > noise * _line_beyond(few, null.recordings, n), shift, 0.0)
     if not sure:
         _, by_own, _, one = _beyond(n, 1)
@@ -68,10 +67,7 @@ def beyond_noise(
     if mean > noise * by_own or mean > most * by_null:
         return shift
     out = (square > noise * one_by_own) | (square > most * one_by_null)
-    if null.law == "poisson":  # a count or two in cells that are mostly empty
-        counts = few * np.maximum(expected, 0.5 / null.recordings)
-        score = poisson_scores(np.maximum(counts + few * shift, 0.0), counts) / math.sqrt(1 + few / null.recordings)
-        out &= (counts > _FEW_COUNTS) | (np.abs(score) > -stats.norm.ppf(_CHANCE / n))
+    out &= null.law.resolved(shift, expected, few, null.recordings, _CHANCE)
     return np.where(out, shift, 0.0)
 
 

@@ -274,7 +274,7 @@ def odd_and_even(replicates: Replicates, evaluation: Evaluation, up: Signature, 
     powers = {
         cell: evaluation.usual(cell, replicates.seen[cell[0]].total)[0]
         for cell, null in evaluation.nulls.items()
-        if null.law == "exponential"
+        if null.law.spectrum
     }
     return Signature.both(up, down, powers, few)
 
@@ -342,11 +342,7 @@ def template_of(replicates: Replicates, evaluation: Evaluation, signature: Signa
             out[cell] = np.zeros(len(evaluation.residuals[cell]))
             continue
         expected, _ = evaluation.usual(cell, replicates.seen[cell[0]].total)
-        scale = null.spread_at(expected)
-        if null.law == "exponential":
-            out[cell] = shift / np.maximum(expected, 1e-9)
-        else:
-            out[cell] = shift / np.maximum(scale, 0.5 if null.law == "poisson" else 1e-30)
+        out[cell] = null.law.template(shift, expected, null.spread, null.factor)
     return out
 
 

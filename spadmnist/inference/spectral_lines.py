@@ -79,7 +79,7 @@ def spectral_lines(replicates: Replicates, evaluation: Evaluation) -> list[Line]
     """
     spectra = []
     for (id, name), z in evaluation.residuals.items():
-        if (id, name) == TOTALS or evaluation.nulls[id, name].law != "exponential":
+        if (id, name) == TOTALS or not evaluation.nulls[id, name].law.spectrum:
             continue
         summary = replicates.seen[id].summaries[name]
         if summary.axis is None or len(z) < 3:

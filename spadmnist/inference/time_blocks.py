@@ -16,6 +16,7 @@ from ..statistics import Summary
 from . import held_out, map_fits
 from .error_budget import Rung
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95
+from .laws import law_of
 from .replicates import Cell, Replicates, halves_of
 from .signature import residuals_at, signatures
 
@@ -123,7 +124,7 @@ def _slopes(
             if here is None:
                 continue
             out[name, statistic] = new = np.zeros((len(here.values), whole.shape[1]))
-            if here.law != "exponential":
+            if not law_of(here.law, here.scale is not None).spectrum:
                 mine, its = _same_places(here, there)
                 share = half.seen[name].total / max(replicates.seen[id].total, 1.0)
                 new[mine] = whole[its] * math.sqrt(share)

@@ -125,9 +125,7 @@ def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Ma
     template = template_of(replicates, evaluation, one.signature.at(one.times))
     size = math.sqrt(sum(float(t @ t) for t in template.values()))
     strengths = [d for d in one.candidate.strengths if d.key in given]
-    spectra = [
-        t for cell, t in template.items() if cell in evaluation.nulls and evaluation.nulls[cell].law == "exponential"
-    ]
+    spectra = [t for cell, t in template.items() if cell in evaluation.nulls and evaluation.nulls[cell].law.spectrum]
     if any(float(np.max(t**2)) > _LINE * size**2 for t in spectra if t.size):
         return 1.0, 1.0  # a line is significant by itself, and no gradient leads to it
     if size > STRONG or one.signature.even or not strengths or any(is_edge(d) for d in strengths):

@@ -1,0 +1,349 @@
+"""The laws of cells: how each one scatters about its expectation if the model is right.
+
+A statistic names its law (`Summary.law`); everything that depends on it is a method here. A law is chosen by `law_of`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from scipy import special, stats
+
+_LEAST = 1e-300  # in place of 0 in a denominator or a tail probability
+_LEAST_RATIO = 1e-3  # of a power relative to its mean: a smaller one is rounded up to this
+_LEAST_POWER = 0.3  # of the mean of a power in a spectrum: the least that a shift may leave
+_MANY = 200.0  # expected counts beyond which Anscombe's residual is normal enough
+_FEW = 20.0  # expected counts: below it, a cell does not determine its own dependence on the light
+_EVENTS = 25.0  # expected independent events from which on a count is nearly normal
+_LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion
+_LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged
+_LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
+
+
+class Law:
+    """A normal law with a scatter of its own for each cell, which the replicates show.
+
+    The base of the others. Everywhere `expected` and `spread` are (cells,) or (captures, cells), in the unit of the
+    summary; n is the number of replicates.
+    """
+
+    exact: ClassVar[bool] = False  # the cells have one possible value
+    spectrum: ClassVar[bool] = False  # the cells are powers at frequencies
+    terms: ClassVar[int] = 3  # of the regression on the total of the capture
+
+    def least(self, n: int) -> float:
+        """The least expectation of a cell."""
+        return -math.inf
+
+    def shifted(self, expected: np.ndarray, shift: np.ndarray, n: int) -> np.ndarray:
+        """The expectation of cells that are shifted, (cells,)."""
+        return np.asarray(expected + shift)
+
+    def regression(self, values: np.ndarray, x: np.ndarray, coefficients: np.ndarray) -> None:
+        """Correct the coefficients of the regression of the replicates on x, in place."""
+
+    def spread(self, values: np.ndarray, fitted: np.ndarray, terms: int, scale: np.ndarray | None) -> np.ndarray:
+        """The scatter of the replicates about their regression, (cells,)."""
+        sample = np.sqrt(np.sum((values - fitted) ** 2, axis=0) / max(1, len(values) - terms))
+        # a cell that never varies has no scatter: the rounding of its value takes that place
+        return np.asarray(np.maximum(sample, 1e-12 * np.maximum(np.abs(fitted).max(axis=0), 1e-30)))
+
+    def factor(self, z: np.ndarray) -> float:
+        """The factor by which standardized residuals of the replicates, (replicates, cells), are too large."""
+        return 1.0
+
+    def standardized(
+        self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int
+    ) -> np.ndarray:
+        """Residuals that are standard normal if the model is right, in the shape of `values`.
+
+        Args:
+            leverage: variance of the expectation relative to the scatter; negative for the residuals of the regression
+                itself.
+        """
+        return _normal_of_t(_in_scatters(values, expected, spread, leverage), max(1, n - 3))
+
+    def of_their_own(
+        self, values: np.ndarray, fitted: np.ndarray, spread: np.ndarray, hat: np.ndarray, terms: int
+    ) -> np.ndarray:
+        """The residuals of the replicates, each as if it were a new one, (replicates, cells).
+
+        The regression follows each replicate; its influence on its own expectation is removed.
+        """
+        n = len(values)
+        inner = (values - fitted) / (spread * np.sqrt(np.maximum(1 - hat, 1e-6)))
+        freedom = max(1, n - terms - 1)
+        outer = inner * np.sqrt(freedom / np.maximum(n - terms - inner**2, 1e-9))
+        return _normal_of_t(outer, freedom)
+
+    def spread_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """The standard deviation of the cells at an expectation, (cells,)."""
+        return spread * factor
+
+    def scatter_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """The same, never too small to divide by."""
+        return np.maximum(self.spread_at(expected, spread, factor), _LEAST_FREE)
+
+    def variance_of_squares(self, variance: float, cells: int) -> float:
+        """The variance of the mean squared residual, from that of the replicates."""
+        return variance
+
+    def breadth(self, spread: np.ndarray, factor: float) -> np.ndarray | float:
+        """The scatter of the cells, in units that another model shares: one number for all, or (cells,)."""
+        return np.asarray(spread)
+
+    def template(self, shift: np.ndarray, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """A shift in standard deviations, (cells,)."""
+        return np.asarray(shift / np.maximum(self.spread_at(expected, spread, factor), _LEAST_FREE))
+
+    def scores(self, template: np.ndarray) -> np.ndarray:
+        """The rise of the normal scores that a template means, (cells,)."""
+        return template
+
+    def fall(self, z: np.ndarray, other: np.ndarray, factors: tuple[float, float]) -> np.ndarray:
+        """By how much twice the negative log likelihood of the values falls from one model to the other, (cells,).
+
+        Without the term of their scatter, see `wider`.
+
+        Args:
+            z, other: residuals under the one and under the other.
+            factors: `Null.factor` of both.
+        """
+        return np.asarray(z**2 - other**2)
+
+    def wider(
+        self,
+        z: np.ndarray,
+        other: np.ndarray,
+        breadth: tuple[np.ndarray | float, np.ndarray | float],
+        factors: tuple[float, float],
+    ) -> np.ndarray:
+        """The log of the scatter under the other model relative to that under the one, (cells,) or a number."""
+        return np.asarray(np.log(breadth[1] / breadth[0]))
+
+    def nearly_normal(self, expected: np.ndarray, factor: float) -> np.ndarray:
+        """Which cells are counts of so many events that they are nearly normal, (cells,) bool."""
+        return np.zeros(len(expected), bool)
+
+    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, chance: float) -> np.ndarray:
+        """Which shifts, of `few` replicates, the small counts of a cell could not make with this chance, (cells,)."""
+        return np.ones(len(shift), bool)
+
+
+class Scaled(Law):
+    """A normal law whose scatter the summary states: the replicates determine one factor for all cells."""
+
+    def spread(self, values: np.ndarray, fitted: np.ndarray, terms: int, scale: np.ndarray | None) -> np.ndarray:
+        """The stated scatter."""
+        return np.ones(values.shape[1]) if scale is None else scale
+
+    def factor(self, z: np.ndarray) -> float:
+        """Their root mean square."""
+        return max(float(np.sqrt(np.mean(z**2))), 1e-6)
+
+    def standardized(
+        self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int
+    ) -> np.ndarray:
+        """In units of the stated scatter."""
+        return _in_scatters(values, expected, spread, leverage)
+
+    def of_their_own(
+        self, values: np.ndarray, fitted: np.ndarray, spread: np.ndarray, hat: np.ndarray, terms: int
+    ) -> np.ndarray:
+        """The residual of a regression is smaller than the scatter by the leverage of its replicate."""
+        return self.standardized(values, fitted, spread, -hat, len(values))
+
+    def breadth(self, spread: np.ndarray, factor: float) -> np.ndarray | float:
+        """One factor for all cells."""
+        return factor
+
+
+class Poisson(Scaled):
+    """Counts. One factor for all cells says by how much they scatter more than independent events."""
+
+    def least(self, n: int) -> float:
+        """A cell that was empty in every replicate may still have a count."""
+        return 0.5 / n
+
+    def shifted(self, expected: np.ndarray, shift: np.ndarray, n: int) -> np.ndarray:
+        """Never below `least`."""
+        return np.maximum(expected + shift, self.least(n))
+
+    def regression(self, values: np.ndarray, x: np.ndarray, coefficients: np.ndarray) -> None:
+        """Cells with few counts follow the total by one common elasticity."""
+        mean = values.mean(axis=0)
+        few = mean < _FEW
+        if few.any():
+            together = values[:, few].sum(axis=1)
+            level, slope = np.linalg.lstsq(np.stack([x**0, x], axis=1), together, rcond=None)[0]
+            elasticity = float(np.clip(slope / level, -1.0, 4.0)) if level > 0 else 1.0
+            coefficients[:, few] = 0.0
+            coefficients[0, few] = mean[few] / max(float(np.mean(1 + elasticity * x)), 0.1)
+            coefficients[1, few] = coefficients[0, few] * elasticity
+
+    def factor(self, z: np.ndarray) -> float:
+        """At least 1: in their middle, scores of few counts scatter less."""
+        return max(float(np.sqrt(np.mean(z**2))), 1.0)
+
+    def standardized(
+        self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int
+    ) -> np.ndarray:
+        """Normal scores of the counts."""
+        return np.asarray(poisson_scores(values, np.maximum(expected, self.least(n))) / _widened(leverage))
+
+    def spread_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """The root of the expectation, times the factor."""
+        return np.asarray(np.sqrt(np.maximum(expected, 0.0)) * factor)
+
+    def scatter_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """At least a fraction of a count."""
+        return np.maximum(self.spread_at(expected, spread, factor), _LEAST_SCATTER)
+
+    def variance_of_squares(self, variance: float, cells: int) -> float:
+        """Cells that are empty in every replicate have no scatter: without this, one count would be impossible."""
+        return max(variance, 1 / cells)
+
+    def template(self, shift: np.ndarray, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """In units of the scatter, or of half a count."""
+        return np.asarray(shift / np.maximum(self.spread_at(expected, spread, factor), _LEAST_COUNT))
+
+    def nearly_normal(self, expected: np.ndarray, factor: float) -> np.ndarray:
+        """By the number of independent events, which is that of the bursts."""
+        return np.asarray(expected >= _EVENTS * max(factor, 1.0) ** 2)
+
+    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, chance: float) -> np.ndarray:
+        """All where there are some counts; a count or two in cells that are mostly empty is no shift."""
+        counts = few * np.maximum(expected, self.least(n))
+        score = poisson_scores(np.maximum(counts + few * shift, 0.0), counts) / math.sqrt(1 + few / n)
+        return np.asarray((counts > _FEW) | (np.abs(score) > -stats.norm.ppf(chance / len(shift))))
+
+
+class Exponential(Scaled):
+    """Powers of a spectrum: each scatters as much as its mean, which does not follow the total of the capture."""
+
+    spectrum = True
+    terms = 1
+
+    def shifted(self, expected: np.ndarray, shift: np.ndarray, n: int) -> np.ndarray:
+        """Random detections keep their power, whatever else changes."""
+        return np.maximum(np.maximum(expected + shift, 0.5 / n), _LEAST_POWER * expected)
+
+    def factor(self, z: np.ndarray) -> float:
+        """None is needed."""
+        return 1.0
+
+    def standardized(
+        self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int
+    ) -> np.ndarray:
+        """Scores of the tail of a power whose mean is an average over the replicates.
+
+        The power at a simple fraction of the clock may be exactly 0 for few detections, so that a very small one is
+        rounded up.
+        """
+        ratio = values / np.maximum(expected, _LEAST)
+        return _score_of_tail(-n * np.log1p(np.maximum(ratio, _LEAST_RATIO) / n))
+
+    def of_their_own(
+        self, values: np.ndarray, fitted: np.ndarray, spread: np.ndarray, hat: np.ndarray, terms: int
+    ) -> np.ndarray:
+        """Each relative to the mean of the others."""
+        n = len(values)
+        return self.standardized(values, (n * fitted - values) / (n - 1), spread, 0.0, n - 1)
+
+    def spread_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """The expectation."""
+        return np.maximum(expected, 0.0)
+
+    def template(self, shift: np.ndarray, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
+        """Relative to the expectation."""
+        return np.asarray(shift / np.maximum(expected, 1e-9))
+
+    def scores(self, template: np.ndarray) -> np.ndarray:
+        """A power that is larger by a part of its mean: the scores of large ones rise by little.
+
+        The score of a power p is about the root of 2 p.
+        """
+        return _score_of_tail(-np.maximum(1.0 + template, _LEAST_POWER)) - _score_of_tail(np.array(-1.0))
+
+    def fall(self, z: np.ndarray, other: np.ndarray, factors: tuple[float, float]) -> np.ndarray:
+        """By the powers themselves, in units of their means."""
+        return 2 * (_powers_of(z * factors[0]) - _powers_of(other * factors[1]))
+
+    def wider(
+        self,
+        z: np.ndarray,
+        other: np.ndarray,
+        breadth: tuple[np.ndarray | float, np.ndarray | float],
+        factors: tuple[float, float],
+    ) -> np.ndarray:
+        """The scatter of a power is its mean."""
+        return np.asarray(np.log(_powers_of(z * factors[0]) / _powers_of(other * factors[1])))
+
+
+class Exact(Law):
+    """The one value that every replicate has."""
+
+    exact = True
+    terms = 1
+
+
+_LAWS = {"poisson": Poisson(), "exponential": Exponential(), "exact": Exact()}
+
+
+def law_of(name: str, scaled: bool) -> Law:
+    """The law of a summary. scaled: it states the scatter of its cells."""
+    return _LAWS.get(name) or (Scaled() if scaled else Law())
+
+
+def poisson_scores(n: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Normal scores of counts: of the mid-p value where they are few, Anscombe's residual where they are many.
+
+    Args:
+        n: counts; mean: their expectation; the shapes broadcast.
+    """
+    n, mean = np.broadcast_arrays(np.asarray(n, np.float64), np.asarray(mean, np.float64))
+    # E n^(2/3) is m^(2/3) - m^(-1/3) / 9, its standard deviation 2/3 m^(1/6)
+    root = np.cbrt(mean)
+    out = np.array(1.5 * (np.cbrt(np.maximum(n, 0.0)) ** 2 - root**2 + 1 / (9 * root)) / np.sqrt(root))
+    few = mean <= _MANY
+    if few.any():
+        k, m = np.maximum(n[few], 0.0), mean[few]
+        half = 0.5 * np.exp(special.xlogy(k, m) - m - special.gammaln(k + 1))
+        above = special.gammainc(k + 1, m) + half
+        below = special.gammaincc(k + 1, m) - half
+        tail = np.clip(np.where(k > m, above, below), _LEAST, 1.0)
+        out[few] = np.where(k > m, -1.0, 1.0) * special.ndtri(tail)
+    return out
+
+
+def _in_scatters(
+    values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray
+) -> np.ndarray:
+    return np.asarray((values - expected) / np.where(spread > 0, spread, 1.0) / _widened(leverage))
+
+
+def _widened(leverage: float | np.ndarray) -> np.ndarray:
+    """The root of the variance of a residual relative to the scatter."""
+    return np.asarray(np.sqrt(np.maximum(1.0 + np.asarray(leverage), 1e-6)))
+
+
+def _powers_of(scores: np.ndarray) -> np.ndarray:
+    """The powers, in units of their mean, that have these normal scores."""
+    return np.asarray(np.maximum(-special.log_ndtr(-scores), _LEAST_RATIO))
+
+
+def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:
+    """The normal score whose upper tail has this logarithm."""
+    tail = np.exp(np.maximum(log_tail, -700.0))
+    score = -special.ndtri(np.clip(tail, _LEAST, 1 - 1e-16))
+    # beyond the range of a double, by the asymptotic tail of the normal law
+    far = log_tail < -690
+    return np.asarray(np.where(far, np.sqrt(np.maximum(-2 * log_tail - math.log(2 * math.pi), 0.0)), score))
+
+
+def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
+    """The normal score of a Student's t."""
+    log_tail = stats.t.logsf(np.abs(t), freedom)
+    return np.asarray(np.sign(t) * _score_of_tail(log_tail))
