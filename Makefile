@@ -5,7 +5,7 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify faults bench challenge lint clean
+.PHONY: help demo test verify docs docs-two faults bench challenge lint clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,20 @@ TRIES ?= 400
 
 faults: $(VENV)/installed  ## kills, full disks, damage and hostile files by the thousand (up to an hour)
 	$(RUN)/python scripts/faults.py run --sample $(TRIES) -o docs/faults.md
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(RUN)/python -m pip install --quiet -e '.[docs]'
+	@touch $@
+
+# Pages of the gallery and the reference are made from the classes; a warning is an error. Cells that did not change are
+# not executed again (build/docs-cells). One worker: cells of two pages at a time would share the two cores
+docs: $(VENV)/installed-docs  ## build the pages with every cell executed, into build/docs (minutes; again: seconds)
+	$(RUN)/python -m sphinx -W --keep-going -q -b html $(DOCS_ONLY) docs build/docs
+	@echo "Open build/docs/index.html"
+
+# All pages, all links; of the notebooks the first two alone are executed
+docs-two: DOCS_ONLY = -D nb_execution_excludepatterns=notebooks/effect.md
+docs-two: docs  ## the same with the cells of two pages alone: what a change must pass
 
 lint: $(VENV)/installed
 	$(RUN)/ruff check spadmnist scripts tests
