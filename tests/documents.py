@@ -89,6 +89,11 @@ class Block:
         return f"{self.page}:{self.line}"
 
     @property
+    def name(self) -> str:
+        """What its test is called."""
+        return f"{self.page.removeprefix('docs/').removesuffix('.md')} {self.line} {self.language}"
+
+    @property
     def file(self) -> str:
         """The file that it is, or nothing."""
         found = re.match(r"# ([\w./]+\.(?:py|yaml))$", self.text, re.M)
