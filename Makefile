@@ -57,7 +57,7 @@ lint: $(VENV)/installed
 	$(RUN)/ruff format --check spadmnist scripts tests
 	$(RUN)/mypy
 
-bench: $(VENV)/installed  ## measure the README's table on this machine (about 4 minutes; never fails on time)
+bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
 
 # So many cases of the list, drawn by lot; QUICK= for all simulations. What is there is not made again, and only missing

@@ -1,9 +1,9 @@
 """Fenced blocks of README.md and of the pages in docs, and somebody who goes through them.
 
-A shell block is run command by command, a Python block with the names of those before it in the same page. A block whose
-first line is a comment with the name of a file is that file. Of MATLAB each line is checked against the file that it
-reads. Code cells (`{code-cell}`) are run by the build of the pages, `text` is output. `RULES` says which commands are run
-otherwise, and why.
+A shell block is run command by command, a Python block with the names of those before it in the same page. A block
+whose first line is a comment with the name of a file is that file. Of MATLAB each line is checked against the file that
+it reads. Code cells (`{code-cell}`) are run by the build of the pages, `text` is output. `RULES` says which commands are
+run otherwise, and why.
 """
 
 from __future__ import annotations
@@ -125,8 +125,9 @@ class Block:
     def _imported(self) -> set[str]:
         if self.language != "python":
             return set()
-        found = {name.name for node in ast.walk(ast.parse(self.text)) if isinstance(node, ast.Import) for name in node.names}
-        found |= {n.module for n in ast.walk(ast.parse(self.text)) if isinstance(n, ast.ImportFrom) and n.module}
+        nodes = list(ast.walk(ast.parse(self.text)))
+        found = {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
+        found |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
         heads = {name.partition(".")[0] for name in found}
         return heads | ({"torch"} if any(name.startswith("spadmnist.torch") for name in found) else set())
 
