@@ -22,7 +22,6 @@ release = version = spadmnist.__version__
 
 extensions = ["myst_nb"]
 exclude_patterns = ["_pages"]
-suppress_warnings = ["toc.empty_glob"]  # a place for pages that are made or come later
 
 html_theme = "furo"
 html_title = f"spadmnist {release}"
