@@ -41,6 +41,7 @@ nb_execution_timeout = 1200  # s, of one cell: the longest takes under a minute 
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True  # what a cell writes is gone with the build
 nb_merge_streams = True
+nb_output_stderr = "warn"  # a warning in a cell is one of the build
 
 
 def make_pages(app: Any) -> None:
