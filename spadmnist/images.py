@@ -398,7 +398,7 @@ def cache_folder() -> Path:
 
 
 def _pooch() -> Any:
-    """The library. In a notebook it takes a bar of tqdm that warns where ipywidgets is missing; nobody asked for a bar."""
+    """The library, without the warning of its progress bar where a notebook lacks ipywidgets: no bar is asked for."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pooch

@@ -2,8 +2,8 @@
 
 A shell block is run command by command, a Python block with the names of those before it in the same page. A block
 whose first line is a comment with the name of a file is that file. Of MATLAB each line is checked against the file that
-it reads. Code cells (`{code-cell}`) are run by the build of the pages, `text` is output. `RULES` says which commands are
-run otherwise, and why.
+it reads. Code cells (`{code-cell}`) are run by the build of the pages; `text` is output, which nobody runs. `RULES`
+says which commands are run otherwise, and why.
 """
 
 from __future__ import annotations

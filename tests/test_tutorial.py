@@ -1,4 +1,4 @@
-"""The loop of docs/start/loop.md, as a reader goes through it: fails, unexplained, an effect of one's own, explained."""
+"""The loop of docs/start/loop.md, as a reader goes through it: fails, unexplained, an own effect, explained."""
 
 from __future__ import annotations
 
