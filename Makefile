@@ -43,12 +43,15 @@ $(VENV)/installed-docs: $(VENV)/installed
 	@touch $@
 
 # Pages of the gallery and the reference are made from the classes; a warning is an error. Cells that did not change are
-# not executed again (build/docs-cells). One worker: cells of two pages at a time would share the two cores
+# not executed again (build/docs-cells). One page at a time: what its cells call uses all cores
+DOCS = build/docs
+
 docs: $(VENV)/installed-docs  ## build the pages with every cell executed, into build/docs (minutes; again: seconds)
-	$(RUN)/python -m sphinx -W --keep-going -q -b html $(DOCS_ONLY) docs build/docs
-	@echo "Open build/docs/index.html"
+	$(RUN)/python -m sphinx -W --keep-going -q -b html $(DOCS_ONLY) docs $(DOCS)
+	@echo "Open $(DOCS)/index.html"
 
 # All pages, all links; of the notebooks the first two alone are executed
+docs-two: DOCS = build/docs-two
 docs-two: DOCS_ONLY = -D nb_execution_excludepatterns=notebooks/effect.md
 docs-two: docs  ## the same with the cells of two pages alone: what a change must pass
 
@@ -74,4 +77,4 @@ challenge: $(VENV)/installed  ## hidden effects of an independent generator, dia
 	@$(RUN)/python scripts/challenge.py score $(CHALLENGE)
 
 clean:  ## remove what was made here
-	rm -rf $(VENV) $(DEMO) benchmarks.md .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) benchmarks.md build .pytest_cache .mypy_cache .ruff_cache .hypothesis
