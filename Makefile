@@ -5,10 +5,10 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify faults bench challenge lint clean
+.PHONY: help demo test verify docs docs-two faults bench challenge lint clean
 
 help:  ## say what there is
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(VENV)/installed: pyproject.toml
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
@@ -38,12 +38,29 @@ TRIES ?= 400
 faults: $(VENV)/installed  ## kills, full disks, damage and hostile files by the thousand (up to an hour)
 	$(RUN)/python scripts/faults.py run --sample $(TRIES) -o docs/faults.md
 
+$(VENV)/installed-docs: $(VENV)/installed
+	$(RUN)/python -m pip install --quiet -e '.[docs]'
+	@touch $@
+
+# Pages of the gallery and the reference are made from the classes; a warning is an error. Cells that did not change are
+# not executed again (build/docs-cells). One page at a time: what its cells call uses all cores
+DOCS = build/docs
+
+docs: $(VENV)/installed-docs  ## build the pages with every cell executed, into build/docs (minutes; again: seconds)
+	$(RUN)/python -m sphinx -W --keep-going -q -b html $(DOCS_ONLY) docs $(DOCS)
+	@echo "Open $(DOCS)/index.html"
+
+# All pages, all links; of the notebooks the first two alone are executed
+docs-two: DOCS = build/docs-two
+docs-two: DOCS_ONLY = -D nb_execution_excludepatterns=notebooks/effect.md
+docs-two: docs  ## the same with the cells of two pages alone: what a change must pass
+
 lint: $(VENV)/installed
 	$(RUN)/ruff check spadmnist scripts tests
 	$(RUN)/ruff format --check spadmnist scripts tests
 	$(RUN)/mypy
 
-bench: $(VENV)/installed  ## measure the README's table on this machine (about 4 minutes; never fails on time)
+bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
 
 # So many cases of the list, drawn by lot; QUICK= for all simulations. What is there is not made again, and only missing
@@ -60,4 +77,4 @@ challenge: $(VENV)/installed  ## hidden effects of an independent generator, dia
 	@$(RUN)/python scripts/challenge.py score $(CHALLENGE)
 
 clean:  ## remove what was made here
-	rm -rf $(VENV) $(DEMO) benchmarks.md .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) benchmarks.md build .pytest_cache .mypy_cache .ruff_cache .hypothesis

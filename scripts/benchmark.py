@@ -1,4 +1,4 @@
-"""Measure what the README claims, on this machine, and print it as a table (`make bench`).
+"""Measure what docs/evidence/benchmark.md claims, on this machine, and print it as a table (`make bench`).
 
 Ratios are taken within one run, the two sides in turn, and the median over the rounds is quoted: the machine's speed
 drifts. Nothing here fails because something is slow.

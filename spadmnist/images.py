@@ -12,6 +12,7 @@ import hashlib
 import os
 import sys
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -393,9 +394,15 @@ def _checked_mnist(path: Path, name: str) -> np.ndarray:
 
 def cache_folder() -> Path:
     """Where the program keeps what it can make or fetch again: `$SPADMNIST_CACHE`, or the system's place for it."""
-    import pooch
+    return Path(os.environ.get("SPADMNIST_CACHE") or _pooch().os_cache("spadmnist"))
 
-    return Path(os.environ.get("SPADMNIST_CACHE") or pooch.os_cache("spadmnist"))
+
+def _pooch() -> Any:
+    """The library, without the warning of its progress bar where a notebook lacks ipywidgets: no bar is asked for."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pooch
+    return pooch
 
 
 def _cached_mnist(name: str) -> np.ndarray:
@@ -410,8 +417,7 @@ def _cached_mnist(name: str) -> np.ndarray:
 
 def _download_mnist(name: str, path: Path) -> np.ndarray:
     """Fetch the file from the first mirror that sends the right one; only a verified one comes to `path`."""
-    import pooch
-
+    pooch = _pooch()
     path.parent.mkdir(parents=True, exist_ok=True)
     show = sys.stderr is not None and sys.stderr.isatty()
     download = pooch.HTTPDownloader(progressbar=show, chunk_size=2**16, timeout=(10, 60))

@@ -1,4 +1,4 @@
-"""The loop of README.md, as a reader goes through it: fails, unexplained, an effect of one's own, explained."""
+"""The loop of docs/start/loop.md, as a reader goes through it: fails, unexplained, an own effect, explained."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def run(folder: Path, line: str, status: int = 0) -> str:
-    """A line of the README, in a folder."""
+    """A command of the page, in a folder."""
     words = line.split("#")[0].split()
     assert words[0] == "spadmnist"
     done = subprocess.run(
@@ -26,11 +26,10 @@ def run(folder: Path, line: str, status: int = 0) -> str:
 
 
 @pytest.mark.slow
-def test_the_loop_of_the_readme(tmp_path):
-    text = (ROOT / "README.md").read_text()
-    text = text[text.index("### The loop") : text.index("## How fast")]
+def test_the_loop_of_the_docs(tmp_path):
+    text = (ROOT / "docs" / "start" / "loop.md").read_text()
     blocks = re.findall(r"```(\w*)\n(.*?)```", text, re.S)
-    commands = [line for kind, body in blocks if not kind for line in body.strip().splitlines()]
+    commands = [line for kind, body in blocks if kind == "bash" for line in body.strip().splitlines()]
     (effect,) = [body for kind, body in blocks if kind == "python"]
     assert commands[0] == "cd configs/tutorial" and len(commands) == 6
     folder = tmp_path / "tutorial"

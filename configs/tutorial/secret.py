@@ -1,4 +1,4 @@
-"""What the camera of the tutorial hides. Read README.md first."""
+"""What the camera of the tutorial hides. Read docs/start/loop.md first."""
 
 import numpy as np
 
