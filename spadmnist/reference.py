@@ -166,7 +166,7 @@ def docstring(cls: type[Plugin]) -> list[str]:
 
 def _parameters(declared: Sequence[Parameter]) -> list[str]:
     """A table, and below each row what the parameter is."""
-    rows = [(p.name, p.symbol or "-", *_numbers(p), _varies(p)) for p in declared]
+    rows = [(p.name, p.symbol or "-", *allowed_values(p), varies(p)) for p in declared]
     if not rows:
         return []
     header = ("parameter", "symbol", "unit", "default", "allowed", "off", "search", "varies by")
@@ -177,7 +177,7 @@ def _parameters(declared: Sequence[Parameter]) -> list[str]:
     return out
 
 
-def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
+def allowed_values(declared: Parameter) -> tuple[str, str, str, str, str]:
     """(unit, default, allowed, off, search)."""
     unit = declared.unit or "1"
     if declared.choices:
@@ -191,7 +191,7 @@ def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
     return unit, default, declared.allowed(), _value(declared, declared.off), search
 
 
-def _varies(declared: Parameter) -> str:
+def varies(declared: Parameter) -> str:
     ways = {declared.per: bool(declared.per), "wavelength": declared.by_wavelength}
     return " or ".join(way for way, can in ways.items() if can) or "-"
 

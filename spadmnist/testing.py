@@ -121,13 +121,18 @@ def check_method(method: type[Method] | str) -> None:
         assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
 
 
+def captured() -> list[str]:
+    """The names of the effects that the contract's sensor has of its own."""
+    return [effect.name for effect in _base().sensor.effects]
+
+
 def captures(
-    effect: type[Effect], lights: Lights, repetitions: int = 32, absent: bool = False, **given: Any
+    effect: type[Effect] | None, lights: Lights, repetitions: int = 32, absent: bool = False, **given: Any
 ) -> dict[str, Shots]:
     """Captures of the contract's sensor, with an effect as strong as the contract has it, or without; for pictures.
 
     Args:
-        effect: the class.
+        effect: the class; None, with `absent`: any that is not one of `captured` and not one of scenes.
         lights: (photons/s, exposures of one repetition) by the name of the capture.
         repetitions: of each capture.
         absent: without the effect, the same light.
@@ -137,10 +142,10 @@ def captures(
         The `signatures.Shots` of each capture, by its name. The dead time in them is that of the sensor without the
         effect.
     """
-    plain = _sensor(None, "device", without=effect.name)
-    sensor = plain if absent else _Trial(effect, given).sensor("device")
-    split = "without" if absent else "with"
-    return _shots(sensor, split, repetitions, plain.nominal_dead_time, effect.of_scene, lights)
+    plain = _sensor(None, "device", without=effect.name if effect else "")
+    sensor = plain if absent or effect is None else _Trial(effect, given).sensor("device")
+    split = "without" if sensor is plain else "with"
+    return _shots(sensor, split, repetitions, plain.nominal_dead_time, effect is not None and effect.of_scene, lights)
 
 
 # --- an effect and its sensor -------------------------------------------------------------------------------------

@@ -24,7 +24,10 @@ LIGHTS = {
     "bright": (1.2e6, 2),
     "brightest": (4e6, 1),
 }
+SEEN = 6.0  # standard errors at some point, from which on a difference is shown: as in the contract
 _GROUPS = 8  # parts of a capture, from whose scatter the standard error comes
+
+_FEW = 20  # pixels that still wait for their next detection, up to which no rate is said
 
 Points = tuple[np.ndarray, np.ndarray]  # x, y
 
@@ -33,13 +36,15 @@ Points = tuple[np.ndarray, np.ndarray]  # x, y
 class Curve:
     """What is drawn of a statistic.
 
-    name: of the quantity, for a title; x, y: labels of the axes, with units; captures: of which it may be made, each
-    alone, or () where it needs all; log: the axes that are logarithmic; image: y belongs to the pixels, row by row.
+    name: of the quantity, and at: of a place on its x axis, for a title; x, y: what the axes show, (words, unit);
+    captures: of which it may be made, each alone, or () where it needs all; log: the axes that are logarithmic; image:
+    y belongs to the pixels, row by row.
     """
 
     name: str
-    x: str
-    y: str
+    at: str
+    x: tuple[str, str]
+    y: tuple[str, str]
     blocks: tuple[str, ...]
     captures: tuple[str, ...]
     of: Callable[..., Points]
@@ -71,9 +76,8 @@ def drawn(curve: Curve, shots: Mapping[str, Shots]) -> list[Drawn]:
     found = []
     for capture in curve.captures or ("",):
         part = {capture: shots[capture]} if capture else dict(shots)
-        given = [{name: one for name, one in group.items()} for group in _groups(part)]
         x, y = curve.of(part[capture] if capture else part)
-        each = np.array([curve.of(group[capture] if capture else group)[1] for group in given])
+        each = np.array([curve.of(group[capture] if capture else group)[1] for group in _groups(part)])
         with np.errstate(invalid="ignore"):
             found.append(Drawn(curve, capture, x, y, each.std(axis=0, ddof=1) / np.sqrt(len(each))))
     return found
@@ -88,6 +92,23 @@ def significance(one: Drawn, other: Drawn) -> np.ndarray:
         return np.nan_to_num((one.y - other.y) / np.maximum(scatter, 0.3 * usual))
 
 
+def visible(one: Drawn, other: Drawn) -> float:
+    """How much of a picture two curves' difference fills, from 0 to about 1; 0 where it is not significant anywhere.
+
+    The mean distance of the curves where they differ by more than 3 standard errors, as a share of the axis' height.
+    """
+    z = np.abs(significance(one, other))
+    if z.max(initial=0.0) <= SEEN:
+        return 0.0
+    heights = [one.y, other.y]
+    if "y" in one.curve.log:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            heights = [np.where(y > 0, np.log(y), np.nan) for y in heights]
+    low, high = (edge([edge(y) for y in heights]) for edge in (np.nanmin, np.nanmax))
+    away = np.where(z > 3.0, np.abs(heights[0] - heights[1]), 0.0)
+    return float(np.nanmean(away) / max(high - low, 1e-300))
+
+
 def _groups(shots: Mapping[str, Shots]) -> Iterator[dict[str, Shots]]:
     for k in range(_GROUPS):
         part = {}
@@ -99,10 +120,16 @@ def _groups(shots: Mapping[str, Shots]) -> Iterator[dict[str, Shots]]:
 
 
 def _curve(
-    name: str, x: str, y: str, blocks: Sequence[str], captures: Sequence[str] = (), **how: object
+    name: str,
+    at: str,
+    x: tuple[str, str],
+    y: tuple[str, str],
+    blocks: Sequence[str],
+    captures: Sequence[str] = (),
+    **how: object,
 ) -> Callable[[Callable[..., Points]], Callable[..., Points]]:
     def known(of: Callable[..., Points]) -> Callable[..., Points]:
-        CURVES.append(Curve(name, x, y, tuple(blocks), tuple(captures), of, **how))  # type: ignore[arg-type]
+        CURVES.append(Curve(name, at, x, y, tuple(blocks), tuple(captures), of, **how))  # type: ignore[arg-type]
         return of
 
     return known
@@ -112,45 +139,89 @@ def _curve(
 
 
 @_curve(
-    "detections per photon",
-    "light (photons/s on a pixel)",
-    "detections per photon",
+    "detections per photon, without the dark counts",
+    "at {} photons/s",
+    ("photons on a pixel", "1/s"),
+    ("detections per photon, less those in the dark", ""),
     ("level", "linearity"),
-    log="xy",
+    log="x",
 )
 def response(shots: Mapping[str, Shots]) -> Points:
-    lit = {name: LIGHTS[name][0] for name in shots if LIGHTS[name][0]}
-    rates = [shots[name].counts.mean() / shots[name].conditions.exposure for name in lit]
-    light = np.array(list(lit.values()))
-    return light, np.array(rates) / light
+    light, rates, dark = _by_light(shots)
+    return light, (rates - dark) / light
 
 
-@_curve("detections per pixel in the dark", "pixel, in order", "rate (1/s)", ("dark_level", "dark_map"), ("dark",), log="y")
+@_curve(
+    "rate of a pixel",
+    "at {} photons/s",
+    ("photons on a pixel", "1/s"),
+    ("rate", "1/s"),
+    ("level",),
+    log="xy",
+)
+def rate_by_light(shots: Mapping[str, Shots]) -> Points:
+    return _by_light(shots)[:2]
+
+
+def _by_light(shots: Mapping[str, Shots]) -> tuple[np.ndarray, np.ndarray, float]:
+    """(photons/s of each lit capture, mean rates of a pixel in 1/s there, mean rate in the dark)."""
+    rates = {LIGHTS[name][0]: float(_rates(one).mean()) for name, one in shots.items()}
+    dark = rates.pop(0.0)
+    return np.array(list(rates)), np.array(list(rates.values())), dark
+
+
+@_curve(
+    "rates of the pixels in the dark",
+    "pixel {} by rate",
+    ("pixel, by rate", ""),
+    ("rate", "1/s"),
+    ("dark_level", "dark_map", "outliers"),
+    ("dark",),
+)
 def dark_rates(shots: Shots) -> Points:
     return np.arange(shots.tr.pixels), np.sort(_rates(shots))
 
 
-@_curve("detections per pixel", "pixel, in order", "rate (1/s)", ("outliers",), ("dim", "dark"))
+@_curve(
+    "rates of the pixels", "pixel {} by rate", ("pixel, by rate", ""), ("rate", "1/s"), ("outliers",), ("dim", "bright")
+)
 def ordered_rates(shots: Shots) -> Points:
     return np.arange(shots.tr.pixels), np.sort(_rates(shots))
 
 
-@_curve("rate of a pixel", "column", "row", ("map", "surface"), ("dim", "bright"), image=True)
+@_curve("rate of a pixel", "pixel {}", ("column", ""), ("row", ""), ("map", "surface"), ("dim", "bright"), image=True)
 def picture(shots: Shots) -> Points:
     return np.arange(shots.tr.pixels), _rates(shots)
 
 
-@_curve("mean rate of a row", "row", "rate relative to the mean", ("rows_columns",), ("dim", "bright"))
+@_curve(
+    "mean rate of a row", "row {}", ("row", ""), ("rate relative to the mean", ""), ("rows_columns",), ("dim", "bright")
+)
 def rows(shots: Shots) -> Points:
     return _profile(shots, 1)
 
 
-@_curve("mean rate of a column", "column", "rate relative to the mean", ("rows_columns",), ("dim", "bright"))
+@_curve(
+    "mean rate of a column",
+    "column {}",
+    ("column", ""),
+    ("rate relative to the mean", ""),
+    ("rows_columns",),
+    ("dim", "bright"),
+)
 def columns(shots: Shots) -> Points:
     return _profile(shots, 0)
 
 
-@_curve("counts of a pixel in 10 us", "count", "share of the counts", ("saturation",), ("bright", "brightest"), log="y")
+@_curve(
+    "counts of a pixel in 10 us",
+    "share of the counts of {}",
+    ("count", ""),
+    ("share of the counts", ""),
+    ("saturation",),
+    ("bright", "brightest"),
+    log="y",
+)
 def counts(shots: Shots) -> Points:
     seen = shots.binned.astype(np.uint32)
     for effect in shots.sensor.at("readout"):
@@ -173,8 +244,9 @@ def _profile(shots: Shots, axis: int) -> Points:
 
 @_curve(
     "rate of the next detection of the same pixel",
-    "time since the last one (ns)",
-    "rate (1/s)",
+    "{} ns after the last one",
+    ("time since the last one", "ns"),
+    ("rate", "1/s"),
     ("edge", "intervals"),
     ("bright", "dim"),
 )
@@ -184,8 +256,9 @@ def hazard(shots: Shots) -> Points:
 
 @_curve(
     "rate of the next detection of the same pixel",
-    "time since the last one (ns)",
-    "rate (1/s)",
+    "{} ns after the last one",
+    ("time since the last one", "ns"),
+    ("rate", "1/s"),
     ("edge",),
     ("bright", "dim"),
 )
@@ -196,8 +269,9 @@ def hazard_at_the_edge(shots: Shots) -> Points:
 
 @_curve(
     "rate of the next detection of the same pixel",
-    "time since the last one (ns)",
-    "rate (1/s)",
+    "{} ns after the last one",
+    ("time since the last one", "ns"),
+    ("rate", "1/s"),
     ("intervals",),
     ("bright", "dim"),
     log="x",
@@ -222,14 +296,15 @@ def _next_one(ended: np.ndarray, open_: np.ndarray, edges: np.ndarray) -> Points
     waited = sums[below] + edges * (len(waits) - below)
     seen = np.histogram(ended, edges)[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        rate = seen / (np.diff(waited) * 1e-9)
+        rate = np.where(len(waits) - below[:-1] > _FEW, seen / (np.diff(waited) * 1e-9), np.nan)
     return np.sqrt(edges[1:] * edges[:-1]) if edges[0] > 20 else (edges[1:] + edges[:-1]) / 2, rate
 
 
 @_curve(
     "rate of the next detection of the array",
-    "time since the last one of any pixel (ns)",
-    "rate (1/s)",
+    "{} ns after the last one",
+    ("time since the last one of any pixel", "ns"),
+    ("rate", "1/s"),
     ("ceiling",),
     ("bright", "dim"),
 )
@@ -245,9 +320,10 @@ def hazard_of_array(shots: Shots) -> Points:
 
 
 @_curve(
-    "g2 - 1 of a pixel, its counts against its later ones",
-    "delay (us)",
-    "g2 - 1",
+    "correlation of a pixel with itself",
+    "{} us later",
+    ("delay", "us"),
+    ("g2 - 1", ""),
     ("autocorrelation",),
     ("bright", "dim"),
 )
@@ -256,7 +332,14 @@ def own_pairs(shots: Shots) -> Points:
     return _lags(shots, own / (shots.binned.mean(axis=(0, 2)) ** 2).sum())
 
 
-@_curve("g2 - 1 of different pixels", "delay (us)", "g2 - 1", ("far_pairs", "neighbours"), ("bright", "dim"))
+@_curve(
+    "correlation of different pixels",
+    "{} us apart",
+    ("delay", "us"),
+    ("g2 - 1", ""),
+    ("far_pairs", "neighbours"),
+    ("bright", "dim"),
+)
 def other_pairs(shots: Shots) -> Points:
     own, together = _pairs(shots)
     mean = shots.binned.mean(axis=(0, 2))
@@ -281,8 +364,9 @@ def _lags(shots: Shots, values: np.ndarray) -> Points:
 
 @_curve(
     "coincidences of neighbours",
-    "time between the two (ns)",
-    "pairs per detection and ns",
+    "{} ns apart",
+    ("time between the two", "ns"),
+    ("pairs per detection", "1/ns"),
     ("neighbours",),
     ("dim", "bright", "dark"),
 )
@@ -304,7 +388,15 @@ def coincidences(shots: Shots) -> Points:
     return (edges[1:] + edges[:-1]) / 2, found / max(len(times), 1)
 
 
-@_curve("variance over mean of a pixel's counts", "window (us)", "variance / mean", ("fano",), ("dim", "dark"), log="x")
+@_curve(
+    "variance over mean of a pixel's counts",
+    "in windows of {} us",
+    ("window", "us"),
+    ("variance / mean", ""),
+    ("fano",),
+    ("dim", "dark"),
+    log="x",
+)
 def fano(shots: Shots) -> Points:
     widths = (1, 2, 5, 10, 20, 50, 100)
     bins = shots.binned.shape[2]
@@ -315,9 +407,10 @@ def fano(shots: Shots) -> Points:
 
 
 @_curve(
-    "power of the array's rate",
-    "frequency (Hz)",
-    "power (1: steady light)",
+    "power spectrum of the array",
+    "at {} Hz",
+    ("frequency", "Hz"),
+    ("power relative to steady light", ""),
     ("spectrum",),
     ("bright",),
     log="xy",
@@ -327,7 +420,9 @@ def spectrum(shots: Shots) -> Points:
     place = np.minimum((shots.tr.times * (bins / shots.conditions.exposure)).astype(int), bins - 1)
     images = len(shots.tr.offsets) // shots.tr.pixels
     series = np.bincount(shots.tr.rows // shots.tr.pixels * bins + place, minlength=images * bins).reshape(-1, bins)
-    power = (np.abs(np.fft.rfft(series, axis=1)[:, 1:-1]) ** 2 / np.maximum(series.sum(axis=1, keepdims=True), 1)).mean(axis=0)
+    power = (np.abs(np.fft.rfft(series, axis=1)[:, 1:-1]) ** 2 / np.maximum(series.sum(axis=1, keepdims=True), 1)).mean(
+        axis=0
+    )
     frequency = np.arange(1, len(power) + 1) / shots.conditions.exposure
     edges = np.unique(np.rint(np.geomspace(1, len(power) + 1, 60)).astype(int))
     # the clock of the frames is a line: a bin of its own
@@ -337,7 +432,14 @@ def spectrum(shots: Shots) -> Points:
     return sums[0], sums[1]
 
 
-@_curve("rate of the array", "time in the exposure (us)", "rate relative to the mean", ("trend",), ("bright", "dim"))
+@_curve(
+    "rate of the array",
+    "{} us after the start",
+    ("time in the exposure", "us"),
+    ("rate relative to the mean", ""),
+    ("trend",),
+    ("bright", "dim"),
+)
 def course(shots: Shots) -> Points:
     rate = shots.binned.sum(axis=(0, 1)).reshape(-1, 4).sum(axis=1)
     end = shots.conditions.exposure * 1e6
@@ -347,14 +449,28 @@ def course(shots: Shots) -> Points:
 # --- codes and frames -----------------------------------------------------------------------------------------------
 
 
-@_curve("how often a code occurs", "time stamp modulo 14 ns (codes of 100 ps)", "relative to the mean", ("phase",), ("bright",))
+@_curve(
+    "occurrences of a code",
+    "code {} of 140",
+    ("code: time stamp modulo 14 ns, in steps of 100 ps", ""),
+    ("occurrences relative to the mean", ""),
+    ("phase",),
+    ("bright",),
+)
 def codes(shots: Shots) -> Points:
     code = np.rint(shots.tr.times / 100e-12).astype(np.int64) % 140
     seen = np.bincount(code, minlength=140)
     return np.arange(140), seen / seen.mean()
 
 
-@_curve("first detection in a frame", "time in the frame (ns)", "probability per ns", ("first",), ("bright",))
+@_curve(
+    "first detection in a frame",
+    "{} ns after its start",
+    ("time in the frame", "ns"),
+    ("probability density", "1/ns"),
+    ("first",),
+    ("bright",),
+)
 def first(shots: Shots) -> Points:
     frames = shots.recorded.frames
     assert frames is not None and frames.first is not None
@@ -363,8 +479,9 @@ def first(shots: Shots) -> Points:
 
 @_curve(
     "first detection in a frame after one with a late detection",
-    "time in the frame (ns)",
-    "probability per ns",
+    "{} ns after its start",
+    ("time in the frame", "ns"),
+    ("probability density", "1/ns"),
     ("frames_lag",),
     ("bright",),
 )
@@ -378,7 +495,14 @@ def after_late(shots: Shots) -> Points:
     return _in_frame(follows[follows < frames.frame_time], len(follows))
 
 
-@_curve("frames that fire after one that fired", "frames later", "relative to all frames", ("frames_lag",), ("bright", "dim"))
+@_curve(
+    "frames that fire after one that fired",
+    "{} frames later",
+    ("frames later", ""),
+    ("relative to all frames", ""),
+    ("frames_lag",),
+    ("bright", "dim"),
+)
 def later_frames(shots: Shots) -> Points:
     frames = shots.recorded.frames
     assert frames is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import numpy as np
 
 from . import Conditions, Effect, parameter
@@ -19,6 +21,7 @@ class DeadTime(Effect, stage="dead_time"):
     """
 
     moves = ("edge", "intervals", "linearity", "fano", "level", "ceiling")
+    shown: ClassVar[dict[str, Any]] = {"duration": 100e-9}  # the same in all pixels: a sharp edge
 
     duration = parameter(
         50e-9,

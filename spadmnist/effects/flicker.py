@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -39,6 +40,7 @@ class Flicker(Effect, stage="arrival"):
     """
 
     moves = ("spectrum", "far_pairs", "neighbours", "autocorrelation", "trend")
+    shown: ClassVar[dict[str, Any]] = {"frequency": 5e3}  # several periods in an exposure
 
     amplitude = parameter(
         0.05, "", "largest relative change of the light", symbol="m", bounds=(0, 1), off=0.0, search=(1e-4, 0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ class PrintBlur(Effect, stage="light"):
 
     of_scene = True
     after = "print_tilt"
+    shown: ClassVar[dict[str, Any]] = {"radius": 0.6}  # less than the details of the scene
     moves = ("map", "rows_columns", "surface", "level", "outliers", "linearity")
 
     radius = parameter(

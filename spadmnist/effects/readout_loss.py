@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ class ReadoutLoss(Effect, stage="readout"):
     """
 
     counted = True
+    shown: ClassVar[dict[str, Any]] = {"service_time": 30e-9, "queue": 2.0}  # bright light just fills the bus
     moves = ("ceiling", "linearity", "far_pairs", "neighbours", "edge", "intervals", "spectrum", "trend")
 
     service_time = parameter(
