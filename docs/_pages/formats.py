@@ -171,7 +171,9 @@ def answers() -> dict[str, dict[str, Any]]:
     check = Check("neighbours", "flat", 1.0, 0.5, "side neighbours", "0.2 % of detections", 0.002)
     nuisance = Nuisance(**{name: _any(one) for name, one in inspect.signature(Nuisance).parameters.items()})
     compared = Comparison("sensor", "lab", "adequate", 1.0, 1.2, (nuisance,), (check,), 100, crop="0:8,0:8")
-    step = Step(Candidate("add", "crosstalk", None, {}), {"probability": Value(0.01, 0.009, 0.011)}, 1.0, 35.0, "rate +2 %")
+    step = Step(
+        Candidate("add", "crosstalk", None, {}), {"probability": Value(0.01, 0.009, 0.011)}, 1.0, 35.0, "rate +2 %"
+    )
     told = list(compared.as_data()["nuisances"])
     lists: dict[str, Any] = {name: [] for name in ("setup", "unexplained", "ladder", "advice", "excluded")}
     found = Diagnosis("sensor", "lab", "explained", 60.0, 1.0, 1.2, told, [step], **lists)
@@ -197,7 +199,9 @@ def keys(data: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
 
 def _type(value: Any) -> str:
     names = {bool: "true or false", str: "text", list: "list", dict: "mapping"}
-    return names.get(type(value), "number" if isinstance(value, int | float | np.number) else "text or `null`")
+    if value is None:
+        return "a value or `null`"
+    return names.get(type(value), "number" if isinstance(value, int | float | np.number) else type(value).__name__)
 
 
 def _keys(data: Mapping[str, Any]) -> str:

@@ -47,7 +47,8 @@ def groups(kind: str) -> Iterator[Group]:
     yield from _groups(made, Group("", "", top), set())
 
 
-def _groups(made: Node, group: Group, above: set[str]) -> Iterator[Group]:
+def _groups(made: Node, group: Group, known: set[str]) -> Iterator[Group]:
+    """A mapping and those in it; one that stands at several places is named at the first."""
     yield group
     for key, node in group.node["properties"].items():
         if key == "effects":
@@ -55,8 +56,9 @@ def _groups(made: Node, group: Group, above: set[str]) -> Iterator[Group]:
         path = f"{group.path}.{key}" if group.path else key
         for name, one in _members(made, node):
             inner = f"{path}[]" if _resolved(made, node).get("type") == "array" else path
-            if name not in above:
-                yield from _groups(made, Group(inner, _which(one), one), {*above, name})
+            if name not in known:
+                known.add(name)
+                yield from _groups(made, Group(inner, _which(one), one), known)
 
 
 def _members(made: Node, node: Node) -> Iterator[tuple[str, Node]]:
@@ -118,8 +120,7 @@ def _form(made: Node, node: Node) -> str:
     if kind in ("integer", "number"):
         return _range(node, "whole number" if kind == "integer" else "number")
     if kind == "object" or "properties" in node:
-        keys = list(node.get("properties", {}))
-        return "mapping" if len(keys) > 4 or not keys else md.literal(f"{{{', '.join(keys)}}}")
+        return "mapping"
     return {"boolean": "`true` or `false`", "string": "text"}.get(str(kind), "")
 
 

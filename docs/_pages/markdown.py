@@ -22,12 +22,16 @@ def plain(text: str) -> str:
 def paragraphs(doc: str | None) -> list[str]:
     """The paragraphs of a docstring, each one line; what begins a law or a source begins a paragraph of its own.
 
-    Indented lines, as those of a table or of a program, stay a block.
+    Indented lines, as those of a program, stay a block; `Args:` and its like become a list.
     """
     found: list[str] = []
-    for block in re.split(r"\n\s*\n", doc or ""):
+    for block in re.split(r"\n\s*\n", (doc or "").strip("\n")):
         lines = block.split("\n")
-        if all(line.startswith("    ") for line in lines if line):
+        if not block.strip():
+            continue
+        if re.fullmatch(r"(Args|Returns|Raises|Attributes|Yields):", lines[0].strip()):
+            found += _section(lines)
+        elif all(line.startswith("    ") for line in lines if line):
             found.append("```text\n" + "\n".join(line[4:] for line in lines) + "\n```")
         elif lines[0].startswith("|"):
             found.append("\n".join(lines))
@@ -37,6 +41,20 @@ def paragraphs(doc: str | None) -> list[str]:
                 known = head in ("Law", "Shows", "Source") and colon
                 found.append(f"**{head}.** {plain(rest)}" if known else plain(part))
     return [one for one in found if one]
+
+
+def _section(lines: Sequence[str]) -> list[str]:
+    """A section of a docstring, `Args:`, with an entry for each name; then what stands behind it."""
+    title = lines[0].strip().removesuffix(":")
+    after = next((i for i, line in enumerate(lines[1:], 1) if not line.startswith("    ")), len(lines))
+    entries: list[str] = []
+    for line in lines[1:after]:
+        if line.startswith("        ") and entries:
+            entries[-1] += f" {line.strip()}"
+        else:
+            entries.append(line.strip())
+    shown = "\n".join(f"- {plain(entry)}" for entry in entries)
+    return [f"**{title}**\n\n{shown}", *paragraphs("\n".join(lines[after:]))]
 
 
 def prose(doc: str | None) -> str:

@@ -53,7 +53,7 @@ def statistics() -> str:
     ]
     for cls in known:
         flat = " For light that is the same on all pixels; a scene has none." if cls.flat else ""
-        blocks += [f"({cls.name})=\n## {cls.name}", f"Modality: {_modalities(cls)}. Unit: {cls.unit}.{flat}"]
+        blocks += [f"## {cls.name}", f"Modality: {_modalities(cls)}. Unit: {cls.unit}.{flat}"]
         blocks += md.paragraphs(inspect.getdoc(cls))
     return md.page("Statistics", *blocks)
 
@@ -70,7 +70,7 @@ def methods() -> str:
     for cls in known:
         use = "divided by the training median" if cls.normalised else "never normalised"
         needs = ", ".join(f"`{name}`" for name in cls.readouts())
-        blocks += [f"({cls.name})=\n## {cls.name}", f"Needs: {needs}. Unit: {cls.unit}. For use it is {use}."]
+        blocks += [f"## {cls.name}", f"Needs: {needs}. Unit: {cls.unit}. For use it is {use}."]
         blocks += md.paragraphs(inspect.getdoc(cls))
     return md.page("Reconstruction methods", *blocks)
 
@@ -132,6 +132,6 @@ def _signature(found: Any, bound: bool = False) -> str:
 
 
 def _doc(found: Any) -> str:
-    """Its docstring; sections of it (Args, Returns, Raises) begin a paragraph of their own."""
+    """Its docstring, with each of its sections (Args, Returns, Raises) as a paragraph of its own."""
     doc = inspect.getdoc(found) or ""
     return re.sub(r"^(Args|Returns|Raises|Attributes|Yields):\s*$", r"\n\1:", doc, flags=re.MULTILINE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 
 import click
@@ -34,7 +35,7 @@ def page() -> str:
 def _verb(name: str, command: click.Command) -> str:
     context = click.Context(command, parent=click.Context(cli, info_name="spadmnist"), info_name=name)
     usage = " ".join(command.collect_usage_pieces(context))
-    blocks = [f"({name})=\n## {name}", md.code(f"spadmnist {name} {usage}", "text"), *_help(command)]
+    blocks = [f"## {name}", md.code(f"spadmnist {name} {usage}", "text"), *_help(command)]
     rows = [[_names(one), md.plain(_about(one))] for one in command.params if isinstance(one, click.Option)]
     return "\n\n".join([*blocks, md.table(("option", "does"), rows)]).rstrip()
 
@@ -45,7 +46,7 @@ def _help(command: click.Command) -> list[str]:
     for block in (command.help or "").split("\n\n"):
         lines = block.strip("\n").split("\n")
         if lines[0].strip() == "\b":
-            found.append(md.code("\n".join(lines[1:]), "text"))
+            found.append(md.code(textwrap.dedent("\n".join(lines[1:])), "text"))
         elif block.strip():
             found.append(md.plain(" ".join(block.split())))
     return found
