@@ -31,7 +31,8 @@ from . import curves
 from .curves import Curve, Drawn
 
 LEAST = 0.02  # share of the height of a picture that a difference fills in the mean, to be worth a second one
-_REPETITIONS = 16  # of each capture: enough for all that is built in to be seen
+_REPETITIONS = 8  # of each capture: enough for all that is built in to be seen
+_OTHERS = 4  # statistics, of those that an effect names behind the first, that are tried for the second panel
 _WITHOUT, _WITH = "0.45", "#c8102e"  # colours of the two curves
 
 
@@ -97,7 +98,7 @@ def _panels(effect: type[Effect]) -> list[Panel]:
     """The statistic that the effect moves first of all, and another of those that it names; none where none moves."""
     shots = testing.captures(effect, curves.LIGHTS, _REPETITIONS, **effect.shown)
     first, *others = effect.moves or ("",)
-    rest = others if first else list(signatures.BLOCKS)
+    rest = others[:_OTHERS] if first else list(signatures.BLOCKS)
     found = [_best(effect, (first,), shots)] if first else []
     for panel in sorted((_best(effect, (block,), shots) for block in rest), key=lambda panel: -panel.visible):
         names = {known.with_.curve.name for known in found}
