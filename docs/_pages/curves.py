@@ -142,7 +142,7 @@ def _curve(
     "detections per photon, without the dark counts",
     "at {} photons/s",
     ("photons on a pixel", "1/s"),
-    ("detections per photon, less those in the dark", ""),
+    ("detections per photon", ""),
     ("level", "linearity"),
     log="x",
 )
@@ -214,10 +214,10 @@ def columns(shots: Shots) -> Points:
 
 
 @_curve(
-    "counts of a pixel in 10 us",
-    "share of the counts of {}",
+    "frames of 10 us by their count",
+    "{} counts",
     ("count", ""),
-    ("share of the counts", ""),
+    ("share of the frames", ""),
     ("saturation",),
     ("bright", "brightest"),
     log="y",
@@ -264,6 +264,8 @@ def hazard(shots: Shots) -> Points:
 )
 def hazard_at_the_edge(shots: Shots) -> Points:
     middle = shots.dead_time * 1e9
+    if not middle:  # there is no edge
+        return np.zeros(1), np.full(1, np.nan)
     return _hazard(shots, np.arange(max(0.0, middle - 6), middle + 8.1, 0.4))
 
 
@@ -293,7 +295,7 @@ def _next_one(ended: np.ndarray, open_: np.ndarray, edges: np.ndarray) -> Points
     waits = np.sort(np.concatenate([ended, open_]))
     sums = np.concatenate([[0.0], np.cumsum(waits)])
     below = np.searchsorted(waits, edges)
-    waited = sums[below] + edges * (len(waits) - below)
+    waited = sums[below] + np.maximum(edges, 0.0) * (len(waits) - below)
     seen = np.histogram(ended, edges)[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         rate = np.where(len(waits) - below[:-1] > _FEW, seen / (np.diff(waited) * 1e-9), np.nan)
@@ -313,7 +315,7 @@ def hazard_of_array(shots: Shots) -> Points:
     order = np.argsort(image + shots.tr.times / (2 * shots.conditions.exposure), kind="stable")
     times, image = shots.tr.times[order], image[order]
     ended = np.diff(times)[image[1:] == image[:-1]] * 1e9
-    return _next_one(ended, np.zeros(0), np.arange(0, 60.5, 1.0))
+    return _next_one(ended, np.zeros(0), np.arange(-0.05, 60.5, 1.0))  # no edge on a stamp
 
 
 # --- correlations ---------------------------------------------------------------------------------------------------
@@ -377,7 +379,7 @@ def coincidences(shots: Shots) -> Points:
     image, pixel = np.divmod(shots.tr.rows, shots.tr.pixels)
     order = np.argsort(image + shots.tr.times / (2 * shots.conditions.exposure), kind="stable")
     image, pixel, times = image[order], pixel[order], shots.tr.times[order]
-    edges = np.arange(0, 41.0, 1.0)
+    edges = np.arange(-0.05, 41.0, 1.0)  # no edge on a stamp
     found = np.zeros(len(edges) - 1)
     for step in range(1, len(times)):
         between = (times[step:] - times[:-step]) * 1e9

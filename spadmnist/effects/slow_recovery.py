@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import numpy as np
 
 from .. import kernels
@@ -20,6 +22,7 @@ class SlowRecovery(Effect, stage="dead_time"):
     Source: Krause and Walenta, arXiv 2507.10361; typical 1-50 ns.
     """
 
+    shown: ClassVar[dict[str, Any]] = {"time_constant": 3e-9}  # the whole climb behind the dead time
     moves = ("edge", "intervals", "linearity", "fano", "level")
 
     time_constant = parameter(
