@@ -47,6 +47,8 @@ def haze() -> Iterator[type[Effect]]:
             """rate (1 - share)."""
             return rate * (1 - self.share)
 
+        expected_rate = apply
+
     try:
         yield Haze
     finally:
