@@ -69,97 +69,101 @@ class Said:
     """What the user says of the files, in SI. None where nothing was said: then the file is asked."""
 
     relative_uncertainty: float | None = _option(
-        f"Of the light's calibration, one standard deviation: 1.5 %.  [default: {UNCERTAIN:.0%}]",
+        f"Standard uncertainty of the light's calibration: 1.5 %.  [default: {UNCERTAIN:.0%}]",
         unit="",
         metavar="SHARE",
     )
     rows: int | None = _option(
-        "Of pixels, which are then the channels of the same number.  [default: 1 x channels in use, raw frames 512 x "
-        "512]",
+        "Rows of pixels. The channels fill them in order.  [default: 1 x channels in use; raw frames 512 x 512]",
         whole=(1, MOST_ROWS),
         names=("height",),
     )
-    columns: int | None = _option("Of pixels.", whole=(1, MOST_ROWS), names=("width",))
-    positions: Path | None = _option("x,y (um) of pixels that are no grid.", path=True, metavar="FILE.csv")
+    columns: int | None = _option("Columns of pixels.", whole=(1, MOST_ROWS), names=("width",))
+    positions: Path | None = _option("Positions x,y (um) of pixels that are not a grid.", path=True, metavar="FILE.csv")
     channels: tuple[str, ...] | None = _option(
-        "The channels that are pixels, in the pixels' order: 0,1,sync. Others are left out.",
+        "Channels that are pixels, in the order of the pixels: 0,1,sync. Others are left out.",
         modalities=_TIMES,
         metavar="LIST",
     )
     exposure: float | None = _option(
-        "How long was recorded.",
+        "Exposure.",
         modalities=_TIMES,
         unit="s",
         instead="frames last their number x --frame-period",
         ask=("how long was recorded", '"100 ms"'),
     )
     subtract_start: bool = _option(
-        "Of a clock that does not start at 0: the first detection is then at 0.", False, modalities=_TIMES, flag=True
+        "Subtract the time of the first detection, for a clock with another zero.",
+        False,
+        modalities=_TIMES,
+        flag=True,
     )
     tick: float | None = _option(
-        "Length of a tick, where the file does not say it; of a table 1 ps.",
+        "Length of a tick, if the file does not contain it; 1 ps for a table.",
         modalities=("tr", "str"),
         unit="s",
         ask=("the length of a tick", '"100 ps"'),
     )
-    modality: str | None = _option("Of a stack of numbers.", choices=MODALITIES)
+    modality: str | None = _option("Modality of a stack of numbers.", choices=MODALITIES)
     axes: str | None = _option(
-        "Of a stack: MHW (frames, rows, columns) or HWM (rows, columns, frames).  [default: MHW; of MATLAB HWM]",
+        "Axes of a stack: MHW (frames, rows, columns) or HWM (rows, columns, frames).  [default: MHW; MATLAB: HWM]",
         modalities=_FRAMES,
         own=STACKS,
         choices=("MHW", "HWM"),
     )
-    frames: int | None = _option("How many; the file is compared.", modalities=_FRAMES, whole=(1, 10**9))
+    frames: int | None = _option("Number of frames; the file must agree.", modalities=_FRAMES, whole=(1, 10**9))
     frame_time: float | None = _option(
-        "How long a frame looks.", modalities=_FRAMES, unit="s", ask=("how long a frame looks", '"10 us"')
+        "Frame time: how long a frame is live.", modalities=_FRAMES, unit="s", ask=("how long a frame looks", '"10 us"')
     )
     frame_period: float | None = _option(
-        "From one frame to the next.",
+        "Frame period: time from one frame to the next.",
         modalities=_FRAMES,
         unit="s",
         ask=("the time from one frame to the next", '"10 us"'),
     )
     bits: int | None = _option(
-        "Of a count; raw counts are a byte each, above 8 bits two.",
+        "Bits of a count. Raw counts are one byte each, two above 8 bits.",
         modalities=("counts",),
         whole=(1, 16),
         ask=("how many bits a count has", "8"),
     )
     counting: str | None = _option(
-        "A count is the sum of 2^bits - 1 binary frames (default), or of a counter in each frame.",
+        "What a count is: the sum of 2^bits - 1 binary frames (default), or a counter in each frame.",
         modalities=("counts",),
         choices=("frames", "counter"),
     )
-    packed: bool = _option("A byte is eight columns.", False, modalities=("qis",), own=BITS, flag=True)
+    packed: bool = _option("A byte is eight columns of bits.", False, modalities=("qis",), own=BITS, flag=True)
     bit_order: str | None = _option(
-        "Of packed bits: which one is the left column.  [default: big]",
+        "Bit of a packed byte that is the left column: the highest (big) or the lowest.  [default: big]",
         modalities=("qis",),
         own=BITS,
         choices=("big", "little"),
     )
-    dataset: str | None = _option("The frames.  [default: frames]", modalities=_FRAMES, own=PLAIN_HDF5, metavar="PATH")
+    dataset: str | None = _option(
+        "Data set of the frames.  [default: frames]", modalities=_FRAMES, own=PLAIN_HDF5, metavar="PATH"
+    )
     tdc: Path | None = _option(
-        "Ends of the codes, in ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.csv"
+        "Ends of the converter's codes, ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.csv"
     )
     offsets: Path | None = _option(
-        "Of the pixels, in ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.npy"
+        "Time offsets of the pixels, ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.npy"
     )
     firmware: str | None = _option(
-        "Decides what pixel an address is.",
+        "Firmware, which defines the pixel of an address.",
         modalities=_TIMES,
         own=LINOSPAD2,
         choices=("2212b", "2212s", "2208"),
         ask=("the firmware, which decides what pixel an address is", "2212b"),
     )
     timestamps: int | None = _option(
-        "Of a cycle.",
+        "Time stamps of a converter in a cycle.",
         modalities=_TIMES,
         own=LINOSPAD2,
         whole=(1, 2**20),
         ask=("how many words a converter has in a cycle", "512"),
     )
     cycle: float | None = _option(
-        "Its length.", modalities=_TIMES, own=LINOSPAD2, unit="s", ask=("how long a cycle is", '"4 ms"')
+        "Length of a cycle.", modalities=_TIMES, own=LINOSPAD2, unit="s", ask=("how long a cycle is", '"4 ms"')
     )
 
     @staticmethod

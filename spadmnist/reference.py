@@ -34,10 +34,10 @@ def effect_page(name: str) -> str:
     cls: type[Effect] = Effect.registry.find(name)
     facts = [f"stage: {cls.stage}"]
     if cls.after is not None:
-        facts.append(f"comes after {cls.after}")
+        facts.append(f"after {cls.after}")
     acts = [line for way in hooks(cls.stage, cls) for line in textwrap.wrap(" ".join(way), _WIDTH)]
     law = mean_law(cls)
-    mean = textwrap.wrap(f"Mean rate behind it: {law}", _WIDTH) if law else []
+    mean = textwrap.wrap(f"Mean rate after the effect: {law}", _WIDTH) if law else []
     return _page(cls, facts, ["In a config or a sensor file:", "", *effect_yaml(cls)], acts, mean)
 
 
@@ -83,7 +83,7 @@ def method_list() -> str:
 def method_page(name: str) -> str:
     """All about one method, with the YAML to paste. Raises KeyError with a sentence where there is none."""
     cls: type[Method] = Method.registry.find(name)
-    use = "divided by the training median" if cls.normalised else "used as it is, never normalised"
+    use = "normalised by the training median" if cls.normalised else "never normalised"
     facts = [f"needs: {', '.join(cls.readouts())}", f"unit: {cls.unit}", use]
     return _page(cls, facts, ["In a config:", "", f"  reconstruct: [{cls.name}]"])
 
@@ -93,14 +93,14 @@ def statistic_list() -> str:
     known: list[type[Statistic]] = [Statistic.registry.find(name) for name in Statistic.registry]
     known.sort(key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
     rows = [(cls.name, " ".join(cls.modalities), cls.unit, cls.summary()) for cls in known]
-    return listing(("statistic", "of", "unit", "what it looks at"), rows)
+    return listing(("statistic", "modality", "unit", "what it measures"), rows)
 
 
 def statistic_page(name: str) -> str:
     """All about one statistic. Raises KeyError with a sentence where there is none."""
     cls: type[Statistic] = Statistic.registry.find(name)
-    light = ["light: the same on all pixels; a scene is not asked"] if cls.flat else []
-    return _page(cls, [f"of: {', '.join(cls.modalities)}", f"unit: {cls.unit}", *light], [])
+    light = ["uniform light only, not scenes"] if cls.flat else []
+    return _page(cls, [f"modality: {', '.join(cls.modalities)}", f"unit: {cls.unit}", *light], [])
 
 
 # kind of plug-in -> its registry, the list of all, the page of one
@@ -155,21 +155,21 @@ def _page(
 
 
 def docstring(cls: type[Plugin]) -> list[str]:
-    """Its paragraphs, filled anew; a source begins a line of its own."""
+    """Its paragraphs, filled anew; a law, what it shows and a source begin a line of their own."""
     out: list[str] = []
     for number, paragraph in enumerate((inspect.getdoc(cls) or "").split("\n\n")):
         out += [""] if number else []
-        for part in re.split(r"\s(?=Source:)", paragraph):
+        for part in re.split(r"\s(?=(?:Law|Shows|Source): )", paragraph):
             out += textwrap.wrap(" ".join(part.split()), _WIDTH)
     return out
 
 
 def _parameters(declared: Sequence[Parameter]) -> list[str]:
     """A table, and below each row what the parameter is."""
-    rows = [(p.name, p.symbol or "-", *_numbers(p), _varies(p)) for p in declared]
+    rows = [(p.name, p.symbol or "-", *allowed_values(p), varies(p)) for p in declared]
     if not rows:
         return []
-    header = ("parameter", "symbol", "unit", "default", "allowed", "off", "search", "varies by")
+    header = ("parameter", "symbol", "unit", "default", "allowed", "off", "search", "may vary by")
     lines = _aligned([header, *rows])
     out = lines[:1]
     for line, parameter in zip(lines[1:], declared, strict=True):
@@ -177,7 +177,7 @@ def _parameters(declared: Sequence[Parameter]) -> list[str]:
     return out
 
 
-def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
+def allowed_values(declared: Parameter) -> tuple[str, str, str, str, str]:
     """(unit, default, allowed, off, search)."""
     unit = declared.unit or "1"
     if declared.choices:
@@ -191,7 +191,7 @@ def _numbers(declared: Parameter) -> tuple[str, str, str, str, str]:
     return unit, default, declared.allowed(), _value(declared, declared.off), search
 
 
-def _varies(declared: Parameter) -> str:
+def varies(declared: Parameter) -> str:
     ways = {declared.per: bool(declared.per), "wavelength": declared.by_wavelength}
     return " or ".join(way for way, can in ways.items() if can) or "-"
 

@@ -74,8 +74,8 @@ def _sensor() -> dict[str, Any]:
 def _measurement() -> dict[str, Any]:
     known: dict[str, Any] = {name: (kind, ...) for name, kind in entries.SECTIONS.items()}
     known |= {
-        "name": (entries.Name, "measurement"),
-        "captures": (Annotated[list[entries.Entry], Field(min_length=1)], ...),
+        "name": (entries.SECTIONS["name"], "measurement"),
+        "captures": (Annotated[list[entries.Entry], Field(min_length=1, description="the captures")], ...),
     }
     return _model("Measurement", known)
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -55,6 +55,7 @@ sensor:
 """
 _CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photons/s, exposures of one repetition
 _REPETITIONS = 32
+Lights = Mapping[str, tuple[float, int]]
 # what share of white each of its pixels sees, where the effect is one of scenes
 _SCENE = np.array([int(bit) for bit in f"{0xC3A5_1E78_5AD2_3C96:064b}"], np.float64)
 
@@ -118,6 +119,33 @@ def check_method(method: type[Method] | str) -> None:
         assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
         parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
         assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+
+
+def captured() -> list[str]:
+    """The names of the effects that the contract's sensor has of its own."""
+    return [effect.name for effect in _base().sensor.effects]
+
+
+def captures(
+    effect: type[Effect] | None, lights: Lights, repetitions: int = 32, absent: bool = False, **given: Any
+) -> dict[str, Shots]:
+    """Captures of the contract's sensor, with an effect as strong as the contract has it, or without; for pictures.
+
+    Args:
+        effect: the class; None, with `absent`: any that is not one of `captured` and not one of scenes.
+        lights: (photons/s, exposures of one repetition) by the name of the capture.
+        repetitions: of each capture.
+        absent: without the effect, the same light.
+        given: values in SI in place of those that the contract chooses; see `strong`.
+
+    Returns:
+        The `signatures.Shots` of each capture, by its name. The dead time in them is that of the sensor without the
+        effect.
+    """
+    plain = _sensor(None, "device", without=effect.name if effect else "")
+    sensor = plain if absent or effect is None else _Trial(effect, given).sensor("device")
+    split = "without" if sensor is plain else "with"
+    return _shots(sensor, split, repetitions, plain.nominal_dead_time, effect is not None and effect.of_scene, lights)
 
 
 # --- an effect and its sensor -------------------------------------------------------------------------------------
@@ -197,14 +225,20 @@ def _reference(without: str, scene: bool) -> dict[str, np.ndarray]:
 def _statistics(
     sensor: Sensor, split: str, repetitions: int, dead_time: float, scene: bool = False
 ) -> dict[str, np.ndarray]:
-    """scene: is the light that of a scene, and not the same on all pixels?"""
+    return signatures.statistics(**_shots(sensor, split, repetitions, dead_time, scene))
+
+
+def _shots(
+    sensor: Sensor, split: str, repetitions: int, dead_time: float, scene: bool, lights: Lights | None = None
+) -> dict[str, Shots]:
+    """Each capture of a sensor by its name. scene: is the light that of a scene, and not the same on all pixels?"""
     shots = {}
-    for name, (light, each) in _CAPTURES.items():
+    for name, (light, each) in (lights or _CAPTURES).items():
         photons, conditions = np.full((repetitions * each, sensor.layout.pixels), light), _conditions(light)
         photons *= _SCENE if scene else 1.0
         recorded = _expose(sensor, photons, conditions, split=f"{split}/{name}", readouts=("tr", "str", "qis"))
         shots[name] = Shots(recorded, sensor, conditions, each, dead_time)
-    return signatures.statistics(**shots)
+    return shots
 
 
 def _conditions(light: float, **changes: Any) -> Conditions:

@@ -84,6 +84,11 @@ def plain(text: str) -> str:
     return _MICRO.sub("u", text)
 
 
+def known() -> list[str]:
+    """The SI units by which dimensions are named; "" is that of plain numbers."""
+    return list(_DIMENSIONS)
+
+
 def is_known(unit: str) -> bool:
     """Is there a dimension whose SI unit is `unit`?"""
     return unit in _DIMENSIONS

@@ -183,7 +183,7 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
         "What is missing": (
             "1. crosstalk an effect that the model lacks · 35.2 sigma · mean rate +2.20% · misfit with it 11.2",
             Effect.registry.find("crosstalk").summary(),
-            "probability chance that an avalanche fires one given side neighbour 0.0051 0.0047 to 0.0055",
+            "probability probability that an avalanche fires one given side neighbour 0.0051 0.0047 to 0.0055",
             "1.12 ns 900 ps to 1.4 ns",
             "crosstalk (chosen) 11.2",
             "source_noise " + Effect.registry.find("source_noise").summary() + " 41.3",

@@ -158,7 +158,7 @@ def test_words_and_what_a_parameter_may_vary_by(blemish: Path) -> None:
 def test_the_law_of_the_mean_is_the_effect_s_own_word(blemish: Path) -> None:
     law = "r = (1 - depth) * rate, a blemish being as deep as that."
     for name in ("odd_blemish", "even_blemish"):
-        assert f"\n\nMean rate behind it: {law}\n\n" in reference.effect_page(name)
+        assert f"\n\nMean rate after the effect: {law}\n\n" in reference.effect_page(name)
         assert reference.as_data("effect", name)["expected_rate"] == law  # type: ignore[call-overload]
     assert "Mean rate" not in reference.effect_page("plain_blemish")
     assert reference.as_data("effect", "plain_blemish")["expected_rate"] is None  # type: ignore[call-overload]

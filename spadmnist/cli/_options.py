@@ -24,7 +24,7 @@ def plugin(command: F) -> F:
         multiple=True,
         type=click.Path(path_type=Path),
         metavar="FILE.py",
-        help="Load a file with effects or methods of your own (it is run as a program; repeatable).",
+        help="Load a Python file with your own effects, statistics or methods. It is executed. Repeatable.",
     )(command)
 
 
@@ -50,13 +50,13 @@ def jobs(command: F) -> F:
         type=click.IntRange(1, 4096),
         default=None,
         metavar="N",
-        help="Workers at a time. The result does not depend on it.  [default: one per processor]",
+        help="Number of worker processes. The result does not depend on it.  [default: one per processor]",
     )(command)
 
 
 def as_json(command: F) -> F:
     """`--json`, as `as_json`."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
+    return click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON.")(command)
 
 
 def crop(command: F) -> F:
@@ -64,7 +64,7 @@ def crop(command: F) -> F:
     return click.option(
         "--crop",
         metavar="ROW:ROW,COLUMN:COLUMN",
-        help="The part of SENSOR that was measured, stops excluded, as 100:150,200:250: its own maps, cut.",
+        help="The measured part of SENSOR, as 100:150,200:250; stops are excluded. Its maps are cropped.",
     )(command)
 
 
@@ -80,9 +80,9 @@ def beside(command: F) -> F:
             type=click.IntRange(0, 2**63 - 1),
             default=0,
             metavar="N",
-            help="Of the simulations.  [default: 0]",
+            help="Seed of the simulations.  [default: 0]",
         ),
-        click.option("--json", "json_file", type=Place(), metavar="FILE", help="Write the answer there, as JSON."),
+        click.option("--json", "json_file", type=Place(), metavar="FILE", help="Write the answer to FILE as JSON."),
         click.argument("measurement", type=path),
         click.argument("sensor", type=path),
     ):

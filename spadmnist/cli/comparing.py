@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     "-o",
     type=options.Place(),
     metavar="REPORT",
-    help="Folder for a report: one HTML page with pictures.",
+    help="Folder of the report, an HTML page with pictures.",
 )
 @click.option(
     "--tolerance",
     metavar="X",
-    help='What is smaller does not matter: "0.5 %" of the detections or of the rate.',
+    help='Largest deviation that passes, as a share of the detections or of the rate: "0.5 %".',
 )
 @options.beside
 def compare(
@@ -46,10 +46,10 @@ def compare(
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
-    """Set the model SENSOR beside MEASUREMENT: where does it fail, and by how much?
+    """Compare the model SENSOR with MEASUREMENT: where does it fail, and by how much?
 
-    Every capture is simulated many times. A check fails where the data lie outside what the model itself scatters; a
-    right model is called wrong once in a hundred comparisons. Exit status: 0 the model is adequate, 1 it fails.
+    Every capture is simulated many times. A check fails where the data lie outside the scatter of the simulations. A
+    right model fails in one of a hundred comparisons. Exit status: 0 the model is adequate, 1 it fails.
 
     \b
     spadmnist compare sensor.yaml lab/2025-03-01 -o report
@@ -101,16 +101,16 @@ def compare(
     "-o",
     type=options.Place(),
     metavar="FOLDER",
-    help="Folder for the report, an HTML page, and for the next sensor.yaml with its maps.",
+    help="Folder of the report, an HTML page, and of the next sensor.yaml with its maps.",
 )
 @click.option(
-    "--max-steps", type=click.IntRange(1, 12), default=12, metavar="N", help="At most so many.  [default: 12]"
+    "--max-steps", type=click.IntRange(1, 12), default=12, metavar="N", help="Largest number of steps.  [default: 12]"
 )
-@click.option("--quick", is_flag=True, help="Fewer simulations: a first answer.")
+@click.option("--quick", is_flag=True, help="Fewer simulations, for a first answer.")
 @click.option(
     "--within",
     metavar="TIME",
-    help="Budget of work, as time of two idle cores: 3 min; none, for no end.  [default: 10 min; with --quick 3 min]",
+    help="Budget, as time on two idle cores: 3 min. none: no limit.  [default: 10 min; with --quick 3 min]",
 )
 @options.beside
 def diagnose(
@@ -126,10 +126,10 @@ def diagnose(
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
-    """Find out which effect the model SENSOR lacks beside MEASUREMENT, add it, and watch the error fall.
+    """Find the effects of MEASUREMENT that the model SENSOR lacks, and add them.
 
-    Every registered effect is tried, those of --plugin files too, every listed number at another value, every
-    per-pixel parameter as a map. After each step the answer so far is written, so that Ctrl-C leaves it.
+    Tried are every registered effect, those of --plugin files included, every listed parameter at another value, and
+    every per-pixel parameter as a map. The answer so far is written after each step, so that Ctrl-C keeps it.
 
     \b
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
@@ -175,10 +175,16 @@ def diagnose(
 
 
 @cli.verb(140, short_help="Fit parameters of a model.")
-@click.option("--output", "-o", type=options.Place(), metavar="NEXT.yaml", required=True, help="New file.")
-@click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add an effect and fit it.")
-@click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Fit a parameter.")
-@click.option("--per-pixel", "mapped", multiple=True, metavar="EFFECT.PARAMETER", help="Fit a map.")
+@click.option("--output", "-o", type=options.Place(), metavar="NEXT.yaml", required=True, help="Fitted sensor file.")
+@click.option("--add", "added", multiple=True, metavar="EFFECT", help="Add EFFECT and fit its parameters. Repeatable.")
+@click.option("--free", "freed", multiple=True, metavar="EFFECT.PARAMETER", help="Fit a listed parameter. Repeatable.")
+@click.option(
+    "--per-pixel",
+    "mapped",
+    multiple=True,
+    metavar="EFFECT.PARAMETER",
+    help="Fit a map. Repeatable.",
+)
 @options.beside
 def fit(
     sensor: Path,
@@ -193,7 +199,7 @@ def fit(
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
-    """Fit parameters of the model SENSOR against MEASUREMENT, with 95 % intervals.
+    """Fit parameters of the model SENSOR to MEASUREMENT, with 95 % intervals.
 
     \b
     spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     "-o",
     type=options.Place(),
     metavar="OUT",
-    help="Folder of the dataset.  [default: the config's name]",
+    help="Folder of the dataset.  [default: the name of the config]",
 )
 @click.option(
     "--lux",
     "levels",
     multiple=True,
     metavar="LEVEL",
-    help='Only this light level, as the config writes it: --lux "5 mlux" (repeatable).',
+    help='Only this light level, as the config writes it: --lux "5 mlux". Repeatable.',
 )
 @click.option(
     "--limit",
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     "--images-dir",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Where the images lie. Without it MNIST is looked for in $SPADMNIST_DATA, then downloaded once.",
+    help="Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
 )
 @options.jobs
 @click.option(
@@ -53,17 +53,17 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 2**63 - 1),
     default=None,
     metavar="N",
-    help="Another seed than the config's.",
+    help="Seed, in place of that of the config.",
 )
 @click.option(
     "--format",
     "format_",
     type=click.Choice(["zarr", "hdf5"]),
     default=None,
-    help="Another format than the config's.",
+    help="Format, in place of that of the config.",
 )
-@click.option("--causes", is_flag=True, help="Store of every detection what made it, and its parent.")
-@click.option("--dry-run", is_flag=True, help="Say photons, bytes, memory and time, and make nothing.")
+@click.option("--causes", is_flag=True, help="Store the cause and the parent of every detection.")
+@click.option("--dry-run", is_flag=True, help="Print photons, bytes, memory and time, and make nothing.")
 @options.plugin
 @options.as_json
 def generate(
@@ -82,11 +82,12 @@ def generate(
 ) -> None:
     """Make the dataset that CONFIG describes.
 
-    The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
-    drawn value of what is made.
+    The same command again resumes an interrupted run. --lux, --limit, --jobs and --causes do not change the random
+    numbers of what is made.
 
-    Pictures of your own are `source: folder` (spadmnist init writes such a config). A pixel's photons follow its grey
-    level. With `gamma: srgb` the level is first taken back from sRGB to light: half of white gets 21 % of its photons.
+    Your own pictures are `source: folder`; spadmnist init writes such a config. The photons of a pixel are
+    proportional to its grey level. With `gamma: srgb` the level is first converted from sRGB to linear light: half of
+    white then gets 21 % of the photons of white.
 
     \b
     spadmnist generate configs/quick.yaml -o out
@@ -136,22 +137,22 @@ def generate(
         terminal.say(f"Look at it:  spadmnist inspect {quoted(root)} --plot {quoted(f'{root.name}.png')}")
 
 
-@cli.verb(20, short_help="Begin: a config and a sensor, or a plan for a bench, every line explained.")
+@cli.verb(20, short_help="Write a first config and sensor, or a plan of captures, every line explained.")
 @click.argument("folder", type=options.Place())
-@click.option("--images", type=click.Path(path_type=Path), metavar="DIR", help="A folder of pictures of your own.")
+@click.option("--images", type=click.Path(path_type=Path), metavar="DIR", help="Folder of your own pictures.")
 @click.option(
     "--sensor",
     type=click.Choice(["spad23", "spad512", "spad_mnist"]),
     default="spad_mnist",
-    help="The sensor to begin with.  [default: spad_mnist]",
+    help="Sensor of the config.  [default: spad_mnist]",
 )
-@click.option("--measurement", is_flag=True, help="A plan of captures instead, which `import -o FOLDER` fills.")
+@click.option("--measurement", is_flag=True, help="Write a plan of captures instead. `import -o FOLDER` fills it.")
 @options.as_json
 def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_json: bool) -> None:
     """Write FOLDER/config.yaml and FOLDER/sensor.yaml, which run as they are, or FOLDER/measurement.yaml.
 
-    Beside them lie their JSON Schemas, with which an editor completes and checks. A config for pictures has gamma:
-    srgb. Light is linear and pictures are not: a value of half of white then gets 21 % of white's photons.
+    Their JSON Schemas are written to FOLDER, too; an editor completes and checks with them. A config of pictures has
+    gamma: srgb, because pictures are not linear in the light: half of white then gets 21 % of the photons of white.
 
     \b
     spadmnist init my --images photos --sensor spad512
@@ -185,20 +186,20 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
     "methods",
     multiple=True,
     metavar="METHOD",
-    help="A method (repeatable).  [default: all that the readouts allow]",
+    help="Method of reconstruction. Repeatable.  [default: all that the readouts allow]",
 )
 @click.option(
     "--output",
     "-o",
     type=options.Place(),
     metavar="FOLDER",
-    help="Of a measurement: folder of its images.  [default: NAME-flux, here]",
+    help="Measurement: folder of the images.  [default: NAME-flux, here]",
 )
 @click.option(
     "--sensor",
     type=click.Path(path_type=Path),
     metavar="SENSOR",
-    help="Of a measurement: whose PDP and dead time the methods are told.  [default: 1, and 0 s]",
+    help="Measurement: sensor with the PDP and the dead time of the methods.  [default: 1 and 0 s]",
 )
 @options.crop
 @options.jobs
@@ -214,11 +215,11 @@ def reconstruct_(
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Make flux images from the raw streams of DATASET, and add them to it; or from the captures of MEASUREMENT, and
-    write them to a folder: <capture>.<method>.npy, and sheet.png.
+    """Make flux images of the raw streams of DATASET or MEASUREMENT.
 
-    The dataset is then, byte for byte, what `generate` makes of a config that lists these methods. A measurement's
-    images are photons/s where SENSOR (a sensor file, or a config) is given, otherwise detections/s.
+    Images of a dataset are added to it. It is then, byte for byte, the dataset of a config that lists these methods.
+    Images of a measurement are written to a folder: <capture>.<method>.npy, and sheet.png. Their unit is photons/s with
+    SENSOR (a sensor file, or a config), otherwise detections/s.
 
     \b
     spadmnist reconstruct out --method inter_photon
@@ -288,12 +289,12 @@ def _reconstruct_measurement(
 
 @cli.verb(70, short_help="Compare every byte with the manifest; repair.")
 @click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--repair", is_flag=True, help="Make exactly the damaged files again.")
+@click.option("--repair", is_flag=True, help="Make the damaged files again.")
 @click.option(
     "--images-dir",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="For --repair: where the images lie, if the dataset's own copy is damaged.",
+    help="For --repair: folder of the images, if the copy in the dataset is damaged.",
 )
 @options.jobs
 @options.plugin
@@ -306,9 +307,9 @@ def verify(
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Compare every byte of DATASET with its manifest; name each file that is changed, missing or extra.
+    """Compare every byte of DATASET with its manifest, and name each file that is changed, missing or extra.
 
-    Exit status 0: as it was made; 1: damage was found (and not repaired).
+    Exit status: 0 the dataset is intact, 1 damage was found and not repaired.
     """
     from .. import verify as library
 

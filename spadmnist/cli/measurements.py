@@ -13,18 +13,20 @@ from . import _terminal as terminal
 from ._group import cli
 
 
-@cli.verb(50, short_help="Say and show what a dataset or a measurement holds.")
+@cli.verb(50, short_help="Show what a dataset or a measurement holds.")
 @click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
 @click.option(
     "--plot",
     type=options.Place(),
     metavar="FILE.png",
-    help="Draw a sheet: images in all readouts and methods, or maps, rates and intervals of captures.",
+    help="Draw a sheet of images in all readouts and methods, or of maps, rates and intervals of captures.",
 )
 @options.as_json
 def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
-    """Say what DATASET holds: per light level detections, empty and saturated pixels, bytes, bits per detection; or
-    MEASUREMENT: per capture detections, rates, empty, hot and dead pixels, intervals.
+    """Show what DATASET or MEASUREMENT holds.
+
+    Of a dataset, for each light level: detections, empty and saturated pixels, bytes, bits per detection. Of a
+    measurement, for each capture: detections, rates, empty, hot and dead pixels, intervals.
 
     \b
     spadmnist inspect out
@@ -74,7 +76,7 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
         terminal.say(f"Drawn: {plot}")
 
 
-@cli.verb(60, short_help="Make the model's twin of a measurement.")
+@cli.verb(60, short_help="Simulate the captures of a measurement with a model.")
 @click.argument("sensor", type=click.Path(path_type=Path))
 @click.argument("measurement", type=click.Path(path_type=Path))
 @click.option(
@@ -83,10 +85,10 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
     type=options.Place(),
     metavar="OUT",
     required=True,
-    help="Folder of the twin, which is a measurement too.",
+    help="Folder of the simulated measurement.",
 )
 @click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the draws.  [default: 0]"
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulation.  [default: 0]"
 )
 @options.crop
 @options.plugin
@@ -148,23 +150,21 @@ def _import_option(name: str, declared: Any, about: str) -> click.Option:
     return click.Option([*words, name], type=kind, default=None, metavar=metavar, help=about)
 
 
-@cli.verb(80, "import", cls=_ImportCommand, short_help="Make a measurement of files that other programs wrote.")
+@cli.verb(80, "import", cls=_ImportCommand, short_help="Make a measurement from files of other programs.")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@click.option("--output", "-o", type=options.Place(), metavar="MEASUREMENT", help="Its folder.")
-@click.option("--name", metavar="NAME", help="Of the measurement.  [default: that of the file or folder]")
+@click.option("--output", "-o", type=options.Place(), metavar="MEASUREMENT", help="Folder of the measurement or plan.")
+@click.option("--name", metavar="NAME", help="Name of the measurement.  [default: that of the file or folder]")
 @click.option(
     "--light",
     "lights",
     multiple=True,
     metavar="LIGHT",
     help=(
-        'What fell on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2", or a scene, '
+        'Light on the sensor: dark, free (unknown), "500 nm 75.67 nW/cm^2", or a scene, '
         '"image:chart.npy 80 mlux". Once for all files, or once for each.'
     ),
 )
-@click.option(
-    "--capture", "ids", multiple=True, metavar="ID", help="Of a plan: the capture that a file is, once for each file."
-)
+@click.option("--capture", "ids", multiple=True, metavar="ID", help="Plan: the capture of a file, once for each file.")
 @options.as_json
 def import_(
     files: tuple[Path, ...],
@@ -175,14 +175,14 @@ def import_(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Make a measurement of FILES, each a capture that is named as its file.
+    """Make a measurement from FILES. Each file is a capture with the name of the file.
 
-    The kind of a file is found by its content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
-    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by its name: LinoSPAD2 .dat, raw frames .bin (bits; counts with --bits),
-    CSV of pixel and time. What no file says is asked for. Times are written with their unit: --exposure "100 ms".
+    The format is recognised by the content: PicoQuant PTU (T2), Photon-HDF5, plain HDF5 (time and pixel, or frames),
+    NumPy .npy and .npz, TIFF, MATLAB 7.3; or by the name: LinoSPAD2 .dat, raw frames .bin (bits; counts with --bits),
+    CSV of pixel and time. What a file does not contain is an option. Times have a unit: --exposure "100 ms".
 
-    Where MEASUREMENT is a plan, a measurement.yaml whose captures have no files yet, FILES become its captures: by
-    name, by --capture, or in order. Light, clock and pixels are then the plan's, and a contradiction is an error.
+    MEASUREMENT may be a plan: a measurement.yaml whose captures have no files yet. FILES become its captures, by name,
+    by --capture, or in order. Light, clock and pixels are those of the plan. A contradiction is an error.
 
     \b
     spadmnist import t2.ptu -o lab --light free
@@ -221,7 +221,7 @@ def import_(
     "-o",
     type=options.Place(),
     metavar="OUT",
-    help="A folder, or a file for one capture, or (.npz) for one level and split.",
+    help="Folder; or the file of one capture; or, with .npz, the file of one level and split.",
 )
 @click.option(
     "--format",
@@ -229,17 +229,17 @@ def import_(
     type=click.Choice(["photon-hdf5", "hdf5", "npz", "npy", "png", "parquet", "webdataset"]),
     help="Captures: photon-hdf5 (stamps), npy (frames), hdf5, npz. Images: npz, png (fluxes), parquet, webdataset.",
 )
-@click.option("--capture", "ids", multiple=True, metavar="ID", help="Only this capture (repeatable).")
-@click.option("--lux", "levels", multiple=True, metavar="LEVEL", help="Of images: only this light level (repeatable).")
-@click.option("--split", "splits", multiple=True, metavar="SPLIT", help="Of images: only this split (repeatable).")
-@click.option("--limit", type=click.IntRange(1), metavar="N", help="Of images: the first N of each level and split.")
-@click.option("--method", "methods", multiple=True, metavar="METHOD", help="Of images: only this flux (repeatable).")
+@click.option("--capture", "ids", multiple=True, metavar="ID", help="Only this capture. Repeatable.")
+@click.option("--lux", "levels", multiple=True, metavar="LEVEL", help="Images: only this light level. Repeatable.")
+@click.option("--split", "splits", multiple=True, metavar="SPLIT", help="Images: only this split. Repeatable.")
+@click.option("--limit", type=click.IntRange(1), metavar="N", help="Images: the first N of each level and split.")
+@click.option("--method", "methods", multiple=True, metavar="METHOD", help="Images: only this flux. Repeatable.")
 @click.option(
     "--readout",
     "readouts",
     multiple=True,
     type=click.Choice(["tr", "str", "qis", "counts"]),
-    help="Of a dataset: only this readout (of images repeatable).",
+    help="Dataset: only this readout. Repeatable for images.",
 )
 @options.as_json
 def export(
@@ -256,8 +256,8 @@ def export(
 ) -> None:
     """Write the captures of MEASUREMENT (or of a dataset of uniform images), or the images of DATASET, to OUT.
 
-    Files of captures say how each was recorded, so that `import` gives it back as it was; .npy alone does not. Of
-    images, OUT holds <level>/<split>/ as the dataset does, a row an image; parquet has a card and croissant.json.
+    The file of a capture contains its light and clock, so that `import` restores it; .npy does not. Images are written
+    to OUT/<level>/<split>/, a row an image; parquet adds a card and croissant.json.
 
     \b
     spadmnist export lab -o dark.hdf5 --format photon-hdf5 --capture dark

@@ -40,21 +40,21 @@ class _ExperimentCommand(click.Command):
 _OWN = "spadmnist.options"  # where a context keeps the options of an experiment
 
 
-@cli.verb(160, "experiment", cls=_ExperimentCommand, short_help="Do an experiment of the paper again.")
+@cli.verb(160, "experiment", cls=_ExperimentCommand, short_help="Repeat an experiment of the paper.")
 @click.argument("name", required=False)
 @click.option(
     "--output",
     "-o",
     type=options.Place(),
     metavar="OUT",
-    help="Folder of the data, the results and the page.",
+    help="Folder of the data, the results and the report.",
 )
-@click.option("--quick", is_flag=True, help="Less of everything: a first answer in minutes.")
+@click.option("--quick", is_flag=True, help="Fewer images and epochs, for a first answer in minutes.")
 @click.option(
     "--images-dir",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Where the images lie. Without it MNIST is looked for in $SPADMNIST_DATA, then downloaded once.",
+    help="Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
 )
 @options.jobs
 @options.as_json
@@ -67,10 +67,10 @@ def experiment_(
     as_json: bool,
     **own: Any,
 ) -> None:
-    """List the experiments of the paper; with NAME describe one and its own options; with OUT do it.
+    """List the experiments of the paper. With NAME describe one and its own options; with OUT run it.
 
-    The same command again goes on where an interrupted run stopped. OUT then holds report.html, the pictures, and the
-    results, a file each and as one table.
+    The same command again resumes an interrupted run. OUT contains report.html, the pictures, and the results, each
+    in a file and all in one table.
 
     \b
     spadmnist experiment

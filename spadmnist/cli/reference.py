@@ -16,9 +16,9 @@ from ._group import cli
 @click.argument("kind", required=False, default="config")
 @options.plugin
 def schema_(kind: str, plugin_files: tuple[Path, ...]) -> None:
-    """Print the JSON Schema of a config, made from the classes; or, KIND being sensor or measurement, that of theirs.
+    """Print the JSON Schema of the YAML files. KIND is config, sensor or measurement.
 
-    An editor that knows YAML completes and checks with it, where the first line of the file names the schema's:
+    An editor completes and checks a YAML file with it, if the first line of the file names the schema:
 
     \b
     spadmnist schema > config.schema.json
@@ -30,10 +30,10 @@ def schema_(kind: str, plugin_files: tuple[Path, ...]) -> None:
     terminal.print_lines(schema.text(kind).rstrip("\n"))
 
 
-@cli.verb(100, "effects", short_help="List physical effects, describe one, or begin one of your own.")
+@cli.verb(100, "effects", short_help="List physical effects, describe one, or begin your own.")
 @click.argument("name", required=False)
-@click.option("--new", metavar="NAME", help="Write NAME.py here: an effect of your own that works at once.")
-@click.option("--stage", metavar="STAGE", help="For --new: where on the line it acts.  [default: dark]")
+@click.option("--new", metavar="NAME", help="Write NAME.py, an effect that works, to be changed.")
+@click.option("--stage", metavar="STAGE", help="For --new: stage of the effect.  [default: dark]")
 @options.plugin
 @options.as_json
 def effects_(
@@ -76,12 +76,12 @@ def _begin_effect(name: str, stage: str | None, as_json: bool) -> None:
         terminal.print_line(line)
 
 
-@cli.verb(110, "statistics", short_help="List what measurements are compared by, or describe one.")
+@cli.verb(110, "statistics", short_help="List the statistics of comparisons, or describe one.")
 @click.argument("name", required=False)
 @options.plugin
 @options.as_json
 def statistics_(name: str | None, plugin_files: tuple[Path, ...], as_json: bool) -> None:
-    """List the statistics by which models and measurements are compared, or describe NAME with its law.
+    """List the statistics by which a model is compared with a measurement, or describe NAME with its law.
 
     \b
     spadmnist statistics

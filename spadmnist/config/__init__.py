@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
+from pydantic import Field
 
 from .. import document
 from ..document import Document, Path_
@@ -26,7 +27,7 @@ from ._sections import _DEFAULTS, _SECTIONS, _Scene, _Sensor
 
 def entries() -> dict[str, tuple[Any, Any]]:
     """The entries of a config by name: pydantic's kind, and the default, `...` where there is none."""
-    kinds = {**_SECTIONS, "sensor": str | _Sensor}
+    kinds = {**_SECTIONS, "sensor": Annotated[str | _Sensor, Field(description="the sensor, or the file of one")]}
     return {name: (kind, _DEFAULTS.get(name, ...)) for name, kind in kinds.items()}
 
 

@@ -52,12 +52,20 @@ _LENGTHS = {
 
 
 class _Scene(Section):
+    """Images and light levels. The levels are given once, as lux or as irradiance."""
+
     model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["lux"]}, {"required": ["irradiance"]}]})
 
-    images: ImageSource
-    wavelength: Annotated[Any, PlainValidator(_of_light), WithJsonSchema(_LENGTHS)] = Field(default="555 nm")
-    lux: list[Lux] | None = Field(default=None, min_length=1)
-    irradiance: list[Irradiance] | None = Field(default=None, min_length=1)
+    images: ImageSource = Field(description="source of the images")
+    wavelength: Annotated[Any, PlainValidator(_of_light), WithJsonSchema(_LENGTHS)] = Field(
+        default="555 nm", description="wavelength of the light, or of each channel of colour images"
+    )
+    lux: list[Lux] | None = Field(
+        default=None, min_length=1, description="light levels: illuminance of the sensor where the image is white"
+    )
+    irradiance: list[Irradiance] | None = Field(
+        default=None, min_length=1, description="light levels: irradiance of the sensor where the image is white"
+    )
 
     @property
     def wavelengths(self) -> tuple[units.Quantity, ...]:
@@ -66,47 +74,72 @@ class _Scene(Section):
 
 
 class _Recording(Section):
-    exposure: Time
-    frames: int | None = Field(default=None, ge=1, le=10**9)
-    frame_time: Time | None = None
-    frame_period: Time | None = None
-    readouts: list[Literal["tr", "str", "qis", "counts"]] = Field(default=["tr", "str", "qis"], min_length=1)
-    bits: int | None = Field(default=None, ge=1, le=12)
-    counting: Literal["frames", "counter"] | None = None
+    """Exposure, frames and readouts. The exposure is frames x frame_period."""
+
+    exposure: Time = Field(description="exposure of an image")
+    frames: int | None = Field(default=None, ge=1, le=10**9, description="number of frames; needed by str, qis, counts")
+    frame_time: Time | None = Field(default=None, description="time for which a frame is live")
+    frame_period: Time | None = Field(
+        default=None, description="time from one frame to the next; the frame time without it"
+    )
+    readouts: list[Literal["tr", "str", "qis", "counts"]] = Field(
+        default=["tr", "str", "qis"],
+        min_length=1,
+        description="what is recorded: time stamps, first time stamps of frames, 1-bit frames, count frames",
+    )
+    bits: int | None = Field(default=None, ge=1, le=12, description="bits of a count; needed by counts")
+    counting: Literal["frames", "counter"] | None = Field(
+        default=None,
+        description="a count is the sum of 2^bits - 1 binary frames, or a counter in each frame; frames without it",
+    )
 
 
 class _Output(Section):
-    format: Literal["zarr", "hdf5"] = "zarr"
+    """The files of the dataset."""
+
+    format: Literal["zarr", "hdf5"] = Field(default="zarr", description="format of the shards")
 
 
 class _Layout(Section):
+    """The pixels: a grid, or a list of positions."""
+
     model_config = ConfigDict(
         json_schema_extra={"oneOf": [{"required": ["rows", "columns"]}, {"required": ["positions"]}]}
     )
 
-    rows: int | None = Field(default=None, ge=1, le=100_000)
-    columns: int | None = Field(default=None, ge=1, le=100_000)
-    positions: str | None = None  # a CSV file, instead of rows and columns
-    pixel_area: Area
-    fill_factor: Share = Field(default="1")  # type: ignore[assignment]
+    rows: int | None = Field(default=None, ge=1, le=100_000, description="rows of the grid")
+    columns: int | None = Field(default=None, ge=1, le=100_000, description="columns of the grid")
+    positions: str | None = Field(
+        default=None, description="CSV file with x, y in um of each pixel, instead of rows and columns"
+    )
+    pixel_area: Area = Field(description="area of a pixel")
+    fill_factor: Share = Field(  # type: ignore[assignment]
+        default="1", description="share of the pixel area that is active"
+    )
 
 
 class _Sensor(Section):
-    name: str = ""
-    rules: Literal["paper", "device"] = "paper"
-    chip_seed: int = Field(default=0, ge=0, lt=2**63)
+    """A sensor: a layout of pixels and a list of effects."""
+
+    name: str = Field(default="", description="name of the sensor, for reports")
+    rules: Literal["paper", "device"] = Field(
+        default="paper", description="the paper's Algorithm 1, or a real pixel, which fires once a frame"
+    )
+    chip_seed: int = Field(default=0, ge=0, lt=2**63, description="seed of what is fixed when the chip is made")
     layout: _Layout
     effects: dict[str, Any]  # each is read by what its class declares
 
 
 # the sections of a config: each is checked by itself, so that a mistake in one hides none in another
 _SECTIONS: dict[str, Any] = {
-    "seed": Annotated[int, Field(ge=0, lt=2**63)],
-    "limit": Annotated[int | None, Field(ge=1), LATER],
-    "causes": Annotated[bool, LATER],
+    "seed": Annotated[int, Field(ge=0, lt=2**63, description="seed of all random numbers")],
+    "limit": Annotated[int | None, Field(ge=1, description="only the first images of each split"), LATER],
+    "causes": Annotated[bool, Field(description="store the cause and the parent of every detection"), LATER],
     "scene": _Scene,
     "recording": _Recording,
-    "reconstruct": list[str] | None,
+    "reconstruct": Annotated[
+        list[str] | None, Field(description="methods of flux images; without it all that the readouts allow")
+    ],
     "sensor": Any,
     "output": _Output,
 }

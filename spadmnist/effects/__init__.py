@@ -154,6 +154,8 @@ class Effect(Plugin, abstract=True):
     )
     # which statistics it moves, for the contract tests (`spadmnist.testing`); every other one stays as it is
     moves: ClassVar[tuple[str, ...]] = ()
+    # values (SI) with which pictures show it, where those that the contract test chooses show it less well
+    shown: ClassVar[dict[str, Any]] = {}
     mimic: ClassVar[Mimic | None] = None
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):

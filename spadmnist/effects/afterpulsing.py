@@ -7,12 +7,13 @@ from ._traps import Traps
 
 
 class Afterpulsing(Traps):
-    """An avalanche fills a trap, and its release fires the same pixel again: at most once, an exponential time later.
+    """An avalanche fills a trap, whose release fires the same pixel again.
 
-    The time counts from the end of the dead time. By the paper's rules every event may have an afterpulse, also one
-    that the dead time hides; by a device's, recorded ones alone, afterpulses among them.
-    Source: Suonsivu et al., Alg. 1 lines 14-18; probability below 1 % (Table 1), lifetimes from a few to thousands
-    of ns.
+    An avalanche has at most one afterpulse. The delay is exponential and counts from the end of the dead time. Under
+    `rules: paper` every event may have an afterpulse, one that the dead time hides as well. Under `rules: device` only
+    recorded detections do, afterpulses among them.
+    Source: Suonsivu et al., Alg. 1 lines 14-18; probability below 1 % (Table 1), lifetimes from a few to thousands of
+    ns.
     """
 
     cause = "afterpulse"
@@ -21,7 +22,7 @@ class Afterpulsing(Traps):
     probability = parameter(
         0.005,
         "",
-        "chance that an avalanche has an afterpulse",
+        "probability that an avalanche has an afterpulse",
         symbol="P_ap",
         bounds=(0, 1),
         off=0.0,
@@ -31,7 +32,7 @@ class Afterpulsing(Traps):
     lifetime = parameter(
         25e-9,
         "s",
-        "de-trapping lifetime: mean time to the release, after the dead time",
+        "de-trapping lifetime: mean delay of the release after the dead time",
         symbol="tau_bar",
         bounds=(0, None),
         open_bounds=True,

@@ -8,10 +8,10 @@ from . import Conditions, Effect, parameter
 
 
 class BackgroundLight(Effect, stage="dark"):
-    """Stray light that reaches the pixels while the shutter is open, whatever the lamp: more detections, evenly.
+    """Stray light adds detections at a constant rate while the shutter is open.
 
-    It is a rate of detections, so the PDP has no say in it; in a dark capture the shutter is closed and there is
-    none. Under both rules it joins the photons and the dark counts in one Poisson process.
+    The rate is one of detections: the PDP does not change it. A dark capture has none, because its shutter is closed.
+    Under both rules the rate joins photons and dark counts in one Poisson process.
     Source: no published number; up to 20 % of the signal is realistic.
     """
 
@@ -20,7 +20,7 @@ class BackgroundLight(Effect, stage="dark"):
     rate = parameter(
         100.0,
         "Hz",
-        "detections per pixel that stray light causes while the shutter is open",
+        "rate of detections of a pixel by stray light",
         bounds=(0, None),
         off=0.0,
         search=(1, 1e5),

@@ -49,13 +49,13 @@ def is_on(
 
 
 class BlinkingDarkCounts(Effect, stage="arrival"):
-    """Some pixels have a defect that switches on and off by itself and adds dark counts while it is on.
+    """Some pixels have a defect that switches on and off and adds dark counts while it is on.
 
-    Each pixel is hit with probability `fraction`, independently, when the chip is made. A defect is a telegraph with
-    two states, in equilibrium when an exposure begins, and different in every image and pixel; its dark counts join
-    the others under both rules, light or no light.
-    Source: random telegraph signals of SPADs, Sci. Rep. (2021) s41598-021-87962-w, Table 3: 37-84 % of the pixels
-    after irradiation, few without; 0.1-10 times the dark count rate, for 10 ms to 1000 s.
+    Each pixel has a defect with probability `fraction`, drawn when the chip is made. A defect is a telegraph process
+    with two states. It is in equilibrium when an exposure begins, and independent in every image and pixel. Its dark
+    counts join the others under both rules, in the light and in the dark.
+    Source: random telegraph signals of SPADs, Sci. Rep. (2021) s41598-021-87962-w, Table 3: 37-84 % of the pixels after
+    irradiation, few without; 0.1-10 times the dark count rate, for 10 ms to 1000 s.
     """
 
     counted = True
@@ -65,7 +65,7 @@ class BlinkingDarkCounts(Effect, stage="arrival"):
     amplitude = parameter(
         1000.0,
         "Hz",
-        "dark count rate that is added while the defect is on",
+        "dark count rate added while the defect is on",
         bounds=(0, None),
         off=0.0,
         search=(1, 1e5),

@@ -9,10 +9,10 @@ from ._pattern import Pattern
 
 
 class ColumnPattern(Pattern, stage="light"):
-    """The pixels of a column share a gain: columns are supplied and read out together.
+    """The pixels of a column share a gain.
 
-    It multiplies the light that counts, under both rules; dark counts stay as they are. Of pixels that are placed one
-    by one each is a column of its own.
+    The gain multiplies the light under both rules. Dark counts do not change. Columns are supplied and read out
+    together. In a layout with positions each pixel is a column.
     Source: no published number; 0.1-3 % from column to column is realistic.
     """
 

@@ -8,17 +8,17 @@ from . import Chip, Effect, parameter
 
 
 class CountSaturation(Effect, stage="readout"):
-    """The counter of a pixel stays at its largest number, 2^bits - 1, however many more events a frame has.
+    """The counter of a pixel stops at its largest number, 2^bits - 1.
 
-    Acts on the counts of frames, the same under both rules, and on no stream of stamps. It is no sum of binary frames,
-    whose counts never pile up at the top.
+    The effect acts on the counts of frames, the same under both rules, and not on time stamps. Counts pile up at the
+    largest number. The sum of binary frames does not pile up: its law is binomial.
     Source: counters of 1-12 bit; no published number.
     """
 
     counted = True
     moves = ("saturation",)
 
-    bits = parameter(8.0, "", "length of the counter", bounds=(1, 32), search=(1, 16))
+    bits = parameter(8.0, "", "number of bits of the counter", bounds=(1, 32), search=(1, 16))
 
     def made(self, chip: Chip) -> None:
         if self.bits != int(self.bits):

@@ -15,14 +15,16 @@ _CERTAIN = 40.0  # hazard of a neighbour that is hit for certain: exp(-40) is le
 
 
 class Crosstalk(Effect, stage="correlated"):
-    """The light of an avalanche fires neighbouring pixels, each by itself, with a chance that falls with distance d.
+    """The light of an avalanche fires other pixels with a probability that falls with their distance.
 
-    Chance: probability * K(d), d in pitches. K(1) = 1, K = diagonal_ratio^((d - 1) / (sqrt 2 - 1)), and beyond the
-    diagonal at least far_ratio / d, as of light that spreads in the plane of the chip, up to `reach`. By the paper's
-    rules every event may do so, and what it causes goes no further; by a device's, recorded ones alone, in cascades.
+    The probability for one pixel at distance d, in pitches, is probability * K(d). K(1) = 1 and K(d) =
+    diagonal_ratio^((d - 1) / (sqrt 2 - 1)). Beyond the diagonal K(d) is at least far_ratio / d, as for light that
+    spreads in the plane of the chip. Pixels beyond `reach` are not fired. Each pixel is fired independently. Under
+    `rules: paper` every event may cause crosstalk, and crosstalk causes none. Under `rules: device` only recorded
+    detections do, in cascades.
     Source: 0.1 % to side neighbours, 0.016 % to diagonal ones in 48-pixel arrays (Ingargiola et al., bioRxiv 207118,
-    whose 1125 pairs this law fits to the scatter among pixels with 0.092 %, 0.16, 0.028 out to 11 pitches); 0.22 %
-    in LinoSPAD2, delays below 20 ns (Kulkov et al., arXiv 2406.15323).
+    whose 1125 pairs this law fits to the scatter among pixels with 0.092 %, 0.16, 0.028 out to 11 pitches); 0.22 % in
+    LinoSPAD2, delays below 20 ns (Kulkov et al., arXiv 2406.15323).
     """
 
     counted = True
@@ -31,30 +33,30 @@ class Crosstalk(Effect, stage="correlated"):
     probability = parameter(
         0.002,
         "",
-        "chance that an avalanche fires one given side neighbour",
+        "probability that an avalanche fires one given side neighbour",
         symbol="P_xt",
         bounds=(0, 1),
         off=0.0,
         search=(1e-5, 0.05),
     )
     diagonal_ratio = parameter(
-        0.3, "", "chance for a diagonal neighbour, relative to a side neighbour", bounds=(0, 1), search=(0.02, 1)
+        0.3, "", "probability for a diagonal neighbour relative to a side neighbour", bounds=(0, 1), search=(0.02, 1)
     )
     delay = parameter(
         100e-12,
         "s",
-        "mean of the exponential time to the neighbour's avalanche; 0 s: prompt",
+        "mean of the exponential delay of the neighbour's avalanche; 0 s: none",
         symbol="tau_xt",
         bounds=(0, None),
         search=(20e-12, 1e-6),
     )
     reach = parameter(
-        1.5, "", "pitches to the farthest neighbours that are hit; 1.5: side and diagonal", bounds=(1, None)
+        1.5, "", "distance of the farthest pixels that are fired, pitches; 1.5: side and diagonal", bounds=(1, None)
     )
     far_ratio = parameter(
         0.0,
         "",
-        "chance beyond the diagonal, times d, relative to a side neighbour, where that is more",
+        "lower bound of d K(d) beyond the diagonal",
         bounds=(0, 1),
     )
 

@@ -8,8 +8,9 @@ from . import Conditions, Effect, parameter
 
 
 class DarkCounts(Effect, stage="dark"):
-    """Avalanches without a photon, mostly thermal: a Poisson process in every pixel, light or no light.
+    """Avalanches without a photon, mostly thermal: a Poisson process in every pixel.
 
+    The rate is the same in the light and in the dark.
     Source: Suonsivu et al., Alg. 1 lines 10-12; typical 1-1000 Hz (Table 1).
     """
 

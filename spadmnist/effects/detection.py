@@ -9,9 +9,10 @@ from . import Conditions, Effect, parameter
 
 
 class Detection(Effect, stage="detection"):
-    """A photon that arrives starts an avalanche with probability PDP (quantum efficiency times triggering).
+    """A photon starts an avalanche with the probability PDP.
 
-    Keeping each photon of a Poisson process with probability q is a Poisson process of q times the rate.
+    PDP is the quantum efficiency times the triggering probability. Keeping each photon with probability q turns a
+    Poisson process into one of q times the rate, so the thinning is exact.
     Source: Suonsivu et al., Alg. 1 lines 6-9; typical 30-70 % at the peak (Table 1).
     """
 
@@ -31,7 +32,7 @@ class Detection(Effect, stage="detection"):
     relative = parameter(
         1.0,
         "",
-        "map that multiplies the PDP",
+        "factor that multiplies the PDP",
         bounds=(0, None),
         off=1.0,
         search=(0, 2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -31,20 +32,21 @@ def sine(times: np.ndarray, frequency: float, start: float) -> np.ndarray:
 
 
 class Flicker(Effect, stage="arrival"):
-    """The lamp's light swings at the frequency of the mains, or of its driver.
+    """The light oscillates at the frequency of the mains or of the lamp's driver.
 
-    The light is multiplied by 1 + amplitude sin(2 pi frequency t + phase), t from the start of the exposure, under
-    both rules and for all pixels alike; dark counts stay as they are.
+    The light is multiplied by 1 + amplitude sin(2 pi frequency t + phase), where t is the time since the start of the
+    exposure. The factor is the same for all pixels and under both rules. Dark counts do not change.
     Source: no published number; 100 or 120 Hz and their harmonics, 0.01-10 %, are realistic.
     """
 
     moves = ("spectrum", "far_pairs", "neighbours", "autocorrelation", "trend")
+    shown: ClassVar[dict[str, Any]] = {"frequency": 5e3}  # several periods in an exposure
 
     amplitude = parameter(
-        0.05, "", "largest relative change of the light", symbol="m", bounds=(0, 1), off=0.0, search=(1e-4, 0.5)
+        0.05, "", "relative amplitude of the oscillation", symbol="m", bounds=(0, 1), off=0.0, search=(1e-4, 0.5)
     )
     frequency = parameter(
-        100.0, "Hz", "frequency of the light's power", symbol="f", bounds=(0, None), open_bounds=True, search=(10, 1e5)
+        100.0, "Hz", "frequency of the oscillation", symbol="f", bounds=(0, None), open_bounds=True, search=(10, 1e5)
     )
     phase = parameter(0.0, "rad", "phase at the start of the exposure", search=(0, 2 * math.pi))
 

@@ -6,11 +6,11 @@ from . import Effect, parameter
 
 
 class FrameCarryOver(Effect, stage="dead_time"):
-    """A pixel that fires near the end of a frame is still blind, for a share of what is left, when the next begins.
+    """A pixel enters the next frame with a share of its remaining dead time.
 
-    It acts in frames (STR, QIS, counts), under both rules: a pixel with dead time tau_d that fired at t is live again
-    at start + share * (t + tau_d - start), start being that of the next frame, if this is later than the start. In
-    the paper's frames it is all that there is of a dead time; TR streams have no frames.
+    The effect acts in frames (STR, QIS, counts) under both rules. A pixel with dead time tau_d that fired at t is live
+    again at start + share * (t + tau_d - start), where start is the start of the next frame. Under `rules: paper`
+    frames have no other dead time. TR streams have no frames.
     Source: no published number; a dead time is 0.1-1 % of a frame, and the frame's reset may or may not end it.
     """
 
@@ -19,7 +19,7 @@ class FrameCarryOver(Effect, stage="dead_time"):
     share = parameter(
         1.0,
         "",
-        "part of the remaining dead time with which a pixel enters the next frame",
+        "share of the remaining dead time with which a pixel enters the next frame",
         bounds=(0, 1),
         off=0.0,
         search=(0.05, 1),

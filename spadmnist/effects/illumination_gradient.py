@@ -8,11 +8,11 @@ from . import Chip, Conditions, Effect, parameter
 
 
 class IlluminationGradient(Effect, stage="light"):
-    """The light falls unevenly on the array: a slope along x and y, and a loss towards the corners.
+    """The illumination varies over the array: a slope along x and y, and a loss towards the corners.
 
-    A pixel at u, v (from -0.5 to 0.5 across the array, 0 in the middle) at the distance r from the middle gets
-    (1 + x u + y v) (1 - vignette (r / r_max)^2) of the light, and none where the slopes make that negative. It
-    multiplies the light under both rules; dark counts stay as they are.
+    A pixel at (u, v), from -0.5 to 0.5 across the array, gets (1 + x u + y v) (1 - vignette (r / r_max)^2) of the
+    light; r is its distance from the middle. A negative slope factor counts as 0. The factor multiplies the light under
+    both rules. Dark counts do not change.
     Source: no published number; 0.5-10 % over the array is what a good set-up shows.
     """
 
@@ -21,7 +21,7 @@ class IlluminationGradient(Effect, stage="light"):
     x = parameter(
         0.05,
         "",
-        "relative change from the first to the last column, about the mean",
+        "relative change from the first to the last column",
         bounds=(-2, 2),
         off=0.0,
         search=(-0.5, 0.5),
@@ -29,7 +29,7 @@ class IlluminationGradient(Effect, stage="light"):
     y = parameter(
         0.0,
         "",
-        "relative change from the first to the last row, about the mean",
+        "relative change from the first to the last row",
         bounds=(-2, 2),
         off=0.0,
         search=(-0.5, 0.5),

@@ -11,12 +11,12 @@ from . import Effect, Mimic, parameter
 
 
 class Jitter(Effect, stage="timing"):
-    """An avalanche is seen a random time after it starts: a normal core, and for some events an exponential tail.
+    """A time stamp scatters about its avalanche: a normal core and an exponential tail.
 
-    time += Normal(0, sigma) + Bernoulli(tail_weight) * Exp(tail), drawn for each stamp, before it becomes a number.
-    The mean delay of the core belongs to the clock. A stamp does not leave the exposure (in STR: the frame). The
-    same under both rules; the number of detections stays. In steady light it only blurs the edge of the dead time
-    and short-lag peaks.
+    time += Normal(0, sigma) + Bernoulli(tail_weight) * Exp(tail), drawn for each stamp before it is digitised. The mean
+    delay of the core is part of the clock. A stamp stays inside its exposure (STR: its frame). The number of detections
+    does not change, and both rules are the same. In steady light jitter only blurs the edge of the dead time and peaks
+    at short delays.
     Source: Suonsivu et al., Sec. 3 (normal core, exponential tail from carriers that diffuse in; Table 1: 20-500 ps),
     after Sun et al. 2019. Alg. 1 leaves it out. Tails of 5-20 % and 0.1-1 ns are experience, no published number.
     """
@@ -37,7 +37,7 @@ class Jitter(Effect, stage="timing"):
     tail_weight = parameter(
         0.0,
         "",
-        "share of the events that are in the tail",
+        "share of the events in the tail",
         symbol="w_j",
         bounds=(0, 1),
         off=0.0,
@@ -46,7 +46,7 @@ class Jitter(Effect, stage="timing"):
     tail = parameter(
         200e-12,
         "s",
-        "mean of the tail's exponential",
+        "mean of the exponential tail",
         symbol="tau_j",
         bounds=(0, None),
         search=(50e-12, 5e-9),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,17 +14,18 @@ _REACH = 4.0  # radii, beyond which a Gaussian is left out: 6e-5 of it
 
 
 class PrintBlur(Effect, stage="light"):
-    """Print and lens blur the scene: each pixel sees a Gaussian of it.
+    """Print and lens blur the scene with a Gaussian.
 
-    The scene is even over each pixel, and a pixel sees its own part of what the Gaussian makes of that; what is farther
-    away than 4 radii is left out, and the weights add up to 1. Beyond the scene's edge the light is that of the nearest
-    pixel at the edge. Pixels that are placed one by one see each other in proportion to exp(-r^2 / (2 radius^2)). It
-    acts on the light of a scene, under both rules; light that is the same on all pixels stays as it is.
+    Each pixel gets the mean of the blurred scene over its own area. The scene is uniform over each pixel. The Gaussian
+    is cut at 4 radii, and its weights add up to 1. Beyond the edge of the scene the light is that of the nearest pixel.
+    In a layout with positions the weight of a pixel at distance r is exp(-r^2 / (2 radius^2)). The effect acts on
+    scenes under both rules; uniform light does not change.
     Source: no published number; 0.3-2 pixels is what a lens that is focused by eye leaves.
     """
 
     of_scene = True
     after = "print_tilt"
+    shown: ClassVar[dict[str, Any]] = {"radius": 0.6}  # less than the details of the scene
     moves = ("map", "rows_columns", "surface", "level", "outliers", "linearity")
 
     radius = parameter(

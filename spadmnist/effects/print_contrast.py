@@ -8,10 +8,10 @@ from . import Conditions, Effect, parameter
 
 
 class PrintContrast(Effect, stage="light"):
-    """The black of a printed chart reflects some of the light: what is black in the scene is dark grey.
+    """The black of a printed chart reflects some of the light.
 
-    A pixel gets black w + (1 - black) of its light, where w is what the brightest place of the scene gives: its paper.
-    It acts on the light of a scene, under both rules; light that is the same on all pixels stays as it is.
+    A pixel with the light L gets black * w + (1 - black) * L, where w is the light of the brightest pixel of the scene.
+    The effect acts on scenes under both rules; uniform light does not change.
     Source: no published number; ink on paper reflects 2-10 % of what paper does.
     """
 
@@ -21,7 +21,7 @@ class PrintContrast(Effect, stage="light"):
     black = parameter(
         0.05,
         "",
-        "reflectance of black beside that of white",
+        "reflectance of black relative to white",
         symbol="b",
         bounds=(0, 1),
         off=0.0,

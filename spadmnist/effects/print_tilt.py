@@ -10,13 +10,13 @@ from . import Chip, Conditions, Effect, parameter
 
 
 class PrintTilt(Effect, stage="light"):
-    """A printed chart is turned in its plane: the sensor sees the scene turned about the middle of the array.
+    """A printed chart is rotated in its plane.
 
-    A pixel gets the light of the place that lies where it does before the turn, between pixels in proportion
-    (bilinear); beyond the scene's edge, that of the nearest pixel at the edge. Pixels that are placed one by one get
-    that of the nearest pixel. A positive angle turns the scene from the columns' direction to the rows'. It acts on
-    the light of a scene, under both rules; light that is the same on all pixels stays as it is.
-    Source: no published number; a chart that is hung by eye is askew by 1-3 degrees, 0.02-0.05 rad.
+    The scene is rotated about the middle of the array and interpolated bilinearly. Beyond the edge of the scene the
+    light is that of the nearest pixel. In a layout with positions each pixel gets the light of the nearest one. A
+    positive angle rotates from the direction of the columns to that of the rows. The effect acts on scenes under both
+    rules; uniform light does not change.
+    Source: no published number; a chart that is hung by eye is rotated by 1-3 degrees, 0.02-0.05 rad.
     """
 
     of_scene = True
@@ -26,7 +26,7 @@ class PrintTilt(Effect, stage="light"):
     angle = parameter(
         0.02,
         "rad",
-        "angle by which the scene is turned",
+        "angle of the rotation",
         symbol="a",
         bounds=(-1, 1),
         off=0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,23 +13,24 @@ from . import Chip, Conditions, Effect, parameter
 
 
 class ReadoutLoss(Effect, stage="readout"):
-    """All pixels share one bus, which takes a fixed time for each event; what finds its queue full is lost.
+    """All pixels share one bus; an event that finds its queue full is lost.
 
-    Events arrive at their stamps; those with equal stamps in the order of the pixels. The bus serves one at a time, in
-    the order of arrival. At most `queue` events are in the system, the one in service included: an event that arrives
-    while there are so many is lost, and one whose service ends at that very moment has left. The bus is empty when an
-    exposure begins, and stamps do not change. Acts on TR streams, the same under both rules.
+    The bus serves one event at a time, in the order of the stamps, and takes `service_time` for each. Events with equal
+    stamps are served in the order of the pixels. At most `queue` events are in the system, the one in service included.
+    An event that arrives while `queue` events are in the system is lost. The bus is empty when an exposure begins.
+    Stamps do not change. The effect acts on TR streams, the same under both rules.
     Source: arbiters of event-driven arrays, for example 333 million events/s for 16 pixels (Aguenounon et al. 2021);
     ceilings from 1e6 to 1e9 events/s for an array. The finite queue is a plain model, no published number.
     """
 
     counted = True
+    shown: ClassVar[dict[str, Any]] = {"service_time": 30e-9, "queue": 2.0}  # bright light just fills the bus
     moves = ("ceiling", "linearity", "far_pairs", "neighbours", "edge", "intervals", "spectrum", "trend")
 
     service_time = parameter(
         10e-9,
         "s",
-        "time for which an event occupies the bus",
+        "time for which one event occupies the bus",
         symbol="t_bus",
         bounds=(0, None),
         off=0.0,

@@ -9,10 +9,10 @@ from ._pattern import Pattern
 
 
 class RowPattern(Pattern, stage="light"):
-    """The pixels of a row share a gain: rows are supplied and switched together.
+    """The pixels of a row share a gain.
 
-    It multiplies the light that counts, under both rules; dark counts stay as they are. Pixels that are placed one by
-    one lie in a single row.
+    The gain multiplies the light under both rules. Dark counts do not change. Rows are supplied and switched together.
+    In a layout with positions all pixels lie in one row.
     Source: no published number; 0.1-3 % from row to row is realistic.
     """
 

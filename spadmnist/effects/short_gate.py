@@ -9,11 +9,12 @@ from . import Conditions, Effect, parameter
 
 
 class ShortGate(Effect, stage="gate"):
-    """The pixel is live for a part of the nominal frame only: it can fire from `offset` on, for `fraction` of a frame.
+    """The pixel is live during a part of each frame only.
 
-    Live while offset <= time since the frame began < offset + fraction * frame time, and never outside the frame: what
-    of the gate sticks out is lost. It acts under both rules and on TR streams too, whose clock has the same frames;
-    without frames the exposure is one. A common factor on all rates, that of dark captures included.
+    It is live while offset <= t < offset + fraction * frame time, where t is the time since the frame began. The part
+    of the gate beyond the end of the frame is lost. The gate acts under both rules and on TR streams as well, whose
+    clock has the same frames; without frames the exposure is one frame. All rates, dark count rates included, are
+    multiplied by the live share.
     Source: gates open and close late, 0.25-0.34 ns from pixel to pixel in SwissSPAD2 (Ulku et al. 2019), shortest gate
     5.75 ns; for a fixed error, 0.2-20 ns a frame by experience, no published number.
     """
@@ -35,7 +36,7 @@ class ShortGate(Effect, stage="gate"):
     fraction = parameter(
         1.0,
         "",
-        "part of the nominal frame during which the pixel is live",
+        "share of the nominal frame during which the pixel is live",
         bounds=(0, 1),
         off=1.0,
         search=(0.1, 1),
@@ -43,7 +44,7 @@ class ShortGate(Effect, stage="gate"):
     offset = parameter(
         0.0,
         "s",
-        "when the gate opens, from the start of the frame",
+        "delay of the gate from the start of the frame",
         bounds=(0, None),
         off=0.0,
         search=(1e-10, 1e-6),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import numpy as np
 
 from .. import kernels
@@ -9,23 +11,23 @@ from . import Conditions, Effect, parameter
 
 
 class SlowRecovery(Effect, stage="dead_time"):
-    """After the dead time the pixel's bias, and with it its sensitivity, climbs back as 1 - exp(-u / time constant).
+    """After the dead time the sensitivity of a pixel recovers as 1 - exp(-u / time constant).
 
-    u counts from the end of the blind time. Whatever would fire the pixel meanwhile, photon, dark count, afterpulse
-    or crosstalk, does so with the sensitivity of that moment, and else leaves no trace. It acts on TR streams; a
-    pixel begins every frame recharged.
-    With a = lambda tau_r the mean interval is tau_d + tau_r e^a a^-a gamma(a, a) (lower incomplete gamma function).
-    Behind the dead time, whose part is no longer known there, the rate is corrected to first order in
-    rate x time constant: each interval is longer by tau_r, which is the most that it can be.
+    u is the time since the end of the dead time. A photon, a dark count, an afterpulse or crosstalk fires the pixel
+    with the sensitivity at its time; otherwise it is lost without a trace. The effect acts on TR streams. A pixel is
+    fully recharged at the start of every frame. With a = lambda tau_r the mean interval is tau_d + tau_r e^a a^-a
+    gamma(a, a) (lower incomplete gamma function). The closed form below does not know tau_d. It is of first order in
+    rate x time constant: each interval is longer by tau_r, which is the upper bound.
     Source: Krause and Walenta, arXiv 2507.10361; typical 1-50 ns.
     """
 
+    shown: ClassVar[dict[str, Any]] = {"time_constant": 3e-9}  # the whole climb behind the dead time
     moves = ("edge", "intervals", "linearity", "fano", "level")
 
     time_constant = parameter(
         5e-9,
         "s",
-        "time constant of the recharge; 0 s: as good as new at once",
+        "time constant of the recharge; 0 s: full sensitivity at once",
         symbol="tau_r",
         bounds=(0, None),
         off=0.0,

@@ -8,10 +8,10 @@ from . import Conditions, Effect, parameter
 
 
 class SourceDrift(Effect, stage="arrival"):
-    """The lamp grows brighter or fainter at an even pace over a capture, about its middle: the mean stays.
+    """The light changes linearly over a capture; its mean stays.
 
-    The light is multiplied by 1 + slope (t / T - 1/2), t from 0 to the end T of the exposure, under both rules and
-    for all pixels alike; dark counts stay as they are.
+    The light is multiplied by 1 + slope (t / T - 1/2), where t is the time since the start of the exposure T. The
+    factor is the same for all pixels and under both rules. Dark counts do not change.
     Source: no published number; 0.1-5 % per capture is realistic for plasma and incandescent lamps.
     """
 
@@ -20,7 +20,7 @@ class SourceDrift(Effect, stage="arrival"):
     slope = parameter(
         0.02,
         "",
-        "relative change over one capture, about its middle",
+        "relative change over one capture",
         bounds=(-2, 2),
         off=0.0,
         search=(-0.5, 0.5),

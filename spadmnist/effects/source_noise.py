@@ -95,27 +95,26 @@ def levels(
 
 
 class SourceNoise(Effect, stage="arrival"):
-    """The lamp's power fluctuates, for all pixels alike and differently in every image: photons come bunched.
+    """The power of the light fluctuates, so that photons bunch.
 
-    g2(tau) - 1 = contrast^2 exp(-2 tau / coherence_time). The power is 1 plus a sum of independent telegraphs, each of
-    which flips between two equal and opposite values at the rate 1 / coherence_time: as many as the contrast allows
-    without a negative power, at most 9 (fewer where one exposure would see more than 4e6 flips). It multiplies the
-    light under both rules; dark counts stay as they are.
+    g2(tau) - 1 = contrast^2 exp(-2 tau / coherence_time). The fluctuation is the same for all pixels and independent in
+    every image. The power is 1 plus a sum of independent telegraph processes, each of which flips between two opposite
+    values at the rate 1 / coherence_time. Their number is the largest that keeps the power positive, at most 9, and
+    less where one exposure would have more than 4e6 flips. The power multiplies the light under both rules. Dark counts
+    do not change.
     Source: Mandel and Wolf, Optical Coherence and Quantum Optics (1995), for counts of fluctuating light. No published
-    number: a lamp's coherence time (about 0.2 ps for 5 nm at 500 nm) is out of sight; pseudo-thermal light and the
-    noise of lasers (1 us to ms) are not.
+    number for a lamp: its coherence time (about 0.2 ps for 5 nm at 500 nm) is too short to be measured; pseudo-thermal
+    light and laser noise have 1 us to ms.
     """
 
     counted = True
     moves = ("far_pairs", "neighbours", "autocorrelation", "spectrum", "fano", "intervals", "frames_lag", "ceiling")
 
-    contrast = parameter(
-        0.1, "", "relative standard deviation of the light's power", bounds=(0, 1), off=0.0, search=(1e-3, 1)
-    )
+    contrast = parameter(0.1, "", "relative standard deviation of the power", bounds=(0, 1), off=0.0, search=(1e-3, 1))
     coherence_time = parameter(
         10e-6,
         "s",
-        "time in which the correlation of the power falls to 1/e^2",
+        "time after which the correlation of the power is 1/e^2",
         symbol="tau_c",
         bounds=(0, None),
         open_bounds=True,

@@ -10,10 +10,10 @@ from . import Effect, parameter
 
 
 class Tdc(Effect, stage="timing"):
-    """Time stamps are whole ticks of the converter: each is rounded to a multiple of the resolution.
+    """Time stamps are rounded to whole ticks of the converter.
 
-    To the nearest one, as in the paper, or down (`floor`), as a counter of ticks does: floor(time / resolution) as
-    doubles divide, so that a moment on a tick's very edge, which no draw meets, may go either way.
+    `nearest` rounds to the nearest multiple of the resolution, as in the paper. `floor` rounds down, as a counter of
+    ticks does: floor(time / resolution) in double precision.
     Source: Suonsivu et al., Alg. 1 lines 30-32; typical 5-100 ps (Table 1).
     """
 
@@ -24,13 +24,13 @@ class Tdc(Effect, stage="timing"):
     resolution = parameter(
         10e-12,
         "s",
-        "length of a tick; 0 s: not rounded",
+        "length of a tick; 0 s: no rounding",
         symbol="dt",
         bounds=(0, None),
         off=0.0,
         search=(1e-12, 1e-8),
     )
-    rounding = parameter("nearest", "", "to the nearest tick, or down", choices=("nearest", "floor"))
+    rounding = parameter("nearest", "", "rounding to the nearest tick, or down", choices=("nearest", "floor"))
 
     def converter(self) -> tuple[float, float]:
         """(s, length of a tick; where stamp k begins, in ticks from k)."""

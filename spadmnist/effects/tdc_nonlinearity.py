@@ -10,14 +10,14 @@ from . import Chip, Effect, parameter
 
 
 class TdcNonlinearity(Effect, stage="timing"):
-    """The converter's codes are not equally long: a code catches the moments of its own width, and none if that is 0.
+    """The codes of the converter have unequal widths; a code of width 0 is missing.
 
-    Acts on the time of a stamp just before the converter, the same under both rules: the time in true codes becomes
-    the time at which a perfect converter shows that code. Widths count in ticks; they repeat with the coarse clock,
-    which is exact, so that each pixel's are scaled to add up to their number. Moments between the converter's ticks
-    lose their meaning: only the code is right.
-    Source: code densities of LinoSPAD2 boards (Kulkov, daplis: rms 0.8-0.9 ticks, 13-27 missing codes of 140);
-    in-pixel converters 2 % (Villa et al. 2014).
+    A code collects the times within its own width. Widths are in ticks and repeat with the coarse clock. The coarse
+    clock is exact, so the widths of each pixel are scaled to add up to their number. The effect moves the time of a
+    stamp just before the converter, the same under both rules; only the code is meaningful, not the time between two
+    codes.
+    Source: code densities of LinoSPAD2 boards (Kulkov, daplis: rms 0.8-0.9 ticks, 13-27 missing codes of 140); in-pixel
+    converters 2 % (Villa et al. 2014).
     """
 
     counted = True
@@ -27,14 +27,14 @@ class TdcNonlinearity(Effect, stage="timing"):
     widths = parameter(
         1.0,
         "",
-        "length of each code in ticks; 0: the code is missing",
+        "width of each code, ticks; 0: a missing code",
         symbol="w_k",
         bounds=(0, None),
         off=1.0,
         search=(0, 6),
         per="code",
     )
-    period = parameter(140.0, "", "codes in a period of the coarse clock, for which widths are drawn", bounds=(1, None))
+    period = parameter(140.0, "", "number of codes in a period of the coarse clock", bounds=(1, None))
 
     def made(self, chip: Chip) -> None:
         if self.period != int(self.period):

@@ -59,23 +59,32 @@ File = Annotated[str, BeforeValidator(_inside)]
 
 
 class Array(Section):
-    """`layout`: rows and columns, or the places of the pixels in a CSV file, which count as one row."""
+    """The pixels: a grid, or a list of positions, which counts as one row."""
 
     model_config = ConfigDict(
         json_schema_extra={"anyOf": [{"required": ["rows", "columns"]}, {"required": ["positions"]}]}
     )
 
-    rows: int | None = Field(default=None, ge=1, le=100_000)
-    columns: int | None = Field(default=None, ge=1, le=100_000)
-    positions: File | None = None
+    rows: int | None = Field(default=None, ge=1, le=100_000, description="rows of the grid")
+    columns: int | None = Field(default=None, ge=1, le=100_000, description="columns of the grid")
+    positions: File | None = Field(
+        default=None, description="CSV file with x, y in um of each pixel, instead of rows and columns"
+    )
 
 
 MOST_FRAMES = 10**12  # binary frames of a capture, of which counts are sums: 11 days of 1 us
 
 
+_WAVELENGTH = "wavelength of the light; 555 nm without it"
+
+
 class _Light(Section):
-    relative_uncertainty: Uncertainty | None = None
-    own_uncertainty: Uncertainty | None = None
+    relative_uncertainty: Uncertainty | None = Field(
+        default=None, description="standard uncertainty of the light's calibration, common to all captures; else 0"
+    )
+    own_uncertainty: Uncertainty | None = Field(
+        default=None, description="standard uncertainty of the light of this capture alone; else 0"
+    )
 
 
 class Dark(_Light):
@@ -85,70 +94,76 @@ class Dark(_Light):
 
 
 class Flat(_Light):
-    """The same light on all pixels. Without irradiance and lux its level is free."""
+    """The same light on all pixels. Without irradiance and lux its level is fitted."""
 
     kind: Literal["flat"]
-    wavelength: Length | None = None
-    irradiance: Irradiance | None = None
-    lux: Lux | None = None
+    wavelength: Length | None = Field(default=None, description=_WAVELENGTH)
+    irradiance: Irradiance | None = Field(default=None, description="irradiance of the sensor")
+    lux: Lux | None = Field(default=None, description="illuminance of the sensor, instead of irradiance")
 
 
 class Image(_Light):
-    """An image that the light follows: a scene. Without irradiance and lux the level of its white is free.
-
-    tiles: a JSON file that says where the tiles of a chart lie: size, [rows, columns]; corners, of each its first row
-    and column; numbers, of the images that they are; labels, where there are any.
-    """
+    """A scene: the light is proportional to an image. Without irradiance and lux the level of white is fitted."""
 
     kind: Literal["image"]
-    file: File
-    tiles: File | None = None
-    wavelength: Length | None = None
-    irradiance: Irradiance | None = None
-    lux: Lux | None = None
+    file: File = Field(description="NumPy file of the image: uint8 with white 255, or floats from 0 to 1")
+    tiles: File | None = Field(
+        default=None,
+        description="JSON file of the tiles of a chart: size, [rows, columns]; corners, the first row and column of "
+        "each; numbers of the images; labels",
+    )
+    wavelength: Length | None = Field(default=None, description=_WAVELENGTH)
+    irradiance: Irradiance | None = Field(default=None, description="irradiance of the sensor where the image is white")
+    lux: Lux | None = Field(default=None, description="illuminance there, instead of irradiance")
 
 
 class _Capture(Section):
-    id: Name
-    file: File | None = None
-    mean: Mean | None = None
-    light: Annotated[Dark | Flat | Image, Field(discriminator="kind")]
+    id: Name = Field(description="name of the capture")
+    file: File | None = Field(default=None, description="HDF5 file of the capture; a plan has none")
+    mean: Mean | None = Field(
+        default=None, description="mean detections of a pixel over the capture, instead of a file"
+    )
+    light: Annotated[Dark | Flat | Image, Field(discriminator="kind", description="light on the sensor")]
 
 
 class Stamps(_Capture):
     """Time stamps of all detections."""
 
     modality: Literal["tr"]
-    exposure: Time
+    exposure: Time = Field(description="exposure of the capture")
 
 
 class _Framed(_Capture):
-    frames: int = Field(ge=1, le=MOST_FRAMES)
-    frame_time: Time
-    frame_period: Time | None = None
-    exposure: Time | None = None
+    frames: int = Field(ge=1, le=MOST_FRAMES, description="number of binary frames")
+    frame_time: Time = Field(description="time for which a frame is live")
+    frame_period: Time | None = Field(
+        default=None, description="time from one frame to the next; the frame time without it"
+    )
+    exposure: Time | None = Field(default=None, description="frames x frame period; checked")
 
 
 class Frames(_Framed):
-    """Frames, each with the first detection of a pixel, or whether there was one."""
+    """Frames: the first time stamp of each pixel (str), or whether there was a detection (qis)."""
 
     modality: Literal["str", "qis"]
 
 
 class Counts(_Framed):
-    """Frames of counts; a file says itself what is counted."""
+    """Frames of counts. The file contains bits and counting as well."""
 
     modality: Literal["counts"]
-    bits: int | None = Field(default=None, ge=1, le=16)
-    counting: Literal["frames", "counter"] | None = None
+    bits: int | None = Field(default=None, ge=1, le=16, description="bits of a count")
+    counting: Literal["frames", "counter"] | None = Field(
+        default=None, description="a count is the sum of 2^bits - 1 binary frames, or a counter in each frame"
+    )
 
 
 Entry = Annotated[Stamps | Frames | Counts, Field(discriminator="modality")]
 
 # each entry of the file is checked by itself, and so is each of the captures
 SECTIONS: dict[str, Any] = {
-    "format": Format,
-    "name": Name,
+    "format": Annotated[Format, Field(description="name and number of the format")],
+    "name": Annotated[Name, Field(description="name of the measurement")],
     "layout": Array,
     "captures": Annotated[list[Any], Field(min_length=1)],
 }

@@ -22,16 +22,15 @@ _SPARSE = 1.5  # stamps in a window of 8 boxes, up to which pairs are looked up 
 
 
 class Autocorrelation(Statistic):
-    """Pairs of detections of the same pixel, by the time between them: all pairs, not only successive ones.
+    """Pairs of detections of the same pixel by the time between them, successive or not.
 
-    Time stamps: lags from the dead time to 10 ms, four cells to an octave, as a multiple-tau correlator takes them:
-    for lags of 4 to 8 boxes of time, products of the numbers of detections in boxes 4, 5, 6 and 7 apart, and then in
-    boxes twice as long. Frames: products of a pixel's frames 1, 2, 3, 5, 10, 20, 50 and 100 apart. Pooled over the
-    pixels.
-    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
-    variance is the number by chance (of frames: (1 - p)^2 times it, p the share of frames with a detection), and their
-    law Poisson's. So neither the light level nor a map of the pixels is seen here. Slow traps, source noise, flicker
-    and blinking show, and in frames what one leaves to the next.
+    Cells of time stamps: lags from the dead time to 10 ms, four cells to an octave, by a multiple-tau correlator: lags
+    of 4 to 8 boxes of time are products of the counts in boxes 4, 5, 6 and 7 apart, then of boxes twice as long. Cells
+    of frames: products of a pixel's frames 1, 2, 3, 5, 10, 20, 50 and 100 apart. Pooled over the pixels.
+    Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
+    Its variance is the number by chance; for frames it is (1 - p)^2 times that, with p the share of frames with a
+    detection. Neither the light level nor a map of the pixels changes the score.
+    Shows: slow traps, source noise, flicker and blinking; in frames also what one frame leaves to the next.
     Source: Schätzel, Quantum Opt. 2 (1990) 287, for the correlator.
     """
 

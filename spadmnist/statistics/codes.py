@@ -35,12 +35,13 @@ _STEPS = _steps()
 
 
 class Codes(Statistic):
-    """Code density: how often each code of the converter occurs, stamps being taken modulo 256, 140 and 100 ticks.
+    """Code density: how often each code of the converter occurs, with stamps modulo 256, 140 and 100 ticks.
 
-    The period of the converter's coarse clock is not known; a histogram modulo 256 has all that repeats after a power
-    of two up to 256, and the lowest eight bits; 140 and 100 have their divisors (140 codes to a period: LinoSPAD2).
-    Other periods: `code_periods`. Detections that know nothing of the clock fall on all codes alike; each count is
-    rare among all: Poisson. Unequal and missing codes show here, and bits that are stuck.
+    The period of the converter's coarse clock is unknown. Modulo 256 shows the periods of powers of two up to 256, and
+    the lowest eight bits. Modulo 140 and 100 show their divisors (LinoSPAD2 has 140 codes to a period). `code_periods`
+    has other periods.
+    Law: Poisson. Detections that are independent of the clock have all codes alike.
+    Shows: unequal and missing codes, and bits that are stuck.
     """
 
     modalities = ("tr", "str")
@@ -70,12 +71,13 @@ class Codes(Statistic):
 
 
 class CodePeriods(Statistic):
-    """Is there any period after which stamps repeat? For each period one number, how uneven the codes in it are.
+    """Unevenness of the converter's codes modulo every period, one number for each period.
 
-    All periods from 2 to 1000 ticks that divide 672,000: 76 of them, with no prime factors but 2, 3, 5 and 7. The
-    number is chi squared of the codes' counts, with one degree of freedom less than codes, made normal by its cube
-    root (Wilson and Hilferty); 0 where there are too few detections for it. What `codes` shows in many cells, this
-    gathers in the one of the right period.
+    Cells: the 76 periods from 2 to 1000 ticks that divide 672,000; their prime factors are 2, 3, 5 and 7. `codes` shows
+    the codes of one period in many cells; here each period has one.
+    Law: normal, as the cube root of chi squared of the codes' counts (Wilson and Hilferty), with one degree of freedom
+    less than codes. 0 where there are too few detections.
+    Shows: unequal codes that repeat with an unknown period.
     """
 
     modalities = ("tr", "str")

@@ -25,16 +25,14 @@ _LEAST_CHANCE = 1e-6  # of pairs that chance makes
 
 
 class Delays(Statistic):
-    """Pairs of detections of distant pixels by the time between them: for each step from pixel to pixel, the most in
-    any ns.
+    """Pairs of detections of distant pixels by delay and step: the largest number in any ns, for each step.
 
-    Steps of more than 3 pitches from the earlier detection to the later one: as columns and rows to go, and as pixels
-    to go in the order of read-out, which begins anew behind the last one. Delays up to 300 ns, evenly in steps of 1 ns.
-    Of very many detections only the first of the capture are looked at (1.5 million pairs). Arrays of up to about
-    32 x 32 pixels on a grid.
-    Law: normal, as the score of the largest of so many Poisson counts, whose mean the pixels' totals tell.
-    Shows: what is detected a second time elsewhere: a reflection from pixel to pixel, wires and converters that two
-    pixels share, addresses that are mixed up. In `far_pairs`, of all steps and delays together, it drowns.
+    Steps: more than 3 pitches from the earlier to the later detection, in columns and rows, and in pixels in the order
+    of the readout, which is cyclic. Delays: up to 300 ns in steps of 1 ns. Of very many detections the first 1.5
+    million pairs are taken. Grids of up to about 32 x 32 pixels only.
+    Law: normal, as the score of the largest of so many Poisson counts, with the mean from the totals of the pixels.
+    Shows: a second detection elsewhere: a reflection from pixel to pixel, wires and converters that two pixels share,
+    mixed addresses. `far_pairs` has all steps and delays together, so that one step is too faint there.
     """
 
     modalities = ("tr",)

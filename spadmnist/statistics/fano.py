@@ -281,12 +281,12 @@ def _summary(
 class PixelFano(Statistic):
     """Variance over mean of a pixel's counts in windows of time, all pixels together.
 
-    Windows: times: the exposure over 20, 40, 80, ... down to 1 us; frames: 1, 2, 4, ... up to a twentieth of them.
-    Relative to what steady rates have: 1 for times, 1 - p for frames that hold one bit.
-    Law: normal, as the score of the pairs of detections within a window, given every pixel's number of them; Poisson
-    where there are few pairs.
-    Shows: afterpulsing (more at all lengths), a dead time that differs (less), source noise, flicker, drift and
-    blinking (more with the length).
+    Windows of time stamps: the exposure over 20, 40, 80, ... down to 1 us. Windows of frames: 1, 2, 4, ... up to a
+    twentieth of them. Values are relative to steady rates: 1 for time stamps, 1 - p for frames of one bit.
+    Law: normal, as the score of the pairs of detections within a window, given the number of each pixel; Poisson where
+    there are few pairs.
+    Shows: afterpulsing (an excess in all windows), another dead time (a deficit), source noise, flicker, drift and
+    blinking (an excess that grows with the window).
     Source: Fano, Phys. Rev. 72 (1947); dead time: Mueller, Nucl. Instr. Meth. 112 (1973).
     """
 
@@ -330,12 +330,12 @@ class PixelFano(Statistic):
 
 
 class ArrayFano(Statistic):
-    """Variance over mean of the counts of the whole array in windows of time, relative to that of steady rates.
+    """Variance over mean of the counts of the whole array in windows of time, relative to steady rates.
 
-    Windows as in `pixel_fano`; in a long exposure of times the shortest are a four millionth of it.
-    Law: normal, as the score of the pairs of detections within a window, given the number of them.
-    Shows: what happens to many pixels at once: flicker, source noise, drift (more with the length), crosstalk and
-    bursts (more at all lengths), a readout that loses events when there are many (less).
+    Windows: as in `pixel_fano`. In a long exposure of time stamps the shortest window is a four millionth of it.
+    Law: normal, as the score of the pairs of detections within a window, given their total number.
+    Shows: what many pixels do at once. Flicker, source noise and drift: an excess that grows with the window. Crosstalk
+    and bursts: an excess in all windows. A readout that loses events at high rates: a deficit.
     Source: Fano, Phys. Rev. 72 (1947).
     """
 

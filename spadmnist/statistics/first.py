@@ -22,14 +22,14 @@ _NORMAL = 0.2654  # power of an exponential variable that is as good as normal
 
 
 class FirstArrivals(Statistic):
-    """When in a frame its first detection comes, for frames after an empty one, after an early detection, a late one.
+    """First detections by their time in the frame, by what the pixel did in the frame before.
 
-    In 40 cells to a frame, the first of them in eight parts; late: in the last tenth of the frame before. Pooled over
-    the pixels. Counts of rare events: Poisson. Their sum says how many frames have a detection, their shape, which is
-    that of an exponential cut off by the end of the frame, the rate: the two agree where a frame is as long as it
-    should be. Here show pixels that are live for a part of the frame only (nothing at its end or its beginning), what
-    a frame leaves to the next (a dead time: too few at once after a late detection; afterpulses: too many), and a
-    light that changes within a frame.
+    Cells: 40 to a frame, the first of them in eight parts; separately for frames after an empty one, after an early
+    detection, and after one in the last tenth of the frame. Pooled over the pixels.
+    Law: Poisson, for counts of rare events. Their sum is the number of frames with a detection. Their shape is an
+    exponential that the frame cuts off. Both depend on the rate, and they agree where the frame has its stated length.
+    Shows: pixels that are live for a part of the frame (nothing at its beginning or end), what a frame leaves to the
+    next (dead time: a deficit after a late detection; afterpulses: an excess), and light that changes within a frame.
     """
 
     modalities = ("str",)
@@ -60,10 +60,11 @@ class FirstArrivals(Statistic):
 
 
 class FrameEnds(Statistic):
-    """First detections near the beginning and the end of a frame, by how many ticks are between: 1, 2, 4, 8, ...
+    """First detections near the beginning and the end of a frame, by their distance in ticks: 1, 2, 4, 8, ...
 
-    Up to a fortieth of a frame. Pooled over the pixels. Counts: Poisson. Here show the first and the last nanoseconds
-    of a frame during which pixels are not live yet, or no longer.
+    Cells: up to a fortieth of a frame. Pooled over the pixels.
+    Law: Poisson.
+    Shows: the first and the last nanoseconds of a frame in which pixels are not live.
     """
 
     modalities = ("str",)
@@ -87,13 +88,14 @@ class FrameEnds(Statistic):
 
 
 class FrameLimits(Statistic):
-    """How long no pixel ever fires at the beginning and at the end of a frame, as the detections near by have it.
+    """Time at the beginning and at the end of a frame in which no pixel ever fires.
 
-    The ticks before the first detection of all frames and behind the last one, times the detections to a tick in the
-    fortieth of a frame that follows or comes before: exponential of mean 1 in steady light, where these are many. Of
-    that the power 0.2654, which is nearly normal (Weibull's law of that power has hardly any skewness). Where in its
-    tick a detection was is left to chance, lest ticks make steps. Here a gate shows that opens late or closes early by
-    less than a bin holds.
+    The ticks before the first detection of all frames, and after the last one, times the detections per tick in the
+    adjacent fortieth of a frame.
+    Law: normal. In steady light with many detections the product is exponential with mean 1; its power 0.2654 is nearly
+    normal (Weibull's law of that power has hardly any skewness). The place of a detection within its tick is drawn at
+    random, so that ticks make no steps.
+    Shows: a gate that opens late or closes early by less than a bin.
     """
 
     modalities = ("str",)

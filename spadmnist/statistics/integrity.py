@@ -110,10 +110,10 @@ def faults(stamps, offsets, end):
 
 
 class RepeatedFrames(Statistic):
-    """Frames that are the same as the one before, where chance cannot make them so.
+    """Frames equal to the one before that chance does not explain.
 
-    A repetition counts where its chance, by the pixels' own shares of detections, is below 1e-9 over the capture;
-    with few pixels, or hardly a detection, frames repeat by themselves (see `rare_frames`). STR: stamp by stamp.
+    A repetition counts where its probability over the capture, from the pixels' own shares of detections, is below
+    1e-9. With few pixels or few detections frames repeat by chance (see `rare_frames`). STR: all stamps are equal.
     Law: exact. There are none.
     Shows: frames that were read out or stored twice.
     """
@@ -206,11 +206,12 @@ def _chance_of_counts(recording: Recording) -> Callable[[np.ndarray], float]:
 
 
 class RareFrames(Statistic):
-    """Frames without any detection, with every pixel full, or the same as the one before against odds of 1000.
+    """Frames without any detection, with all pixels full, or equal to the one before at odds below 1 in 1000.
 
-    Pixels that are dead, or always on, are left out of the first two; for the odds see `repeated_frames`.
-    Law: Poisson where they are rare; where they are not, they scatter less.
-    Shows: frames that were lost, overwritten or stored twice, a light source that stops.
+    Dead pixels and pixels that always fire are left out of the first two. `repeated_frames` says how the odds are
+    computed.
+    Law: Poisson where they are rare; otherwise they scatter less.
+    Shows: frames that were lost, overwritten or stored twice; a light source that stops.
     """
 
     modalities = ("str", "qis", "counts")
@@ -251,7 +252,7 @@ class Disorder(Statistic):
     """Time stamps that are smaller than the one before in the same pixel.
 
     Law: exact. There are none.
-    Shows: stamps that were mixed up, a coarse counter that ran over.
+    Shows: stamps out of order, an overflow of the coarse counter.
     """
 
     modalities = ("tr",)
@@ -271,10 +272,10 @@ class Disorder(Statistic):
 
 
 class EqualStamps(Statistic):
-    """Time stamps that the pixel already has, and stamps behind the end of the exposure.
+    """Time stamps that occur twice in a pixel, and stamps after the end of the exposure.
 
-    Law: Poisson, rare things. With a dead time longer than a tick there are no equal stamps at all.
-    Shows: events that were stored twice, a dead time or an exposure that is not what it should be.
+    Law: Poisson, for rare events. With a dead time longer than a tick there are none.
+    Shows: events that were stored twice; a dead time or an exposure with a wrong value.
     """
 
     modalities = ("tr",)
@@ -294,11 +295,11 @@ class EqualStamps(Statistic):
 
 
 class Gaps(Statistic):
-    """The longest time in which the whole array is silent.
+    """The longest time without a detection of the whole array.
 
-    Law: normal, as the score of the longest of n + 1 spacings of n events that fall anywhere: it is shorter than x
-    with probability exp(-(n + 1) (1 - x)^n), x as a share of the exposure.
-    Shows: readout that stops or loses a stretch of data, light that goes out, bunched light.
+    Law: normal, as the score of the longest of n + 1 spacings of n random events. It is shorter than x with probability
+    exp(-(n + 1) (1 - x)^n), with x as a share of the exposure.
+    Shows: a readout that stops or loses data, light that goes out, bunched light.
     Source: longest spacing (Darling, Ann. Math. Stat. 24, 1953).
     """
 
@@ -335,10 +336,10 @@ class Gaps(Statistic):
 
 
 class FullCounters(Statistic):
-    """Counts that stand at the largest number that the readout has.
+    """Counts that are equal to the largest number of the readout.
 
-    Law: Poisson where they are rare; where they are not, they scatter less.
-    Shows: counters that are full, or have fewer bits than they should.
+    Law: Poisson where they are rare; otherwise they scatter less.
+    Shows: counters that are full, or that have fewer bits than stated.
     """
 
     modalities = ("counts",)

@@ -49,12 +49,12 @@ def _edge(recording: Recording) -> np.ndarray:
 
 
 class EdgeIntervals(Statistic):
-    """Intervals between successive detections of a pixel about the dead time, in steps of 0.5 ns (or of a tick).
+    """Intervals between successive detections of a pixel near the dead time, in steps of 0.5 ns or a tick.
 
-    From 10 ns before the dead time to 20 ns behind it, and one cell for all that is shorter; pooled over the pixels.
-    Counts of rare events, each in one cell: Poisson. Here show another dead time, one that differs from pixel to
-    pixel or is extended by hidden arrivals, a slow recovery (too few at first), detections at the very end of the dead
-    time, short-lived traps, and the jitter that blurs the edge.
+    Cells: from 10 ns before the dead time to 20 ns beyond it, and one for shorter intervals. Pooled over the pixels.
+    Law: Poisson, for counts of rare events in one cell each.
+    Shows: another dead time, one that differs from pixel to pixel, a paralyzable one, slow recovery (a deficit at
+    first), detections at the very end of the dead time, short-lived traps, and jitter, which blurs the edge.
     """
 
     modalities = ("tr",)
@@ -88,12 +88,13 @@ class EdgeIntervals(Statistic):
 
 
 class Intervals(Statistic):
-    """Intervals between successive detections of a pixel, in logarithmic bins behind the edge of the dead time.
+    """Intervals between successive detections of a pixel beyond the dead time, in logarithmic bins.
 
-    From 20 ns behind the dead time to 100 ms, ten bins to a decade, and one for all that is longer; pooled over the
-    pixels. Counts, each interval in one cell: Poisson (the few cells that hold many of all intervals scatter less).
-    Here show afterpulsing with its lifetimes (an excess that does not depend on the light), slow traps, echoes,
-    source noise, and detections that are lost.
+    Cells: from 20 ns beyond the dead time to 100 ms, ten bins to a decade, and one for longer intervals. Pooled over
+    the pixels.
+    Law: Poisson, for counts of intervals in one cell each. The few cells that hold many of all intervals scatter less.
+    Shows: afterpulsing with its lifetimes (an excess that does not depend on the light), slow traps, echoes, source
+    noise, and detections that are lost.
     """
 
     modalities = ("tr",)
@@ -122,11 +123,12 @@ class Intervals(Statistic):
 
 
 class FineIntervals(Statistic):
-    """Intervals between successive detections of a pixel behind the edge of the dead time, evenly in steps of 1 ns.
+    """Intervals between successive detections of a pixel beyond the dead time, in steps of 1 ns.
 
-    From 20 ns behind the dead time to 1 us behind it; pooled over the pixels. Counts, each interval in one cell:
-    Poisson. Here stands out what comes back after a fixed time and drowns in wider bins: a reflection in a fibre or on
-    a board, the period of a clock that is near.
+    Cells: from 20 ns to 1 us beyond the dead time. Pooled over the pixels.
+    Law: Poisson, for counts of intervals in one cell each.
+    Shows: what returns after a fixed time and is too faint in wider bins: a reflection in a fibre or on a board, the
+    period of a nearby clock.
     """
 
     modalities = ("tr",)
@@ -154,14 +156,14 @@ class FineIntervals(Statistic):
 
 
 class EarlyIntervals(Statistic):
-    """How unlike the pixels are in their shortest intervals: pairs of short intervals in the same pixel.
+    """Differences between pixels in their shortest intervals: pairs of short intervals in the same pixel.
 
-    Intervals up to 5, 2 and 0.5 ns below the dead time, up to it, and up to 1, 5, 20 and 100 ns behind it. How many of
-    all of them a pixel should have, if all have one dead time, follows from its rate; pixels that should have more than
-    twice as many as usual are left out, lest they have nearly all pairs. Law: normal, as the score of the pairs given
-    the number of intervals; Poisson where there are few pairs.
-    Shows: a dead time that differs from pixel to pixel (jitter blurs the edge in all pixels alike, and is not seen),
-    afterpulsing that some pixels have and others not.
+    Cells: intervals up to 5, 2 and 0.5 ns below the dead time, up to it, and up to 1, 5, 20 and 100 ns beyond it. The
+    expected share of a pixel follows from its rate, if all pixels have the same dead time. A pixel with more than twice
+    the usual share is left out, because it would have nearly all pairs.
+    Law: normal, as the score of the pairs given the number of intervals; Poisson where there are few pairs.
+    Shows: a dead time that differs from pixel to pixel, and afterpulsing of some pixels. Jitter blurs the edge of all
+    pixels alike, so it does not show.
     Source: index of dispersion (Fisher, Biometrics 6, 1950).
     """
 
@@ -223,13 +225,14 @@ class EarlyIntervals(Statistic):
 
 
 class Rescaled(Statistic):
-    """Intervals measured by the pixel's own rate: u = 1 - exp(-rate (interval - dead time)), which should be even.
+    """Intervals relative to the pixel's own rate: u = 1 - exp(-rate (interval - dead time)), which is uniform.
 
-    In 20 cells from 0 to 1, pooled over the pixels; intervals that are shorter than the dead time count as 0. The
-    rate is the pixel's own, from its intervals. Pixels with fewer than 16 intervals tell too little of it and are left
-    out; the model's recordings leave them out by the same rule, so nothing is biased by it. Counts: Poisson (a little
-    less, for the rate is fitted to them). Whatever makes a pixel's detections come otherwise than by chance shows
-    here, known or not, while maps, levels and gradients do not.
+    Cells: 20 from 0 to 1. Pooled over the pixels. Intervals shorter than the dead time count as 0. The rate is the
+    pixel's own, from its intervals. Pixels with fewer than 16 intervals are left out, in the simulations as well, so
+    this makes no bias.
+    Law: Poisson, a little narrower because the rate is fitted to the same intervals.
+    Shows: any departure of a pixel's detections from a Poisson process with dead time, of a known or unknown cause.
+    Maps, levels and gradients do not show.
     Source: time rescaling, Brown et al., Neural Computation 14 (2002) 325.
     """
 
@@ -254,9 +257,9 @@ class Rescaled(Statistic):
 class RescaledLag(Statistic):
     """Correlation of a pixel's rescaled intervals (see `rescaled`) 1, 2, 3, 5, 10 and 20 apart.
 
-    Intervals of a Poisson process with a dead time are independent. The mean product of many independent bounded
-    numbers is normal, its spread 1/sqrt(products); nothing is said below 300 products. A rate that changes slowly
-    (blinking, drift, source noise) makes neighbours alike; so do afterpulses, which come in pairs.
+    Law: normal, with spread 1/sqrt(products), as the mean product of many independent bounded numbers; 0 below 300
+    products. Intervals of a Poisson process with dead time are independent.
+    Shows: a rate that changes slowly (blinking, drift, source noise), and afterpulses, which come in pairs.
     """
 
     modalities = ("tr",)

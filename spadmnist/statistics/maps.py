@@ -123,10 +123,10 @@ def place_of(layout: Layout, pixel: int) -> str:
 class PixelMap(Statistic):
     """Detections of each pixel.
 
-    Law: Poisson. Frames fill slots (binomial) and a dead time takes part of the exposure, so the counts are first
-    brought to numbers with the scatter of Poisson counts; small counts stay what they are. A pixel whose first stamps
-    come early has waited less: its detections are brought to an equal time of waiting, and so the stamps tell its rate
-    where frames without a detection are few.
+    Law: Poisson. Frames make counts binomial and a dead time shortens the exposure, so counts are first transformed to
+    the scatter of Poisson counts; small counts stay as they are. First stamps: a pixel whose stamps come early has
+    waited less, so its detections are scaled to an equal time of waiting. Thus stamps determine the rate where frames
+    without a detection are few.
     Shows: pixels with another PDP, hot and dead pixels, gradients and patterns, crosstalk around hot pixels.
     Source: photon response and dark signal non-uniformity, EMVA standard 1288.
     """
@@ -176,8 +176,8 @@ def _lines(recording: Recording, axis: int) -> Summary | None:
 class Rows(Statistic):
     """Detections of each row of a grid.
 
-    Law: Poisson, sums of the pixels' numbers (see `pixel_map`).
-    Shows: row patterns, a gradient, a rolling shutter, rows that read out late.
+    Law: Poisson, for sums of the pixels' numbers (see `pixel_map`).
+    Shows: row patterns, a gradient, a rolling shutter, rows that are read out late.
     """
 
     modalities = _ALL
@@ -190,7 +190,7 @@ class Rows(Statistic):
 class Columns(Statistic):
     """Detections of each column of a grid.
 
-    Law: Poisson, sums of the pixels' numbers (see `pixel_map`).
+    Law: Poisson, for sums of the pixels' numbers (see `pixel_map`).
     Shows: column patterns, a gradient, columns whose readout differs.
     """
 
@@ -246,10 +246,11 @@ def _basis(layout: Layout) -> _Basis:
 class Surface(Statistic):
     """Gradient and curvature of the map: a polynomial in x, y, x2, xy, y2, relative to the mean rate.
 
-    Each coefficient is the relative change over the array: from edge to edge for x and y, from the middle to the edge
-    for the others. Rates are free of saturation and dead time, so that a gradient is as large in every light.
-    Law: normal, sums over the array.
-    Shows: illumination gradients, vignetting, a temperature gradient in the dark. PDP spread does not, or hardly.
+    Cells: each coefficient is the relative change over the array: from edge to edge for x and y, from the middle to the
+    edge for the others. Rates are corrected for saturation and dead time, so that a gradient is the same at every light
+    level.
+    Law: normal, for sums over the array.
+    Shows: illumination gradients, vignetting, a temperature gradient in the dark. PDP spread hardly shows.
     """
 
     modalities = _ALL
@@ -285,11 +286,12 @@ def _dithered(recording: Recording) -> tuple[np.ndarray, float]:
 
 
 class Outliers(Statistic):
-    """How many pixels lie far below or above the middle of the array.
+    """Number of pixels far below or above the middle of the array.
 
-    Below 1/4, 1/2 and 3/4 and above 1.33, 2, 4 and 10 times the mean without the lowest and the highest tenth of the
-    pixels (at least two detections); rates free of saturation and dead time.
-    Law: Poisson where it is a matter of counting noise; pixels that always are there, by a map, scatter less.
+    Cells: below 1/4, 1/2 and 3/4, and above 1.33, 2, 4 and 10 times the middle. The middle is the mean without the
+    lowest and the highest tenth of the pixels (at least two detections). Rates are corrected for saturation and dead
+    time.
+    Law: Poisson where counting noise decides; pixels that a map puts there scatter less.
     Shows: lazy and dead pixels (below), hot pixels (above), a PDP spread of tens of per cent.
     """
 
@@ -317,12 +319,13 @@ class Outliers(Statistic):
 
 
 class Tails(Statistic):
-    """The mean rate of the lowest and of the highest pixels, relative to the middle of the array.
+    """Mean rate of the lowest and of the highest pixels relative to the middle of the array.
 
-    The lowest and highest quarter, twelfth, and so on by threes, of at least 16 pixels each. Middle: the mean
-    without the lowest and the highest tenth (at least two detections). Rates are free of saturation and dead time.
-    Law: normal, means of many pixels; of the highest the logarithm, for they are skewed.
-    Shows: PDP spread (both sides), lazy pixels (low side), dark count rates that spread or hot pixels (high side).
+    Cells: the lowest and the highest quarter, twelfth, and so on by threes, of at least 16 pixels each. The middle is
+    the mean without the lowest and the highest tenth (at least two detections). Rates are corrected for saturation and
+    dead time.
+    Law: normal, for means of many pixels. Of the highest pixels the logarithm is taken, because they are skewed.
+    Shows: PDP spread (both sides), lazy pixels (low side), a spread of dark count rates or hot pixels (high side).
     """
 
     modalities = _ALL
@@ -351,11 +354,11 @@ class Tails(Statistic):
 
 
 class Spread(Statistic):
-    """How much more the pixels differ than counting alone makes them: the variance of the map beyond its noise.
+    """Variance of the map beyond its counting noise.
 
-    Once of the map as it is, once behind its surface (see `surface`), so that a gradient shows in the first only.
-    Law: normal, as the score of the variance among those of equal pixels (the index of dispersion of the counts).
-    Shows: PDP spread, hot and lazy pixels, patterns; the first also a gradient.
+    Cells: of the map as it is, and of the map without its surface (see `surface`). A gradient shows in the first only.
+    Law: normal, as the score of the variance among equal pixels (the index of dispersion of the counts).
+    Shows: PDP spread, hot and lazy pixels, patterns; the first cell also a gradient.
     Source: index of dispersion (Fisher, Biometrics 6, 1950).
     """
 

@@ -23,16 +23,16 @@ _PARTS = 64  # of a frame, in which the times of first stamps are counted
 
 
 class Neighbours(Statistic):
-    """Detections of neighbouring pixels that come together, by direction, distance and the time between them.
+    """Coincident detections of neighbouring pixels, by direction, distance and the time between them.
 
-    Directions: side by side, one above the other, both diagonals; then 2 and 3 pitches. Where pixels have positions:
-    the nearest, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart, whichever is the first, and
-    for each direction one cell for the second one being later. Frames: the same frame, and the next. First stamps of
-    frames (STR): both.
-    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
-    variance is the number by chance (of frames: (1 - p)(1 - p') times it, p the share of frames with a detection), and
-    their law Poisson's. Light that spreads from pixel to pixel shows here and not in `far_pairs`: an excess, per
-    detection the same at every light level and in the dark.
+    Directions: horizontal, vertical, both diagonals; then 2 and 3 pitches. In a layout with positions: the nearest
+    pixels, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart in either order, and for each
+    direction one cell for its sign. Frames: the same frame, and the next one. First stamps of frames (STR): both.
+    Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
+    Its variance is the number by chance; for frames it is (1 - p)(1 - p') times that, with p the share of frames with a
+    detection.
+    Shows: crosstalk, which `far_pairs` does not show: an excess per detection that is the same at every light level and
+    in the dark.
     Source: Ingargiola et al., bioRxiv 207118 (2017), for coincidences by distance.
     """
 
@@ -58,15 +58,15 @@ _Row = tuple[str, float, float, float]  # where, pairs, of these by chance, thei
 
 
 class FarPairs(Statistic):
-    """Detections of different pixels anywhere on the array that come together: what the whole array has in common.
+    """Coincident detections of pixels far apart: what the whole array has in common.
 
-    All pairs of pixels more than 3 pitches apart. Time stamps: up to 1, 3, 10, 30 and 100 ns apart; frames: the same
-    frame, and the next (there of all pairs of different pixels).
-    Each cell is the normal score of the pairs beyond those that chance makes of the pixels' totals. Given these, their
-    variance is the number by chance (of frames: (1 - p)(1 - p') times it), and their law Poisson's; from frames they
-    are found as the variance of the array's sums less that of each pixel. A source that fluctuates, flickers or drifts
-    shows here as it does between neighbours; so do bursts over the array, and a readout that loses detections when
-    many come (too few).
+    Cells: all pairs of pixels more than 3 pitches apart. Time stamps: up to 1, 3, 10, 30 and 100 ns apart. Frames: the
+    same frame, and the next one (there all pairs of different pixels).
+    Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
+    Its variance is the number by chance; for frames it is (1 - p)(1 - p') times that. Pairs in frames are counted as
+    the variance of the array's sums less that of each pixel.
+    Shows: a source that fluctuates, flickers or drifts (as much as between neighbours), bursts over the array, and a
+    readout that loses detections at high rates (a deficit).
     """
 
     modalities = ("tr", "str", "qis", "counts")

@@ -144,11 +144,11 @@ def _of_blocks(series: np.ndarray, blocks: int) -> np.ndarray:
 
 
 class Trend(Statistic):
-    """The array's detections in 32 blocks of the capture (16 where there are few frames), relative to their mean.
+    """Detections of the array in 32 blocks of the capture, relative to their mean.
 
-    Of first stamps those of equal times of waiting (see `pixel_map`).
-    Law: normal, as scores of Poisson counts among those of the whole capture; all blocks with the same spread.
-    Shows: a light source that drifts, slow flicker, warming up, readout that stops for a while.
+    Captures with few frames have 16 blocks. First stamps: detections for equal times of waiting (see `pixel_map`).
+    Law: normal, as scores of Poisson counts given their total; all blocks have the same spread.
+    Shows: a light source that drifts, slow flicker, warming up, a readout that stops for a while.
     """
 
     modalities = _ALL
@@ -198,11 +198,11 @@ class Trend(Statistic):
 
 
 class SlowSeries(Statistic):
-    """Of each pixel, whether its rate is steady: the scatter of its counts in 32 blocks of the capture (or 16).
+    """Steadiness of each pixel: the scatter of its counts in 32 blocks of the capture (or 16).
 
-    Law: normal, as the score of the counts' variance (chi-square) given the pixel's number of detections, exact for
-    few. A dead time makes it smaller in bright light, in the model as well.
-    Shows: pixels that blink (telegraph noise of dark counts), a drift of all pixels, pixels that die or wake up.
+    Law: normal, as the score of the variance of the counts (chi-square) given the number of detections of the pixel;
+    exact for few. A dead time makes the variance smaller in bright light, in the model as well.
+    Shows: pixels that blink (telegraph noise of dark counts), a drift of all pixels, pixels that stop or start.
     Source: random telegraph signals in SPADs, Karami et al., IEEE Trans. Electron Devices 61 (2014); index of
     dispersion, Fisher, Biometrics 6 (1950).
     """
@@ -255,14 +255,14 @@ class SlowSeries(Statistic):
 
 
 class HotSeries(Statistic):
-    """Of the pixels with the most detections, whether their rates are steady: the scatter of their counts in blocks.
+    """Steadiness of the pixels with the most detections: the scatter of their counts in blocks.
 
-    The 2, 5, 10 and 20 % of the pixels with the most detections (two at least), together; 8, 32 and 128 blocks of the
-    capture, of 4 frames or more. `slow_series` has a cell for each pixel: if few of many pixels scatter a little too
-    much, all the others hide it.
-    Law: normal, as the score of the pairs of detections within a block, given every pixel's number of them, so that
-    the choice of the pixels changes nothing; Poisson where there are few pairs.
-    Shows: hot pixels that blink (telegraph noise of dark counts), where a map of steady dark counts has their mean.
+    Cells: the 2, 5, 10 and 20 % of the pixels with the most detections (at least two), together; 8, 32 and 128 blocks
+    of the capture, of 4 frames or more. `slow_series` has a cell for each pixel, so that a small excess of a few pixels
+    is hidden by all others.
+    Law: normal, as the score of the pairs of detections within a block, given the number of each pixel, so that the
+    choice of the pixels changes nothing; Poisson where there are few pairs.
+    Shows: hot pixels that blink (telegraph noise of dark counts). A map shows only their mean.
     Source: random telegraph signals in SPADs, Karami et al., IEEE Trans. Electron Devices 61 (2014); index of
     dispersion, Fisher, Biometrics 6 (1950).
     """

@@ -11,12 +11,13 @@ from ._walk import RANKS, SIZES, crowd_edges, crowd_scatter, gaps, spacing_edges
 
 
 class Spacing(Statistic):
-    """Intervals between successive detections of the whole array, whichever pixels they are of.
+    """Intervals between successive detections of the whole array.
 
-    In logarithmic bins from one tick on, ten to a decade, and one cell for those with the same stamp. First stamps of
-    frames (STR): within a frame. Counts, each interval in one cell: Poisson (cells that hold many of all intervals
-    scatter less). Too many short ones: light that spreads, or bursts; too few: a readout that needs time between
-    detections, whichever pixels they come from.
+    Cells: logarithmic bins from one tick on, ten to a decade, and one for equal stamps. First stamps of frames (STR):
+    within a frame.
+    Law: Poisson, for counts of intervals in one cell each. Cells that hold many of all intervals scatter less.
+    Shows: crosstalk and bursts (too many short intervals); a readout that needs time between detections of any pixels
+    (too few).
     """
 
     modalities = ("tr", "str")
@@ -44,14 +45,14 @@ class Spacing(Statistic):
 
 
 class Crowds(Statistic):
-    """Crowds of 3, 5, 9, 17 and 33 successive detections of the whole array, by the time from the first to the last.
+    """Crowds of 3, 5, 9, 17 and 33 successive detections of the whole array by their duration.
 
-    Only those that are so close together that in steady light of the same total less than one detection in 10,000,
-    1000, 100 or 10 ends such a crowd. Each cell is the normal score of their number. Its law is that of steady light:
-    crowds overlap, so they come in clumps of geometric size, and their number scatters up to three times as much as
-    independent ones; a gamma law of the same mean, variance and third cumulant describes it. Too few: a readout that
-    falls behind where many come, as it serves one at a time from a queue that is soon full; too many: bursts, or light
-    that fluctuates.
+    A crowd counts where it is so short that, in steady light of the same total, fewer than one detection in 10,000,
+    1000, 100 or 10 ends one.
+    Law: normal, as the score of the number of crowds against steady light. Crowds overlap, so they come in clumps of
+    geometric size; a gamma law of the same mean, variance and third cumulant describes their number.
+    Shows: a readout that falls behind at high rates, with a queue that is soon full (a deficit); bursts and fluctuating
+    light (an excess).
     """
 
     modalities = ("tr",)
@@ -89,11 +90,11 @@ class Crowds(Statistic):
 
 
 class Multiplicity(Statistic):
-    """Clusters of detections anywhere on the array, each within 1 ns, or 10 ns, of the one before: how many, how large?
+    """Clusters of detections anywhere on the array, by size, each within 1 ns or 10 ns of the one before.
 
-    Of 2, 3, 4, 5 to 8, 9 to 16 and more detections. First stamps of frames (STR): within a frame. Rare and
-    independent of each other, their numbers are Poisson. Bursts of many pixels at once show here, which in other
-    statistics drown.
+    Cells: clusters of 2, 3, 4, 5 to 8, 9 to 16 and more detections. First stamps of frames (STR): within a frame.
+    Law: Poisson, for rare and independent clusters.
+    Shows: bursts of many pixels at once, which are too faint in other statistics.
     """
 
     modalities = ("tr", "str")

@@ -21,13 +21,13 @@ _LEAST = 16  # bins
 
 
 class Spectrum(Statistic):
-    """Power spectrum of the detections of the whole array: every frequency that its length and its steps allow.
+    """Power spectrum of the detections of the whole array, at all frequencies.
 
-    Time stamps in at most 65,536 bins of at least 5 us; frames as they are, or some together where there are more. The
-    power is divided by its mean over all frequencies, so that neither the light level nor what a dead time takes away
-    at all frequencies is seen here; frequency zero is left out.
-    Amplitudes are sums over very many detections, so that their power is exponential (chi squared with 2 degrees of
-    freedom). A line shows flicker, or a clock; low frequencies a drift, a source that is noisy, blinking pixels.
+    Time stamps: at most 65,536 bins of at least 5 us. Frames: each is a bin, or several together where there are more.
+    The power is relative to its mean over all frequencies, so neither the light level nor a loss at all frequencies
+    shows. Frequency zero is left out.
+    Law: exponential (chi squared with 2 degrees of freedom), because amplitudes are sums over very many detections.
+    Shows: flicker or a clock (a line); drift, source noise and blinking pixels (an excess at low frequencies).
     Source: Leahy et al., Astrophys. J. 266 (1983) 160.
     """
 
