@@ -12,12 +12,13 @@ import errno
 import fcntl
 import functools
 import hashlib
-import importlib.metadata
 import io
 import json
 import os
 import resource
+import secrets
 import shutil
+import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,24 +28,24 @@ from typing import Any
 
 import numpy as np
 
-from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
+from . import config, dataset, disk, document, golden, plugins, reconstruct, store
 from .compiled import compiling
 from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .foreign import from_json
+from .golden import versions
 from .images import Images
 from .positions import positions_text
 from .reconstruct import median_of_nonzero
-from .workers import Executor, executor
+from .workers import Executor, Serial, executor
 
 POSITIONS = "maps/layout.positions.csv"
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
-_VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,27 @@ class Task:
     labels: np.ndarray | None
     white: float
     first: int
+    run: Run | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a worker of another machine knows a run by: a file in the dataset's state, and what it holds."""
+
+    path: str
+    token: str
+
+    def check(self) -> None:
+        """Raise SpadError where a worker does not see the run's file, or the run has ended meanwhile."""
+        try:
+            there = disk.read_file(self.path, _LARGEST_NOTE).decode()
+        except (OSError, ValueError):
+            there = ""
+        if there != self.token:
+            raise SpadError(
+                f"a worker on {socket.gethostname()} does not see this run in {Path(self.path).parents[1]}; mount that "
+                "folder there under the same name, or say --no-shared, with which workers write nothing themselves"
+            )
 
 
 @dataclass(frozen=True)
@@ -96,14 +118,30 @@ def _experiment(job: Job) -> Experiment:
         return config.build(document.parse(job.config, "config"), Path(folder))
 
 
-def make_shard(task: Task) -> tuple[str, Files]:
+def make_shard(task: Task) -> Files:
     """Simulate, encode and commit one shard, then note its files' digests in the state folder."""
     experiment = _experiment(task.job)
+    if task.run:
+        task.run.check()
     columns, attributes = shard_content(experiment, task)
-    root = Path(task.root)
-    files = store.write_shard(root, task.shard.path, columns, attributes, experiment.format)
-    note(root, task.shard, files)
-    return task.shard.path, files
+    if task.run:
+        task.run.check()  # once more: nobody waits for a worker that was given up
+    files = store.write_shard(task.root, task.shard.path, columns, attributes, experiment.format)
+    note(Path(task.root), task.shard, files)
+    return files
+
+
+def encode_shard(task: Task) -> dict[str, bytes]:
+    """Simulate and encode one shard; its files, for `store.put_shard`."""
+    experiment = _experiment(task.job)
+    columns, attributes = shard_content(experiment, task)
+    files = store.encoded(task.shard.path, columns, attributes, experiment.format)
+    return {name: b"".join(pieces) for name, pieces in files.items()}
+
+
+def golden_of(job: Job) -> tuple[str, str]:
+    """(digest of a config's golden shard, by what it was made), for `Executor.greet`."""
+    return golden.digest(_experiment(job)), golden.made_by()
 
 
 def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.Column], dict[str, Any]]:
@@ -217,11 +255,6 @@ def _writable(place: Path) -> Iterator[None]:
             error.errno or 0, error.strerror
         )
         raise SpadError(f"{place}: cannot be written ({reason}); choose another place with -o") from None
-
-
-def versions() -> dict[str, str]:
-    """Versions of what decides the bytes of a dataset."""
-    return {"spadmnist": __version__} | {name: importlib.metadata.version(name) for name in _VERSIONS}
 
 
 def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, Any]:
@@ -354,6 +387,7 @@ def generate(
         if _check_place(root, wanted):  # another run has finished it meanwhile
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted)
+        greet(workers, experiment)
         _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
         missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
@@ -521,7 +555,7 @@ def _make(
     by_path = {s.path: s for s in missing}
     started, images = time.monotonic(), 0
 
-    def done(path: str, _: Any) -> None:
+    def done(path: str, _: Files) -> None:
         nonlocal images
         shard = by_path[path]
         images += shard.stop - shard.start if shard.level is not None else 0
@@ -529,14 +563,37 @@ def _make(
         progress.advance(work[path], f"{shard.level or 'images'} {shard.split}, {rate:,.0f} images/s")
 
     if missing:
-        job = job_of(experiment)
-
-        def tasks(paths: Sequence[str]) -> Iterator[Task]:
-            return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split]) for p in paths)
-
         _warm(experiment, progress)
-        workers.run(make_shard, tasks, list(by_path), done)
+        make_shards(experiment, splits, root, missing, workers, done)
     progress.stop()
+
+
+def make_shards(
+    experiment: Experiment,
+    splits: Mapping[str, Images],
+    root: Path,
+    shards: Sequence[Shard],
+    workers: Executor,
+    done: Callable[[str, Files], None],
+) -> None:
+    """Make shards in `root`, which is a dataset or lies in its state; `done` is called with the path of each, and the
+    digests of its files."""
+    by_path, job, run = {s.path: s for s in shards}, job_of(experiment), run_of(root, workers)
+
+    def tasks(paths: Sequence[str]) -> Iterator[Task]:
+        block = experiment.sensor.block
+        return (_task_of(job, root, run, by_path[p], splits[by_path[p].split], block) for p in paths)
+
+    def keep(path: str, files: dict[str, bytes]) -> None:
+        size = sum(map(len, files.values()))
+        made = store.put_shard(root, path, {name: [data] for name, data in files.items()}, experiment.format, size)
+        note(root, by_path[path], made)
+        done(path, made)
+
+    if workers.shared:
+        workers.run(make_shard, tasks, list(by_path), done)
+    else:
+        workers.run(encode_shard, tasks, list(by_path), keep)
 
 
 def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
@@ -555,13 +612,30 @@ def job_of(experiment: Experiment) -> Job:
     return Job(document.dump(resolved), tuple(maps.items()), plugins.carried())
 
 
-def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images) -> Task:
+def _task_of(job: Job, root: Path, run: Run | None, shard: Shard, images: Images, block: int) -> Task:
     """The task that makes a shard: whole blocks of images where an effect needs them."""
-    block = experiment.sensor.block if shard.level is not None else 1
+    block = block if shard.level is not None else 1
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
     labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
-    return Task(job, str(root), shard, images.pixels[first:last], labels, images.white, first)
+    return Task(job, os.path.abspath(root), shard, images.pixels[first:last], labels, images.white, first, run)
+
+
+def greet(workers: Executor, experiment: Experiment) -> None:
+    """Have each worker of another machine show first that it makes the bytes that are made here."""
+    if golden.has_golden(experiment):
+        workers.greet(golden_of, job_of(experiment))
+    else:
+        workers.greet(golden.answer, None)
+
+
+def run_of(root: Path, workers: Executor) -> Run | None:
+    """The mark in a dataset's state by which workers of other machines know this run; None where none need it."""
+    if workers.local or not workers.shared:
+        return None
+    run = Run(os.path.abspath(root / STATE / "run"), secrets.token_hex(16))
+    disk.commit_file(run.path, run.token.encode(), disk.temporary(root))
+    return run
 
 
 def _warm(experiment: Experiment, progress: Progress) -> None:
@@ -589,11 +663,14 @@ class Addition:
     methods: tuple[str, ...]
     like: Likeness
     files: dict[str, Files]
+    run: Run | None = None
 
 
 def add_methods(addition: Addition) -> tuple[str, Files]:
     """Reconstruct the images of one shard from its raw streams and add them to it."""
     experiment = _experiment(addition.job)
+    if addition.run:
+        addition.run.check()
     root, shard = Path(addition.root), addition.shard
     reader = shard.reader(root, experiment.format, addition.like, addition.files)
     recorded, shape = dataset.read_shard(reader, experiment)
@@ -639,7 +716,8 @@ def add_reconstructions(
                 _refuse_other(root, wanted, there)
         begin(root, wanted)
         by_path = {s.path: s for s in shards if _record(root, s) is None}
-        job, like = job_of(after), Likeness.of(manifest)
+        job, like, run = job_of(after), Likeness.of(manifest), run_of(root, workers)
+        greet(workers, after)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
         def files_of(shard: Shard) -> dict[str, Files]:
@@ -656,9 +734,10 @@ def add_reconstructions(
             del by_path[path]
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
+            place = os.path.abspath(root)
             workers.run(
                 add_methods,
-                lambda paths: (Addition(job, str(root), by_path[p], new, like, files_of(by_path[p])) for p in paths),
+                lambda paths: (Addition(job, place, by_path[p], new, like, files_of(by_path[p]), run) for p in paths),
                 list(by_path),
                 done,
             )
@@ -700,14 +779,15 @@ def finish(
     progress.start("normalising", len(keys), 0)
 
     def tasks(which: Sequence[tuple[str, str]]) -> Iterator[Any]:
-        return ((root, experiment.format, like, training[level], method) for level, method in which)
+        place = Path(os.path.abspath(root))
+        return ((place, experiment.format, like, training[level], method) for level, method in which)
 
     def done(key: tuple[str, str], value: float | None) -> None:
         normalisation[key[0]][key[1]] = value
         progress.advance(1, key[0])
 
     if keys:
-        workers.run(_normalise, tasks, keys, done)
+        (workers if workers.shared else Serial()).run(_normalise, tasks, keys, done)
     progress.stop()
 
     temporary = disk.temporary(root)

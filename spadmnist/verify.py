@@ -310,17 +310,12 @@ def _remake(
     Returns (the files of each shard, what was done).
     """
     apart = root / STATE / "again"
-    by_path = {s.path: s for s in shards}
-    job = factory.job_of(experiment)
     remade: dict[str, Files] = {}
     did: list[str] = []
 
-    def tasks(paths: Sequence[str]) -> Iterator[Any]:
-        return (factory.task_of(experiment, job, apart, by_path[p], splits[by_path[p].split]) for p in paths)
-
-    def done(path: str, result: tuple[str, Files]) -> None:
+    def done(path: str, files: Files) -> None:
         progress.advance(1, path)
-        for name, facts in result[1].items():
+        for name, facts in files.items():
             if manifest is not None and manifest["files"].get(name) != facts:
                 raise SpadError(
                     f"{root / name}: what is made now is not what the manifest lists; generate the dataset anew"
@@ -329,11 +324,12 @@ def _remake(
             if not _same(root / name, facts):
                 os.replace(apart / name, root / name)
                 did.append(f"made again: {name}")
-        remade[path] = result[1]
+        remade[path] = files
 
     progress.start("making again", len(shards), 0)
     if shards:
-        workers.run(factory.make_shard, tasks, list(by_path), done)
+        factory.greet(workers, experiment)
+        factory.make_shards(experiment, splits, apart, shards, workers, done)
     progress.stop()
     return remade, did
 

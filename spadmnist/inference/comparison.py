@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from .. import units
+from .. import golden, units
 from ..errors import InputError
 from ..measurement import Measurement
 from ..recording import Capture
@@ -170,6 +170,7 @@ def compare(
         InputError: where sensor and measurement do not belong together, or nothing can be compared.
     """
     with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         say = progress or (lambda capture, share: None)
         simulations = Replicates(sensor, measurement, seed, workers, replicates, progress=say)
         evaluation, _ = evaluate_start(simulations)

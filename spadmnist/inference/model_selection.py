@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from .. import golden
 from ..effects import Mimic
 from ..errors import UNABLE, why
 from ..measurement import Measurement
@@ -84,6 +85,7 @@ def diagnose(
         report(what if budget.spent == 0 or left in (0, math.inf) else f"{what} (at most {clock(left)} of steps left)")
 
     with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         number = _QUICK if quick else REPLICATES
         replicates = Replicates(sensor, measurement, seed, workers, number, say, budget=budget)
         short = setups.stopped_early(replicates)

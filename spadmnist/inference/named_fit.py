@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from .. import golden
 from ..effects import Effect
 from ..errors import InputError, did_you_mean
 from ..measurement import Measurement
@@ -67,6 +68,7 @@ def fit_named(
     if not wanted:
         raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
     with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         if counts_in_the_dark.may_fit(sensor.settled(), wanted):
             replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
             answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
