@@ -30,6 +30,8 @@ _ADDRESS = re.compile(r"(tcp|tls|ws|wss|ucx|inproc)://.+")
 _CONNECT = 10.0  # s for the scheduler to answer; it is one process, and idle
 _NO_WORKER = 60.0  # s without a single worker, after which the run ends; a batch system starts one in less, or not soon
 _LOOK = 1.0  # s between two looks at how many workers there are
+_FETCH = 5.0  # s for a result to come, before it is asked whether there are workers still
+_YOUNG, _SETTLE = 30.0, 2.0  # s: a worker so young waits so long, for a nanny replaces none that dies as it starts
 _END = 1.5  # s for the scheduler to take back tasks, and as many to part; Ctrl-C ends all within five
 
 
@@ -45,7 +47,7 @@ class Cluster(Executor):
         SpadError: where dask.distributed is not installed, or the address is none.
     """
 
-    chances = 2  # each of them is four workers of the scheduler's: it tries a task itself on as many
+    chances = 1  # of four workers, on which the scheduler itself tries a task
     local = False
 
     def __init__(
@@ -127,7 +129,7 @@ class Cluster(Executor):
                 _called, self._greeting, packed, key=f"spadmnist-{uuid.uuid4().hex}", pure=False
             )
         self._under_way.add(future)
-        return _Future(future)
+        return _Future(future, self._look)
 
     def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
         while True:
@@ -194,29 +196,30 @@ class Cluster(Executor):
 class _Future:
     """A future of the scheduler's, which calls back with itself."""
 
-    def __init__(self, of: Any):
-        self.of = of
+    def __init__(self, of: Any, look: Callable[[], None]):
+        self.of, self._look = of, look
 
     def add_done_callback(self, call: Callable[[Any], None]) -> None:
         self.of.add_done_callback(lambda future: call(self))
 
-    def exception(self) -> BaseException | None:
-        try:
-            found = self.of.exception()
-        except BaseException as error:  # of one that was taken back
-            found = error
-        return found
-
     def result(self) -> Any:
-        result = self.of.result()
-        self.of.release()
-        return result
+        """The result, which is fetched from its worker; where that has died meanwhile, the task is done again."""
+        while True:
+            try:
+                result = self.of.result(timeout=_FETCH)
+            except TimeoutError:
+                if self.of.status == "error":  # it is the task's own
+                    raise
+                self._look()
+            else:
+                self.of.release()
+                return result
 
 
 def _hush() -> None:
     """dask.distributed writes of every worker that dies; what matters is said here."""
-    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
-    for name in ("distributed", *names):
+    heads = ("distributed", "tornado", "asyncio")
+    for name in [*heads, *(name for name in logging.root.manager.loggerDict if name.split(".")[0] in heads)]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
@@ -245,10 +248,19 @@ def _called(greeting: bytes, packed: bytes) -> Any:
         digest = hashlib.sha256(greeting).digest()
         if digest not in _welcome:
             keep_freed_memory()
+            if _age() < _YOUNG:
+                time.sleep(_SETTLE)
             if asked is not None:
                 _ask(host, *asked)
             _welcome.add(digest)
     return function(task)
+
+
+def _age() -> float:
+    """How long this process has lived, s."""
+    import psutil  # distributed brings it
+
+    return time.time() - psutil.Process().create_time()
 
 
 def _ask(host: str, question: Callable[[Any], tuple[str, str]], about: Any, known: tuple[str, str]) -> None:

@@ -170,15 +170,17 @@ class Executor:
             if not under_way:
                 return lost, list(left)
             future = self._next(ended)
-            key, error = under_way.pop(future), future.exception()
-            if error is None:
-                in_a_row = 0
-                done(key, future.result())
-            elif self._is_death(error):
+            key = under_way.pop(future)
+            try:
+                result = future.result()
+            except Exception as error:
+                if not self._is_death(error):
+                    raise
                 in_a_row += 1
                 lost.append(key)
-            else:
-                raise error
+                continue
+            in_a_row = 0
+            done(key, result)
 
     # --- what an executor is made of ---
 
@@ -187,7 +189,7 @@ class Executor:
         return contextlib.nullcontext()
 
     def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
-        """A future, with `add_done_callback`, `exception` and `result`, of a task handed to a worker."""
+        """A future, with `add_done_callback` and `result`, of a task handed to a worker."""
         raise NotImplementedError
 
     def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
@@ -195,7 +197,7 @@ class Executor:
         return ended.get()
 
     def _is_death(self, error: BaseException) -> bool:
-        """Does an error of a future say that its worker died?"""
+        """Does what a future raised say that its worker died?"""
         raise NotImplementedError
 
     def _end(self) -> None:
