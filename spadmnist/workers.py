@@ -17,8 +17,6 @@ import ctypes
 import fcntl
 import functools
 import math
-import multiprocessing
-import multiprocessing.resource_tracker
 import os
 import queue
 import shutil
@@ -244,6 +242,8 @@ class Loky(Executor):
             yield
 
     def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
+        import multiprocessing.resource_tracker
+
         from joblib.externals.loky import get_reusable_executor
         from joblib.externals.loky.backend import resource_tracker
 
@@ -274,6 +274,8 @@ class Loky(Executor):
         return isinstance(error, TerminatedWorkerError)
 
     def _end(self) -> None:
+        import multiprocessing
+
         from joblib.externals.loky import get_reusable_executor
         from joblib.externals.loky.backend.process import LokyProcess
 

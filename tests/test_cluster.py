@@ -17,10 +17,13 @@ from typing import Any
 
 import psutil
 import pytest
-from test_factory import METHODS, assert_same, descendants, make, tree, wait_for, write_config
+import tinylab
+from commands import run
+from test_factory import METHODS, assert_same, assert_sentence, descendants, make, tree, wait_for, write_config
 
 from spadmnist import config, factory, golden, plugins, verify
 from spadmnist.errors import SpadError
+from spadmnist.inference.comparison import canonical, compare
 from spadmnist.workers import Serial
 
 distributed = pytest.importorskip("distributed", reason="the cluster's library is not installed")
@@ -193,6 +196,12 @@ def test_plug_ins_and_maps_are_carried_along(cluster: Cluster, tmp_path: Path) -
     assert_same(tmp_path / "out", tree(tmp_path / "expected"))
 
 
+def test_a_comparison_on_a_cluster_is_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    sensor, data = tinylab.labs(tmp_path)()
+    alone, there = (canonical(compare(sensor, data, jobs=workers, replicates=16)) for workers in (1, cluster))
+    assert alone == there
+
+
 # --- bad input ----------------------------------------------------------------------------------------------------
 
 
@@ -202,6 +211,26 @@ def test_no_scheduler_there(monkeypatch: pytest.MonkeyPatch) -> None:
         Cluster(FREE).run(abs, iter, [1], print)
     with pytest.raises(SpadError, match=r"is no address of a scheduler"):
         Cluster("127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--cluster", FREE], "no scheduler answers there"),
+        (["--cluster", "8786"], "is no address of a scheduler; write tcp://HOST:PORT"),
+        (["--cluster", FREE, "--jobs", "2"], "--jobs: a cluster has the workers that were started there"),
+        (["--no-shared"], "--no-shared: is said of the workers of a cluster"),
+    ],
+)
+def test_the_command_line_says_it_in_one_sentence(more: list[str], said: str, tmp_path: Path) -> None:
+    assert_sentence(run("generate", write_config(tmp_path / "c.yaml"), "-o", tmp_path / "out", *more), said)
+    assert not (tmp_path / "out" / "data.zarr").exists()
+
+
+def test_the_command_line_makes_the_same_bytes(many: tuple[Path, Path], site: Site, tmp_path: Path) -> None:
+    result = run("generate", many[0], "-o", tmp_path / "out", "--cluster", site.address)
+    assert result.returncode == 0, result.stderr
+    assert_same(tmp_path / "out", tree(many[1]))
 
 
 def test_a_scheduler_of_another_version(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

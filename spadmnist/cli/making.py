@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     help="Where the images lie. Without it MNIST is looked for in $SPADMNIST_DATA, then downloaded once.",
 )
 @options.jobs
+@options.cluster
+@options.no_shared
 @click.option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
@@ -73,6 +75,8 @@ def generate(
     limit: int | None,
     images_dir: Path | None,
     jobs: int | None,
+    cluster: str | None,
+    no_shared: bool,
     seed: int | None,
     format_: str | None,
     causes: bool,
@@ -82,8 +86,8 @@ def generate(
 ) -> None:
     """Make the dataset that CONFIG describes.
 
-    The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs and --causes change no
-    drawn value of what is made.
+    The same command again goes on where an interrupted run stopped. --lux, --limit, --jobs, --cluster and --causes
+    change no drawn value of what is made.
 
     Pictures of your own are `source: folder` (spadmnist init writes such a config). A pixel's photons follow its grey
     level. With `gamma: srgb` the level is first taken back from sRGB to light: half of white gets 21 % of its photons.
@@ -105,17 +109,17 @@ def generate(
     for note in sources.notes(images):
         terminal.say(f"Note: {note}")
     root = output if output is not None else Path(config.stem)
-    workers = jobs or factory.most_workers(experiment, images, processors())
+    most = factory.most_workers(experiment, images, processors())
     if dry_run:
         from .. import plan
 
-        estimate = plan.estimate(experiment, images, workers)
+        estimate = plan.estimate(experiment, images, jobs or most)
         if as_json:
             terminal.print_json(estimate)
         else:
             terminal.print_lines(plan.text(estimate, root))
         return
-    with terminal.progress() as progress:
+    with options.workers_of(jobs, cluster, no_shared, most) as workers, terminal.progress() as progress:
         outcome = factory.generate(experiment, images, root, workers, progress)
     if as_json:
         terminal.print_json(
@@ -202,6 +206,7 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
 )
 @options.crop
 @options.jobs
+@options.cluster
 @options.plugin
 @options.as_json
 def reconstruct_(
@@ -211,6 +216,7 @@ def reconstruct_(
     sensor: Path | None,
     crop: str | None,
     jobs: int | None,
+    cluster: str | None,
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
@@ -235,10 +241,11 @@ def reconstruct_(
         except KeyError as error:
             raise SpadError(f"--method: {error.args[0]}") from None
     if measurement.is_measurement(dataset):
-        if jobs is not None:
-            raise SpadError(
-                f"--jobs: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
-            )
+        for option, value in (("--jobs", jobs), ("--cluster", cluster)):
+            if value is not None:
+                raise SpadError(
+                    f"{option}: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
+                )
         if crop is not None and sensor is None:
             raise SpadError("--crop: is the part of a sensor; give --sensor as well, or leave it out")
         model = None if sensor is None else options.model_of(sensor, crop)
@@ -250,8 +257,8 @@ def reconstruct_(
                 f"{option}: belongs to a measurement, and {dataset} is none; a dataset keeps its images and knows its "
                 "sensor: leave it out"
             )
-    with terminal.progress() as progress:
-        added, manifest = factory.add_reconstructions(dataset, methods, jobs or processors(), progress)
+    with options.workers_of(jobs, cluster) as workers, terminal.progress() as progress:
+        added, manifest = factory.add_reconstructions(dataset, methods, workers, progress)
     if as_json:
         terminal.print_json({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
         return
@@ -296,6 +303,8 @@ def _reconstruct_measurement(
     help="For --repair: where the images lie, if the dataset's own copy is damaged.",
 )
 @options.jobs
+@options.cluster
+@options.no_shared
 @options.plugin
 @options.as_json
 def verify(
@@ -303,6 +312,8 @@ def verify(
     repair: bool,
     images_dir: Path | None,
     jobs: int | None,
+    cluster: str | None,
+    no_shared: bool,
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
@@ -313,11 +324,11 @@ def verify(
     from .. import verify as library
 
     options.load_plugins(plugin_files)
-    with terminal.progress() as progress:
+    with options.workers_of(jobs, cluster, no_shared) as workers, terminal.progress() as progress:
         damage = library.verify(dataset, progress)
         left, did = damage, []
         if repair:
-            did = library.repair(dataset, damage, jobs or processors(), images_dir, progress)
+            did = library.repair(dataset, damage, workers, images_dir, progress)
             left = library.verify(dataset, progress) if damage else damage
     if as_json:
         found = {
