@@ -581,8 +581,7 @@ def make_shards(
     by_path, job, run = {s.path: s for s in shards}, job_of(experiment), run_of(root, workers)
 
     def tasks(paths: Sequence[str]) -> Iterator[Task]:
-        block = experiment.sensor.block
-        return (_task_of(job, root, run, by_path[p], splits[by_path[p].split], block) for p in paths)
+        return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split], run) for p in paths)
 
     def keep(path: str, files: dict[str, bytes]) -> None:
         size = sum(map(len, files.values()))
@@ -612,9 +611,9 @@ def job_of(experiment: Experiment) -> Job:
     return Job(document.dump(resolved), tuple(maps.items()), plugins.carried())
 
 
-def _task_of(job: Job, root: Path, run: Run | None, shard: Shard, images: Images, block: int) -> Task:
+def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images, run: Run | None = None) -> Task:
     """The task that makes a shard: whole blocks of images where an effect needs them."""
-    block = block if shard.level is not None else 1
+    block = experiment.sensor.block if shard.level is not None else 1
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
     labels = None if images.labels is None or shard.level is not None else images.labels[first:last]

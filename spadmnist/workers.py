@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import ctypes
 import fcntl
 import functools
 import math
@@ -29,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from .errors import SpadError
-from .heap import keep_freed_memory
 
 Make = Callable[[Sequence[Any]], Iterator[Any]]  # keys -> the task of each, made when it is called for
 Done = Callable[[Any, Any], None]  # called with a key and its result
@@ -210,6 +208,8 @@ class Serial(Executor):
 
     def run(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
         """As `Executor.run`; a task that kills takes this process with it."""
+        from .heap import keep_freed_memory
+
         clear_once(os.getpid())
         keep_freed_memory()
         for key, task in zip(keys, make(keys), strict=True):
@@ -290,6 +290,10 @@ class Loky(Executor):
 
 def _start_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
+    import ctypes
+
+    from .heap import keep_freed_memory
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

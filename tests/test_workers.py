@@ -137,6 +137,7 @@ def test_an_empty_entry_of_the_path_is_not_the_current_folder(watched: Watched, 
 
 LIBRARY = """
 import os, sys
+from spadmnist import compiled  # numba sets a variable of its own when it is imported
 from spadmnist.workers import executor
 
 if __name__ == "__main__":
