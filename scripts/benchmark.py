@@ -35,6 +35,7 @@ from spadmnist import config, dataset, factory, measurement, reconstruct, store,
 from spadmnist.effects import Conditions, Effect  # noqa: E402
 from spadmnist.errors import SpadError  # noqa: E402
 from spadmnist.events import Layout  # noqa: E402
+from spadmnist.heap import keep_freed_memory  # noqa: E402
 from spadmnist.plugins import Distribution  # noqa: E402
 from spadmnist.recording import Capture, Light  # noqa: E402
 from spadmnist.sensor import Sensor  # noqa: E402
@@ -73,7 +74,7 @@ def experiment_at(level: str, images_dir: Path | None, limit: int | None = None)
 
 def simulation(images_dir: Path | None, rounds: int) -> list[Row]:
     """One core, no storing: against raw exponentials, plain numpy and the literal algorithm."""
-    factory.keep_freed_memory()
+    keep_freed_memory()
     experiment, splits, kind = experiment_at("2560 mlux", images_dir)
     images = splits["train"]
     level = experiment.levels[0]

@@ -8,21 +8,18 @@ of config, images and versions alone.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import functools
 import hashlib
-import importlib.metadata
 import io
 import json
-import multiprocessing
-import multiprocessing.resource_tracker
 import os
 import resource
+import secrets
 import shutil
-import signal
-import sys
+import socket
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -31,35 +28,36 @@ from typing import Any
 
 import numpy as np
 
-from . import __version__, config, dataset, disk, document, plugins, reconstruct, store
+from . import config, dataset, disk, document, golden, plugins, reconstruct, store
 from .compiled import compiling
 from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .foreign import from_json
-from .heap import keep_freed_memory
+from .golden import versions
 from .images import Images
 from .positions import positions_text
 from .reconstruct import median_of_nonzero
-from .workers import clear_once, workers
+from .workers import Executor, Serial, executor
 
 POSITIONS = "maps/layout.positions.csv"
-_ROUNDS = 3
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
-_VERSIONS = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs to know to simulate: enough to build the experiment anew."""
+    """What a worker needs to know to simulate: enough to build the experiment anew, wherever it is.
+
+    maps: (name, content) of the files that the config names.
+    """
 
     config: str
-    base: str
-    plugin_files: tuple[str, ...]
+    maps: tuple[tuple[str, bytes], ...]
+    plugins: tuple[plugins.Carried, ...]
 
 
 @dataclass(frozen=True)
@@ -73,6 +71,27 @@ class Task:
     labels: np.ndarray | None
     white: float
     first: int
+    run: Run | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a worker of another machine knows a run by: a file in the dataset's state, and what it holds."""
+
+    path: str
+    token: str
+
+    def check(self) -> None:
+        """Raise SpadError where a worker does not see the run's file, or the run has ended meanwhile."""
+        try:
+            there = disk.read_file(self.path, _LARGEST_NOTE).decode()
+        except (OSError, ValueError):
+            there = ""
+        if there != self.token:
+            raise SpadError(
+                f"a worker on {socket.gethostname()} does not see this run in {Path(self.path).parents[1]}; mount that "
+                "folder there under the same name, or say --no-shared, with which workers write nothing themselves"
+            )
 
 
 @dataclass(frozen=True)
@@ -90,19 +109,39 @@ class Progress:
 
 @functools.lru_cache(maxsize=2)
 def _experiment(job: Job) -> Experiment:
-    for file in job.plugin_files:
-        plugins.load_file(file)
-    return config.build(document.parse(job.config, "config"), Path(job.base))
+    plugins.load_carried(job.plugins)
+    with tempfile.TemporaryDirectory(prefix="spadmnist-maps-") as folder:
+        for name, data in job.maps:
+            path = Path(folder, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        return config.build(document.parse(job.config, "config"), Path(folder))
 
 
-def make_shard(task: Task) -> tuple[str, Files]:
+def make_shard(task: Task) -> Files:
     """Simulate, encode and commit one shard, then note its files' digests in the state folder."""
     experiment = _experiment(task.job)
+    if task.run:
+        task.run.check()
     columns, attributes = shard_content(experiment, task)
-    root = Path(task.root)
-    files = store.write_shard(root, task.shard.path, columns, attributes, experiment.format)
-    note(root, task.shard, files)
-    return task.shard.path, files
+    if task.run:
+        task.run.check()  # once more: nobody waits for a worker that was given up
+    files = store.write_shard(task.root, task.shard.path, columns, attributes, experiment.format)
+    note(Path(task.root), task.shard, files)
+    return files
+
+
+def encode_shard(task: Task) -> dict[str, bytes]:
+    """Simulate and encode one shard; its files, for `store.put_shard`."""
+    experiment = _experiment(task.job)
+    columns, attributes = shard_content(experiment, task)
+    files = store.encoded(task.shard.path, columns, attributes, experiment.format)
+    return {name: b"".join(pieces) for name, pieces in files.items()}
+
+
+def golden_of(job: Job) -> tuple[str, str]:
+    """(digest of a config's golden shard, by what it was made), for `Executor.greet`."""
+    return golden.digest(_experiment(job)), golden.made_by()
 
 
 def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.Column], dict[str, Any]]:
@@ -133,145 +172,6 @@ def _record_path(root: Path, shard: Shard) -> Path:
 def note(root: Path, shard: Shard, files: Files) -> None:
     """Remember the digests of a shard's files until the manifest lists them."""
     disk.commit_file(_record_path(root, shard), dataset.canonical(files), disk.temporary(root))
-
-
-def _start_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    if os.getppid() != parent:
-        os._exit(1)
-    keep_freed_memory()
-
-
-# --- running tasks ------------------------------------------------------------------------------------------------
-
-
-def run_tasks(
-    function: Callable[[Any], Any],
-    tasks: Callable[[Sequence[Any]], Iterator[Any]],
-    keys: Sequence[Any],
-    jobs: int,
-    done: Callable[[Any, Any], None],
-) -> None:
-    """Call `function` on the task of every key, `jobs` at a time, and `done(key, result)` for each.
-
-    A worker that dies takes its call down with it; what is missing is tried again, at last one by one, so that the
-    task that kills its worker is named. Errors that a task raises itself are passed on.
-    """
-    if jobs == 1:
-        clear_once(os.getpid())
-        keep_freed_memory()
-        for key, task in zip(keys, tasks(keys), strict=True):
-            done(key, function(task))
-        return
-    from joblib import delayed
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    missing, fatal, attempt = list(keys), [], 1
-    while missing:
-        remaining = dict.fromkeys(missing)
-        alone = attempt > _ROUNDS
-        try:
-            with workers(
-                2 if alone else min(jobs, max(2, len(missing))),
-                backend="loky",
-                return_as="generator_unordered",
-                pre_dispatch=1 if alone else "n_jobs",
-                batch_size=1,
-                max_nbytes=None,
-                initializer=_start_worker,
-                initargs=(os.getpid(),),
-            ) as parallel:
-                _start_workers()
-                calls = (
-                    delayed(_keyed)(function, key, task) for key, task in zip(missing, tasks(missing), strict=True)
-                )
-                for key, result in parallel(calls):
-                    del remaining[key]
-                    done(key, result)
-        except TerminatedWorkerError:
-            if alone:  # the one that was under way is the one that kills
-                fatal.append(next(iter(remaining)))
-                del remaining[fatal[-1]]
-        except BaseException as error:
-            _end_workers(error)
-            raise
-        missing, attempt = list(remaining), attempt + 1
-    if fatal:
-        raise SpadError(
-            f"a worker died each time it made {', '.join(map(str, fatal))} (out of memory?); all else is complete: "
-            "free some memory or give fewer --jobs, and type the same command again"
-        )
-
-
-@contextlib.contextmanager
-def pool(jobs: int, return_as: str = "list") -> Iterator[Any]:
-    """What `joblib.Parallel` is with so many workers, which are started when they are called for.
-
-    Raises SpadError where a worker dies; whatever is raised, no worker is left at work.
-    """
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    if jobs == 1:
-        with workers(1, return_as=return_as) as parallel:
-            yield parallel
-        return
-    start = {"backend": "loky", "initializer": _start_worker, "initargs": (os.getpid(),)}
-    try:
-        with workers(jobs, return_as=return_as, **start) as parallel:
-
-            def called(calls: Any) -> Any:
-                _start_workers()
-                return parallel(calls)
-
-            yield called
-    except TerminatedWorkerError as error:
-        _end_workers(error)
-        raise SpadError(
-            "a worker died (out of memory, or killed from outside?); free some memory or give fewer --jobs, and type "
-            "the same command again"
-        ) from None
-    except BaseException as error:
-        _end_workers(error)
-        raise
-
-
-def _start_workers() -> None:
-    """Start the workers of the open pool, which never see Ctrl-C: not while they import what they need, either."""
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.backend import resource_tracker
-
-    for tracker in (resource_tracker, multiprocessing.resource_tracker):  # which may unblock the signal as they start
-        tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        get_reusable_executor(reuse=True).submit(_nothing)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _nothing() -> None:
-    """A first call, for which all workers are started."""
-
-
-def _end_workers(error: BaseException) -> None:
-    """End the workers: an error of a task leaves them idle; an interruption finds them at work."""
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.backend.process import LokyProcess
-
-    with contextlib.suppress(OSError, RuntimeError):  # where no process or thread could be started
-        get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=not isinstance(error, Exception))
-    for process in multiprocessing.active_children():
-        if isinstance(process, LokyProcess) and process.pid is not None:  # started before the one that could not be
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
-            process.join()
-
-
-def _keyed(function: Callable[[Any], Any], key: Any, task: Any) -> tuple[Any, Any]:
-    return key, function(task)
 
 
 # --- the state of a run -------------------------------------------------------------------------------------------
@@ -355,11 +255,6 @@ def _writable(place: Path) -> Iterator[None]:
             error.errno or 0, error.strerror
         )
         raise SpadError(f"{place}: cannot be written ({reason}); choose another place with -o") from None
-
-
-def versions() -> dict[str, str]:
-    """Versions of what decides the bytes of a dataset."""
-    return {"spadmnist": __version__} | {name: importlib.metadata.version(name) for name in _VERSIONS}
 
 
 def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, Any]:
@@ -471,14 +366,19 @@ def generate(
     experiment: Experiment,
     splits: Mapping[str, Images],
     root: Path,
-    jobs: int,
+    jobs: int | Executor,
     progress: Progress = Progress(),
 ) -> Outcome:
-    """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done."""
+    """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done.
+
+    jobs: how many workers of this machine, or an executor.
+    """
     started = time.monotonic()
     check_volume(experiment, splits)
     shards = dataset.shards_of(experiment, splits)
-    check_memory(experiment, splits, shards, jobs)
+    workers = executor(jobs)
+    if workers.local:
+        check_memory(experiment, splits, shards, workers.threads)
     wanted = identity(experiment, splits)
     if _check_place(root, wanted):
         tidy(root)
@@ -487,11 +387,12 @@ def generate(
         if _check_place(root, wanted):  # another run has finished it meanwhile
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted)
+        greet(workers, experiment)
         _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
         missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
-        _make(experiment, splits, root, shards, missing, jobs, progress)
-        manifest = finish(experiment, root, wanted, shards, jobs, progress)
+        _make(experiment, splits, root, shards, missing, workers, progress)
+        manifest = finish(experiment, root, wanted, shards, workers, progress)
     return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
 
 
@@ -645,7 +546,7 @@ def _make(
     root: Path,
     shards: Sequence[Shard],
     missing: Sequence[Shard],
-    jobs: int,
+    workers: Executor,
     progress: Progress,
 ) -> None:
     work = {s.path: _work(experiment, splits, s) for s in shards}
@@ -654,7 +555,7 @@ def _make(
     by_path = {s.path: s for s in missing}
     started, images = time.monotonic(), 0
 
-    def done(path: str, _: Any) -> None:
+    def done(path: str, _: Files) -> None:
         nonlocal images
         shard = by_path[path]
         images += shard.stop - shard.start if shard.level is not None else 0
@@ -662,14 +563,36 @@ def _make(
         progress.advance(work[path], f"{shard.level or 'images'} {shard.split}, {rate:,.0f} images/s")
 
     if missing:
-        job = job_of(experiment)
-
-        def tasks(paths: Sequence[str]) -> Iterator[Task]:
-            return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split]) for p in paths)
-
         _warm(experiment, progress)
-        run_tasks(make_shard, tasks, list(by_path), jobs, done)
+        make_shards(experiment, splits, root, missing, workers, done)
     progress.stop()
+
+
+def make_shards(
+    experiment: Experiment,
+    splits: Mapping[str, Images],
+    root: Path,
+    shards: Sequence[Shard],
+    workers: Executor,
+    done: Callable[[str, Files], None],
+) -> None:
+    """Make shards in `root`, which is a dataset or lies in its state; `done` is called with the path of each, and the
+    digests of its files."""
+    by_path, job, run = {s.path: s for s in shards}, job_of(experiment), run_of(root, workers)
+
+    def tasks(paths: Sequence[str]) -> Iterator[Task]:
+        return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split], run) for p in paths)
+
+    def keep(path: str, files: dict[str, bytes]) -> None:
+        size = sum(map(len, files.values()))
+        made = store.put_shard(root, path, {name: [data] for name, data in files.items()}, experiment.format, size)
+        note(root, by_path[path], made)
+        done(path, made)
+
+    if workers.shared:
+        workers.run(make_shard, tasks, list(by_path), done)
+    else:
+        workers.run(encode_shard, tasks, list(by_path), keep)
 
 
 def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
@@ -684,20 +607,34 @@ def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) ->
 
 def job_of(experiment: Experiment) -> Job:
     """The experiment, for workers."""
-    return Job(
-        document.dump(experiment.resolved),
-        str(experiment.base),
-        tuple(str(path) for path in plugins.loaded_files()),
-    )
+    resolved, maps = portable(experiment)
+    return Job(document.dump(resolved), tuple(maps.items()), plugins.carried())
 
 
-def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images) -> Task:
+def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images, run: Run | None = None) -> Task:
     """The task that makes a shard: whole blocks of images where an effect needs them."""
     block = experiment.sensor.block if shard.level is not None else 1
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
     labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
-    return Task(job, str(root), shard, images.pixels[first:last], labels, images.white, first)
+    return Task(job, os.path.abspath(root), shard, images.pixels[first:last], labels, images.white, first, run)
+
+
+def greet(workers: Executor, experiment: Experiment) -> None:
+    """Have each worker of another machine show first that it makes the bytes that are made here."""
+    if golden.has_golden(experiment):
+        workers.greet(golden_of, job_of(experiment))
+    else:
+        workers.greet(golden.answer, None)
+
+
+def run_of(root: Path, workers: Executor) -> Run | None:
+    """The mark in a dataset's state by which workers of other machines know this run; None where none need it."""
+    if workers.local or not workers.shared:
+        return None
+    run = Run(os.path.abspath(root / STATE / "run"), secrets.token_hex(16))
+    disk.commit_file(run.path, run.token.encode(), disk.temporary(root))
+    return run
 
 
 def _warm(experiment: Experiment, progress: Progress) -> None:
@@ -725,11 +662,14 @@ class Addition:
     methods: tuple[str, ...]
     like: Likeness
     files: dict[str, Files]
+    run: Run | None = None
 
 
 def add_methods(addition: Addition) -> tuple[str, Files]:
     """Reconstruct the images of one shard from its raw streams and add them to it."""
     experiment = _experiment(addition.job)
+    if addition.run:
+        addition.run.check()
     root, shard = Path(addition.root), addition.shard
     reader = shard.reader(root, experiment.format, addition.like, addition.files)
     recorded, shape = dataset.read_shard(reader, experiment)
@@ -741,14 +681,14 @@ def add_methods(addition: Addition) -> tuple[str, Files]:
 def add_reconstructions(
     root: Path,
     names: Sequence[str],
-    jobs: int,
+    jobs: int | Executor,
     progress: Progress = Progress(),
 ) -> tuple[list[str], dict[str, Any]]:
     """Flux images from the raw streams of a finished dataset, as if its config had asked for them.
 
-    Returns (methods that were added, manifest). An interrupted run is taken up by the same call.
+    Returns (methods that were added, manifest). An interrupted run is taken up by the same call. jobs: see `generate`.
     """
-    manifest = dataset.intact_manifest(root)
+    workers, manifest = executor(jobs), dataset.intact_manifest(root)
     before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
     chosen = list(names) or [
         m for m in reconstruct.Method.registry if set(reconstruct.find(m).readouts()) <= set(before.readouts)
@@ -775,7 +715,8 @@ def add_reconstructions(
                 _refuse_other(root, wanted, there)
         begin(root, wanted)
         by_path = {s.path: s for s in shards if _record(root, s) is None}
-        job, like = job_of(after), Likeness.of(manifest)
+        job, like, run = job_of(after), Likeness.of(manifest), run_of(root, workers)
+        greet(workers, after)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
         def files_of(shard: Shard) -> dict[str, Files]:
@@ -792,15 +733,15 @@ def add_reconstructions(
             del by_path[path]
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
-            run_tasks(
+            place = os.path.abspath(root)
+            workers.run(
                 add_methods,
-                lambda paths: (Addition(job, str(root), by_path[p], new, like, files_of(by_path[p])) for p in paths),
+                lambda paths: (Addition(job, place, by_path[p], new, like, files_of(by_path[p]), run) for p in paths),
                 list(by_path),
-                jobs,
                 done,
             )
         progress.stop()
-        return list(new), finish(after, root, wanted, shards, jobs, progress)
+        return list(new), finish(after, root, wanted, shards, workers, progress)
 
 
 # --- finishing ----------------------------------------------------------------------------------------------------
@@ -817,7 +758,7 @@ def finish(
     root: Path,
     wanted: dict[str, Any],
     shards: Sequence[Shard],
-    jobs: int,
+    workers: Executor,
     progress: Progress,
 ) -> dict[str, Any]:
     """Normalisation, groups, config and manifest; then the state is removed."""
@@ -837,14 +778,15 @@ def finish(
     progress.start("normalising", len(keys), 0)
 
     def tasks(which: Sequence[tuple[str, str]]) -> Iterator[Any]:
-        return ((root, experiment.format, like, training[level], method) for level, method in which)
+        place = Path(os.path.abspath(root))
+        return ((place, experiment.format, like, training[level], method) for level, method in which)
 
     def done(key: tuple[str, str], value: float | None) -> None:
         normalisation[key[0]][key[1]] = value
         progress.advance(1, key[0])
 
     if keys:
-        run_tasks(_normalise, tasks, keys, jobs, done)
+        (workers if workers.shared else Serial()).run(_normalise, tasks, keys, done)
     progress.stop()
 
     temporary = disk.temporary(root)

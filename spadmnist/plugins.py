@@ -8,6 +8,7 @@ has been imported: by `discover` (the package's own places and the entry points 
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import importlib
 import importlib.metadata
@@ -16,9 +17,12 @@ import inspect
 import io
 import pkgutil
 import re
+import shutil
 import sys
+import tempfile
+import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -594,6 +598,43 @@ def is_from_file(cls: type) -> bool:
 def loaded_files() -> dict[Path, str]:
     """The plug-in files loaded by `load_file`, with their texts."""
     return dict(_loaded)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A plug-in file on its way to a worker, which may not have it."""
+
+    path: str
+    text: str
+
+
+def carried() -> tuple[Carried, ...]:
+    """The plug-in files loaded by `load_file`, for workers."""
+    return tuple(Carried(str(path), text) for path, text in _loaded.items())
+
+
+_arriving = threading.Lock()  # two threads of one worker may be given the same
+
+
+def load_carried(files: Iterable[Carried]) -> None:
+    """Run plug-in files that another process has loaded, each once; what is not here is written into a folder.
+
+    Raises EffectError as `load_file`, where a file needs another one that is not here.
+    """
+    with _arriving:
+        for file in files:
+            if file.text in _loaded.values():
+                continue
+            try:
+                here = Path(file.path).read_text(encoding="utf-8") == file.text
+            except (OSError, UnicodeDecodeError):
+                here = False
+            path = Path(file.path)
+            if not here:
+                path = Path(tempfile.mkdtemp(prefix="spadmnist-plugin-")) / path.name
+                atexit.register(shutil.rmtree, path.parent, ignore_errors=True)
+                path.write_text(file.text, encoding="utf-8")
+            load_file(path)
 
 
 def blame(effect: Plugin, error: BaseException) -> EffectError:

@@ -136,16 +136,29 @@ def write_shard(
 
     A column's name may contain "/": `tr/ticks` is the array `ticks` in the group `tr`.
     """
-    root, relative = Path(root), location(path, format)
+    size = sum(np.asarray(column.data).nbytes for column in columns.values())
+    return put_shard(root, path, encoded(path, columns, attributes, format), format, size)
+
+
+def encoded(
+    path: str, columns: Mapping[str, Column], attributes: Mapping[str, Any], format: str
+) -> dict[str, Iterable[bytes]]:
+    """The files of a shard as pieces of bytes, which are encoded as they are asked for; for `put_shard`."""
     checked = _check_columns(columns, path)
     own = _check_attributes(attributes, path)
     if format == "zarr":
         files: dict[str, Iterable[bytes]] = {"shard/zarr.json": [_group_json(own)]}
-        files |= {f"shard/{name}": pieces for name, pieces in _zarr_files(checked).items()}
-    else:
-        files = {"shard": [_hdf5_image(checked, own)]}
+        return files | {f"shard/{name}": pieces for name, pieces in _zarr_files(checked).items()}
+    return {"shard": [_hdf5_image(checked, own)]}
+
+
+def put_shard(
+    root: str | os.PathLike[str], path: str, files: Mapping[str, Iterable[bytes]], format: str, size: int
+) -> Files:
+    """Write the files of a shard; see `write_shard`. size: bytes, about."""
+    root, relative = Path(root), location(path, format)
     with (
-        writing(root / relative, sum(column.data.nbytes for column in checked.values())),
+        writing(root / relative, size),
         workspace(inside(root, ".spadmnist/tmp/x").parent) as work,
     ):
         final = inside(root, relative)

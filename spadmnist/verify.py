@@ -25,6 +25,7 @@ from .experiment import Experiment
 from .factory import POSITIONS, Progress
 from .images import Images
 from .tiles import of_facts
+from .workers import Executor, executor
 
 _PIECE = 1 << 22
 
@@ -129,15 +130,17 @@ def _same(path: Path, listed: Mapping[str, Any]) -> bool:
 def repair(
     root: Path,
     damage: Damage,
-    jobs: int,
+    jobs: int | Executor,
     images_dir: Path | None = None,
     progress: Progress = Progress(),  # noqa: B008
 ) -> list[str]:
     """Make exactly the damaged files again; what does not belong there is moved beside the dataset.
 
     The images come from the dataset itself where they are intact, else from where the config says. Without a
-    manifest everything is simulated again and compared. Returns what was done, a line each.
+    manifest everything is simulated again and compared. Returns what was done, a line each. jobs: how many workers of
+    this machine, or an executor.
     """
+    workers = executor(jobs)
     if not damage:
         factory.tidy(root)
         return []
@@ -174,7 +177,7 @@ def repair(
             hurt = dataset.files_by_shard({name: {} for name in bad}, experiment.format)
             again = [s for s in shards if store.location(s.path, experiment.format) in hurt]
         did += _set_aside(root, damage.extra)
-        remade, lines = _remake(experiment, splits, root, again, manifest, jobs, progress)
+        remade, lines = _remake(experiment, splits, root, again, manifest, workers, progress)
         did += lines
         if manifest is None:
             factory.begin(root, identity)
@@ -182,7 +185,7 @@ def repair(
                 factory.note(root, shard, remade[shard.path])
             for name in (*factory.small_files(experiment, shards, {})[0], MANIFEST):
                 did += _clear_way(root, name)
-            factory.finish(experiment, root, identity, shards, jobs, progress)
+            factory.finish(experiment, root, identity, shards, workers, progress)
             did.append(f"made again: {MANIFEST}")
         else:
             for name, data in factory.small_files(experiment, shards, manifest["normalisation"])[0].items():
@@ -299,7 +302,7 @@ def _remake(
     root: Path,
     shards: Sequence[Shard],
     manifest: dict[str, Any] | None,
-    jobs: int,
+    workers: Executor,
     progress: Progress,
 ) -> tuple[dict[str, Files], list[str]]:
     """Simulate shards into a folder apart, and put in place the files that differ from what is there.
@@ -307,17 +310,12 @@ def _remake(
     Returns (the files of each shard, what was done).
     """
     apart = root / STATE / "again"
-    by_path = {s.path: s for s in shards}
-    job = factory.job_of(experiment)
     remade: dict[str, Files] = {}
     did: list[str] = []
 
-    def tasks(paths: Sequence[str]) -> Iterator[Any]:
-        return (factory.task_of(experiment, job, apart, by_path[p], splits[by_path[p].split]) for p in paths)
-
-    def done(path: str, result: tuple[str, Files]) -> None:
+    def done(path: str, files: Files) -> None:
         progress.advance(1, path)
-        for name, facts in result[1].items():
+        for name, facts in files.items():
             if manifest is not None and manifest["files"].get(name) != facts:
                 raise SpadError(
                     f"{root / name}: what is made now is not what the manifest lists; generate the dataset anew"
@@ -326,11 +324,12 @@ def _remake(
             if not _same(root / name, facts):
                 os.replace(apart / name, root / name)
                 did.append(f"made again: {name}")
-        remade[path] = result[1]
+        remade[path] = files
 
     progress.start("making again", len(shards), 0)
     if shards:
-        factory.run_tasks(factory.make_shard, tasks, list(by_path), jobs, done)
+        factory.greet(workers, experiment)
+        factory.make_shards(experiment, splits, apart, shards, workers, done)
     progress.stop()
     return remade, did
 

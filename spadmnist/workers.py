@@ -1,9 +1,12 @@
-"""Workers: other Python processes, what they are told by their environment, and what is left where all were killed.
+"""Workers: what calls a function for many tasks, one by one, at once, or on a cluster.
 
-Arrays for workers are files of a temporary folder, and what workers wait for are semaphores of the system. A process
-that is killed together with its workers leaves both. So all of one process bear the name of one folder, which it holds
-locked for as long as it lives: the next process of the same user that works, with workers or alone, removes what nobody
-holds.
+An `Executor` is one of three: `Serial` (this process), `Loky` (processes of this machine), `cluster.Cluster` (the
+workers of a dask.distributed scheduler). They keep one contract, that of `Executor.run`: the loop over the tasks stands
+here once, and an executor says how a task is handed to a worker, and which errors mean that the worker died.
+
+Processes that were killed together with their workers leave semaphores of the system. So all of one process bear the
+name of one folder, which it holds locked for as long as it lives: the next process of the same user that works, with
+workers or alone, removes what nobody holds.
 """
 
 from __future__ import annotations
@@ -12,19 +15,33 @@ import atexit
 import contextlib
 import fcntl
 import functools
+import math
 import os
+import queue
 import shutil
+import signal
+import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from joblib import Parallel
+from .errors import SpadError
+
+Make = Callable[[Sequence[Any]], Iterator[Any]]  # keys -> the task of each, made when it is called for
+Done = Callable[[Any, Any], None]  # called with a key and its result
 
 _MEMORY = Path("/dev/shm")  # files that are memory, and the semaphores of Linux
-_LEAST = 2 << 30  # bytes of it, from which on arrays are put there
+_LEAST = 2 << 30  # bytes of it, from which on the folder is put there
 _PREFIX = "spadmnist-workers-"
+_IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
+_IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
+# the variables by which libraries are told how many threads they may use
+_THREADS = (
+    *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
+    "VECLIB_MAXIMUM_THREADS",
+)
 
 
 def processors() -> int:
@@ -35,44 +52,272 @@ def processors() -> int:
         return os.cpu_count() or 1
 
 
-@contextlib.contextmanager
-def workers(jobs: int, **options: Any) -> Iterator[Parallel]:
-    """joblib's `Parallel` with these options, whose workers run no file of the current folder.
+def executor(jobs: int | Executor) -> Executor:
+    """The executor that works with so many processes of this machine; one that is an executor already is returned."""
+    if isinstance(jobs, Executor):
+        return jobs
+    return Serial() if jobs == 1 else Loky(jobs)
 
-    They look for compiled kernels where this process does.
+
+# --- the contract -------------------------------------------------------------------------------------------------
+
+
+class Executor:
+    """Calls a function for many tasks.
+
+    A subclass defines `_opened`, `_submit`, `_is_death` and `_end`, or `run` itself.
+
+    Attributes:
+        threads: how many tasks are done at a time.
+        chances: how often a task may be lost with its worker before it is tried alone.
+        local: its workers are processes of this machine.
+        shared: its workers see the files of this machine.
     """
-    from joblib import Parallel
 
-    from . import compiled
+    threads = 1
+    chances = 3
+    local = True
+    shared = True
 
-    clear_once(os.getpid())
-    # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers does so, too
-    debugging = os.environ.get("SPADMNIST_DEBUG")
-    silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
-    quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
-    with safe_path(), _environment({**quiet, **compiled.for_workers()}):
-        place = _own_place(os.getpid()) if jobs != 1 else None
-        with Parallel(n_jobs=jobs, temp_folder=place, **options) as parallel:
-            yield parallel
+    def run(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
+        """Call `function` on the task of every key, and `done(key, result)` for each, as they end.
+
+        A task that is lost with its worker is tried again, at last alone: one that kills its worker each time is named
+        when all others are done. Whatever a task or `done` raises, and Ctrl-C, is passed on at once; then no worker of
+        this machine is left at work.
+
+        Args:
+            function: of a module, where workers find it.
+            make: makes the tasks of keys, which are called for one by one: twice as many as there are threads.
+            keys: they name the tasks in messages; each is there once.
+            done: is called in this process, once for each key.
+        Raises:
+            SpadError: where a task kills its worker, or there are no workers any more.
+        """
+        with self._opened(len(keys)):
+            try:
+                self._all(function, make, keys, done)
+            except BaseException:
+                self._end()
+                raise
+
+    def greet(self, question: Callable[[Any], tuple[str, str]], about: Any) -> None:
+        """Ask each worker of another machine first; one that answers otherwise than this process gets no task.
+
+        Args:
+            question: of a module; it answers a digest and, in words, by what it was made.
+            about: what it is asked, which can be hashed.
+        """
+
+    def close(self) -> None:
+        """Let go of the workers of other machines."""
+
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- the loop ---
+
+    def _all(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
+        deaths: Counter[Any] = Counter()
+        waiting, alone, hopeless = list(keys), [], False
+        while waiting and not hopeless:
+            patience: float = _IN_A_ROW * 2 * self.threads
+            lost, waiting = self._pass(function, make, waiting, done, lambda: 2 * self.threads, patience)
+            hopeless = bool(waiting)
+            deaths.update(lost)
+            alone += [key for key in lost if deaths[key] >= self.chances]
+            waiting += [key for key in lost if deaths[key] < self.chances]
+        patience = _IN_A_ROW if hopeless else math.inf
+        killers, left = self._pass(function, make, [*waiting, *alone], done, lambda: 1, patience)
+        if killers:
+            rest = "what is complete is kept" if left else "all else is complete"
+            raise SpadError(
+                f"a worker died each time it made {', '.join(map(str, killers))} (out of memory?); {rest}: free some "
+                "memory or give fewer --jobs, and type the same command again"
+            )
+
+    def _pass(
+        self,
+        function: Callable[[Any], Any],
+        make: Make,
+        keys: Sequence[Any],
+        done: Done,
+        window: Callable[[], int],
+        patience: float,
+    ) -> tuple[list[Any], list[Any]]:
+        """Try each key once; (those lost with their workers, those that were not tried).
+
+        Args:
+            window: how many tasks are handed out at a time.
+            patience: how many may be lost in a row before no more is tried.
+        """
+        left, tasks, in_a_row = deque(keys), make(keys), 0
+        lost: list[Any] = []
+        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        under_way: dict[Any, Any] = {}
+        while True:
+            while left and in_a_row < patience and len(under_way) < window():
+                future = self._submit(function, next(tasks))
+                under_way[future] = left.popleft()
+                future.add_done_callback(ended.put)
+            if not under_way:
+                return lost, list(left)
+            future = self._next(ended)
+            key = under_way.pop(future)
+            try:
+                result = future.result()
+            except Exception as error:
+                if not self._is_death(error):
+                    raise
+                in_a_row += 1
+                lost.append(key)
+                continue
+            in_a_row = 0
+            done(key, result)
+
+    # --- what an executor is made of ---
+
+    def _opened(self, number: int) -> contextlib.AbstractContextManager[None]:
+        """Within it `number` tasks are submitted."""
+        return contextlib.nullcontext()
+
+    def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
+        """A future, with `add_done_callback` and `result`, of a task handed to a worker."""
+        raise NotImplementedError
+
+    def _next(self, ended: queue.SimpleQueue[Any]) -> Any:
+        """The next future that has ended; it is waited for."""
+        return ended.get()
+
+    def _is_death(self, error: BaseException) -> bool:
+        """Does what a future raised say that its worker died?"""
+        raise NotImplementedError
+
+    def _end(self) -> None:
+        """End what is under way."""
+
+
+# --- on this machine ----------------------------------------------------------------------------------------------
+
+
+class Serial(Executor):
+    """One task after the other, in this process."""
+
+    def run(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
+        """As `Executor.run`; a task that kills takes this process with it."""
+        from .heap import keep_freed_memory
+
+        clear_once(os.getpid())
+        keep_freed_memory()
+        for key, task in zip(keys, make(keys), strict=True):
+            done(key, function(task))
+
+
+class Loky(Executor):
+    """Processes of this machine, which idle for a while after a run and are there for the next one.
+
+    They run no file of the current folder, look for compiled kernels where this process does, leave Ctrl-C to it, and
+    die with it.
+    """
+
+    def __init__(self, jobs: int):
+        self.threads = jobs
+        self._started = 0
+
+    @contextlib.contextmanager
+    def _opened(self, number: int) -> Iterator[None]:
+        from . import compiled
+
+        clear_once(os.getpid())
+        _own_place(os.getpid())
+        self._started = max(self._started, min(self.threads, number))
+        # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers warns, too
+        debugging = os.environ.get("SPADMNIST_DEBUG")
+        silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
+        quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
+        with safe_path(), _environment({**quiet, **compiled.for_workers()}):
+            yield
+
+    def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
+        import multiprocessing.resource_tracker
+
+        from joblib.externals.loky import get_reusable_executor
+        from joblib.externals.loky.backend import resource_tracker
+
+        for tracker in (resource_tracker, multiprocessing.resource_tracker):  # may unblock the signal as they start
+            tracker.ensure_running()
+        each = str(max(1, processors() // self.threads))
+        options: dict[str, Any] = {
+            "timeout": _IDLE,
+            "initializer": _start_worker,
+            "initargs": (os.getpid(),),
+            "env": {name: os.environ.get(name, each) for name in _THREADS},
+        }
+        # workers, which this may start, never see Ctrl-C: not while they import what they need, either
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            while True:
+                try:
+                    return get_reusable_executor(self._started, **options).submit(function, task)
+                except Exception as error:
+                    if not self._is_death(error):  # of another task, just now: the next workers are new ones
+                        raise
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def _is_death(self, error: BaseException) -> bool:
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        return isinstance(error, TerminatedWorkerError)
+
+    def _end(self) -> None:
+        import multiprocessing
+
+        from joblib.externals.loky import get_reusable_executor
+        from joblib.externals.loky.backend.process import LokyProcess
+
+        with contextlib.suppress(OSError, RuntimeError):  # where no process or thread could be started
+            get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
+        for process in multiprocessing.active_children():
+            if isinstance(process, LokyProcess) and process.pid is not None:  # started before the one that could not be
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process.pid, signal.SIGKILL)
+                process.join()
+
+
+def _start_worker(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
+    import ctypes
+
+    from .heap import keep_freed_memory
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        os._exit(1)
+    keep_freed_memory()
 
 
 # --- what is left of the killed -----------------------------------------------------------------------------------
 
 
 @functools.cache
-def _own_place(process: int) -> str | None:
-    """The folder of this process for its workers' arrays. None: the system's."""
+def _own_place(process: int) -> None:
+    """Make the folder of this process, whose name its semaphores bear; where it cannot be made, they keep theirs."""
     held = next(filter(None, map(_made, _places())), None)
     if held is None:
-        return None
+        return
     folder, handle = held
-    atexit.register(_end, folder, handle, process)  # joblib's own come later, and so are called before it
+    atexit.register(_remove_own, folder, handle, process)  # loky's own come later, and so are called before it
     if _MEMORY.is_dir():
         from joblib.externals.loky.backend.synchronize import SemLock
 
         names = SemLock._rand
         SemLock._rand = _Names(folder.name, names.names if isinstance(names, _Names) else names)
-    return os.fspath(folder)
 
 
 class _Names:
@@ -105,7 +350,7 @@ def clear() -> int:
 
 
 def _places(all_of_them: bool = False) -> Iterator[Path]:
-    """Where the folder may lie, as joblib chooses it."""
+    """Where the folder may lie."""
     if told := os.environ.get("JOBLIB_TEMP_FOLDER"):
         yield Path(told)
     with contextlib.suppress(OSError):
@@ -147,7 +392,7 @@ def _held(folder: Path) -> int | None:
     return None
 
 
-def _end(folder: Path, handle: int, process: int) -> None:
+def _remove_own(folder: Path, handle: int, process: int) -> None:
     """The end of the process that the folder belongs to; one that divided from it leaves it alone."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)

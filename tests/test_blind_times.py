@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from joblib import Parallel
 
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
@@ -23,6 +22,7 @@ from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.score_test import p_of_map
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
+from spadmnist.workers import Serial
 
 SIDE, DEAD = 16, 50e-9
 DURATION = ("dead_time", "duration")
@@ -169,7 +169,7 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> dict[float, tuple[Repli
     for spread in (0.0, 0.03):
         own = DEAD * np.exp(spread * np.random.default_rng(2).standard_normal(SIDE**2))
         data = twin.simulate(with_values(sensor, {DURATION: own}), plan, folder / f"lab {spread}", 5)
-        out[spread] = Replicates(sensor, measurements.open(data), 0, Parallel(n_jobs=1), 16), own
+        out[spread] = Replicates(sensor, measurements.open(data), 0, Serial(), 16), own
     return out
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from joblib import Parallel
 from scipy import stats
 
 from spadmnist import config, measurement, twin
@@ -29,6 +28,7 @@ from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
 from spadmnist.statistics import Summary
 from spadmnist.streams import Streams
+from spadmnist.workers import Serial
 
 CHALLENGE = Path(__file__).parents[2] / "shared" / "challenge"
 REAL = Path(__file__).parents[2] / "shared" / "real"
@@ -169,7 +169,7 @@ def test_the_misfit_is_that_of_a_diagnosis() -> None:
     """
     data = measured(sensor(flicker={"amplitude": 0.2, "frequency": 20.0}), "str", 8)
     found = compared(sensor(), data)
-    replicates = Replicates(sensor(), data, 0, Parallel(n_jobs=1), 48)
+    replicates = Replicates(sensor(), data, 0, Serial(), 48)
     state = evaluate(replicates, {})
     of_checks = {(c.capture, c.statistic): c.misfit for c in found.checks}
     said = misfits(state.replicate_residuals, state.residuals)

@@ -27,6 +27,7 @@ import spadmnist
 from spadmnist import config, dataset, factory, plugins
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
+from spadmnist.workers import Serial
 
 METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
 LEVELS = ("5 mlux", "40 mlux", "160 mlux", "640 mlux", "2560 mlux")
@@ -152,12 +153,12 @@ def test_two_workers_make_the_same_bytes(made: tuple[Path, Path], tmp_path: Path
 def test_shards_in_any_order_make_the_same_bytes(
     made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_tasks = factory.run_tasks
+    run_all = Serial.run
 
-    def shuffled(function: Any, tasks: Any, keys: Any, jobs: int, done: Any) -> None:
-        run_tasks(function, tasks, random.Random(5).sample(list(keys), len(keys)), jobs, done)
+    def shuffled(self: Serial, function: Any, make: Any, keys: Any, done: Any) -> None:
+        run_all(self, function, make, random.Random(5).sample(list(keys), len(keys)), done)
 
-    monkeypatch.setattr(factory, "run_tasks", shuffled)
+    monkeypatch.setattr(Serial, "run", shuffled)
     make(made[0], tmp_path / "out")
     assert_same(tmp_path / "out", tree(made[1]))
 

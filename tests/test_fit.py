@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from joblib import Parallel
 
 from spadmnist import config
 from spadmnist import measurement as measurements
@@ -36,6 +35,7 @@ from spadmnist.inference.results import sentence
 from spadmnist.recording import Capture, Light
 from spadmnist.streams import Streams
 from spadmnist.twin import model_recordings
+from spadmnist.workers import Serial
 
 SENSOR = """sensor:
   name: small
@@ -87,8 +87,8 @@ def measured(tmp_path, sensor, captures):
 def test_a_dead_time_is_settled_and_a_map_found(tmp_path, made):
     sensor, captures, map_ = made
     data = measured(tmp_path, sensor, captures)
-    with Parallel(n_jobs=1) as parallel:
-        replicates = Replicates(sensor, data, 0, parallel, 16)
+    with Serial() as workers:
+        replicates = Replicates(sensor, data, 0, workers, 16)
         evaluation = evaluate(replicates, {})
         candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")
         levels = light_levels_of(replicates, evaluation)

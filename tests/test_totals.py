@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from joblib import Parallel
 from scipy import stats
 from tinylab import bench_of
 
@@ -22,6 +21,7 @@ from spadmnist.inference.map_fits import CountModel
 from spadmnist.inference.replicates import TOTALS, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
+from spadmnist.workers import Serial
 
 
 def null_of(expected: Any, scatter: float) -> Any:
@@ -80,7 +80,7 @@ def test_a_sensor_without_dark_counts_is_not_judged_by_how_many_there_are(lab) -
     """Nothing is expected, and no factor on nothing is more: what adds some is found by all else."""
     sensor, data = lab()
     bare = Sensor(sensor.layout, [e for e in sensor.effects if e.name != "dark_counts"], sensor.rules)
-    replicates = Replicates(bare, data, 0, Parallel(n_jobs=1), 16)
+    replicates = Replicates(bare, data, 0, Serial(), 16)
     evaluation = evaluate(replicates, {})
     assert replicates.seen["dark"].total > 300 and totals_space(replicates, evaluation)[0] == ["flat"]
     assert np.all(np.isfinite(evaluation.residuals[TOTALS]))

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel
-
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.inference.candidates import Candidate, candidates
@@ -20,6 +18,7 @@ from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
+from spadmnist.workers import Serial
 
 SENSOR = """sensor:
   name: tiny
@@ -70,7 +69,7 @@ def labs(tmp_path: Path) -> Lab:
 
 
 def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Replicates:
-    return Replicates(*made, 0, Parallel(n_jobs=1), replicates)
+    return Replicates(*made, 0, Serial(), replicates)
 
 
 def quiet(replicates: Replicates) -> Scan:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from ..workers import Executor, executor, processors
+from . import _terminal as terminal
+
 if TYPE_CHECKING:
     from ..sensor import Sensor
 
@@ -54,6 +57,24 @@ def jobs(command: F) -> F:
     )(command)
 
 
+def cluster(command: F) -> F:
+    """`--cluster ADDRESS`; see `workers_of`."""
+    return click.option(
+        "--cluster",
+        metavar="tcp://HOST:PORT",
+        help="Give the work to the workers of this dask.distributed scheduler. The result does not depend on it.",
+    )(command)
+
+
+def no_shared(command: F) -> F:
+    """`--no-shared`; see `workers_of`."""
+    return click.option(
+        "--no-shared",
+        is_flag=True,
+        help="The workers of --cluster do not see the dataset's folder: they send what they make.",
+    )(command)
+
+
 def as_json(command: F) -> F:
     """`--json`, as `as_json`."""
     return click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON.")(command)
@@ -74,6 +95,7 @@ def beside(command: F) -> F:
     for part in (
         plugin,
         crop,
+        cluster,
         jobs,
         click.option(
             "--seed",
@@ -88,6 +110,24 @@ def beside(command: F) -> F:
     ):
         command = part(command)
     return command
+
+
+def workers_of(jobs: int | None, cluster: str | None, no_shared: bool = False, most: int | None = None) -> Executor:
+    """Who does the work: the workers of a cluster, or processes of this machine.
+
+    most: how many of these by default; None: one per processor.
+    """
+    from ..errors import SpadError
+
+    if cluster is None:
+        if no_shared:
+            raise SpadError("--no-shared: is said of the workers of a cluster; give --cluster as well, or leave it out")
+        return executor(jobs or most or processors())
+    if jobs is not None:
+        raise SpadError("--jobs: a cluster has the workers that were started there; leave --jobs or --cluster out")
+    from ..cluster import Cluster
+
+    return Cluster(cluster, not no_shared, terminal.say)
 
 
 def load_plugins(plugin_files: tuple[Path, ...]) -> None:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import click
 
 from ..foreign import quoted
-from ..workers import processors
 from . import _options as options
 from . import _terminal as terminal
 from ._group import cli
@@ -43,6 +42,7 @@ def compare(
     tolerance: str | None,
     seed: int,
     jobs: int | None,
+    cluster: str | None,
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
@@ -75,6 +75,7 @@ def compare(
 
         pages.check_place(output)
     _check_answer(json_file)
+    workers = options.workers_of(jobs, cluster)
     with terminal.progress() as progress:
         progress.start("comparing", 100, 0)
         done = [0.0]
@@ -83,7 +84,7 @@ def compare(
             progress.advance(max(100 * share - done[0], 0), what)  # what is periodic is simulated once more
             done[0] = max(100 * share, done[0])
 
-        found = comparison.compare(model, data, seed, smallest, jobs or processors(), progress=told)
+        found = comparison.compare(model, data, seed, smallest, workers, progress=told)
         progress.stop()
     _write_answer(json_file, comparison.canonical(found))
     if output is not None:
@@ -123,6 +124,7 @@ def diagnose(
     within: str | None,
     seed: int,
     jobs: int | None,
+    cluster: str | None,
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
@@ -149,6 +151,7 @@ def diagnose(
         pages.check_place(output, "diagnosis")
         sensor_file.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
     _check_answer(json_file)
+    workers = options.workers_of(jobs, cluster)
 
     def keep(so_far: Diagnosis) -> None:
         """What is found so far, should the rest be interrupted."""
@@ -158,7 +161,7 @@ def diagnose(
         _write_answer(json_file, results.canonical(so_far))
 
     found = model_selection.diagnose(
-        model, data, seed, max_steps, quick, jobs or processors(), progress=terminal.say, within=seconds, keep=keep
+        model, data, seed, max_steps, quick, workers, progress=terminal.say, within=seconds, keep=keep
     )
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
@@ -196,6 +199,7 @@ def fit(
     json_file: Path | None,
     seed: int,
     jobs: int | None,
+    cluster: str | None,
     crop: str | None,
     plugin_files: tuple[Path, ...],
 ) -> None:
@@ -213,7 +217,8 @@ def fit(
     model, data = options.model_of(sensor, crop), measurements.open(measurement)
     sensor_file.check_place(sensor, output)
     _check_answer(json_file)
-    found = named_fit.fit_named(model, data, added, freed, mapped, seed, jobs or processors(), progress=terminal.say)
+    workers = options.workers_of(jobs, cluster)
+    found = named_fit.fit_named(model, data, added, freed, mapped, seed, workers, progress=terminal.say)
     _write_next(found, sensor, output, model)
     _write_answer(json_file, results.canonical(found))
     what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), quoted(found.file or output))

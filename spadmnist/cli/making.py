@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     help="Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
 )
 @options.jobs
+@options.cluster
+@options.no_shared
 @click.option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
@@ -73,6 +75,8 @@ def generate(
     limit: int | None,
     images_dir: Path | None,
     jobs: int | None,
+    cluster: str | None,
+    no_shared: bool,
     seed: int | None,
     format_: str | None,
     causes: bool,
@@ -82,8 +86,8 @@ def generate(
 ) -> None:
     """Make the dataset that CONFIG describes.
 
-    The same command again resumes an interrupted run. --lux, --limit, --jobs and --causes do not change the random
-    numbers of what is made.
+    The same command again resumes an interrupted run. --lux, --limit, --jobs, --cluster and --causes do not change the
+    random numbers of what is made.
 
     Your own pictures are `source: folder`; spadmnist init writes such a config. The photons of a pixel are
     proportional to its grey level. With `gamma: srgb` the level is first converted from sRGB to linear light: half of
@@ -106,17 +110,17 @@ def generate(
     for note in sources.notes(images):
         terminal.say(f"Note: {note}")
     root = output if output is not None else Path(config.stem)
-    workers = jobs or factory.most_workers(experiment, images, processors())
+    most = factory.most_workers(experiment, images, processors())
     if dry_run:
         from .. import plan
 
-        estimate = plan.estimate(experiment, images, workers)
+        estimate = plan.estimate(experiment, images, jobs or most)
         if as_json:
             terminal.print_json(estimate)
         else:
             terminal.print_lines(plan.text(estimate, root))
         return
-    with terminal.progress() as progress:
+    with options.workers_of(jobs, cluster, no_shared, most) as workers, terminal.progress() as progress:
         outcome = factory.generate(experiment, images, root, workers, progress)
     if as_json:
         terminal.print_json(
@@ -203,6 +207,7 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
 )
 @options.crop
 @options.jobs
+@options.cluster
 @options.plugin
 @options.as_json
 def reconstruct_(
@@ -212,6 +217,7 @@ def reconstruct_(
     sensor: Path | None,
     crop: str | None,
     jobs: int | None,
+    cluster: str | None,
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
@@ -236,10 +242,11 @@ def reconstruct_(
         except KeyError as error:
             raise SpadError(f"--method: {error.args[0]}") from None
     if measurement.is_measurement(dataset):
-        if jobs is not None:
-            raise SpadError(
-                f"--jobs: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
-            )
+        for option, value in (("--jobs", jobs), ("--cluster", cluster)):
+            if value is not None:
+                raise SpadError(
+                    f"{option}: belongs to a dataset; the captures of {dataset} are read one by one: leave it out"
+                )
         if crop is not None and sensor is None:
             raise SpadError("--crop: is the part of a sensor; give --sensor as well, or leave it out")
         model = None if sensor is None else options.model_of(sensor, crop)
@@ -251,8 +258,8 @@ def reconstruct_(
                 f"{option}: belongs to a measurement, and {dataset} is none; a dataset keeps its images and knows its "
                 "sensor: leave it out"
             )
-    with terminal.progress() as progress:
-        added, manifest = factory.add_reconstructions(dataset, methods, jobs or processors(), progress)
+    with options.workers_of(jobs, cluster) as workers, terminal.progress() as progress:
+        added, manifest = factory.add_reconstructions(dataset, methods, workers, progress)
     if as_json:
         terminal.print_json({"dataset": str(dataset), "added": added, "normalisation": manifest["normalisation"]})
         return
@@ -297,6 +304,8 @@ def _reconstruct_measurement(
     help="For --repair: folder of the images, if the copy in the dataset is damaged.",
 )
 @options.jobs
+@options.cluster
+@options.no_shared
 @options.plugin
 @options.as_json
 def verify(
@@ -304,6 +313,8 @@ def verify(
     repair: bool,
     images_dir: Path | None,
     jobs: int | None,
+    cluster: str | None,
+    no_shared: bool,
     plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
@@ -314,11 +325,11 @@ def verify(
     from .. import verify as library
 
     options.load_plugins(plugin_files)
-    with terminal.progress() as progress:
+    with options.workers_of(jobs, cluster, no_shared) as workers, terminal.progress() as progress:
         damage = library.verify(dataset, progress)
         left, did = damage, []
         if repair:
-            did = library.repair(dataset, damage, jobs or processors(), images_dir, progress)
+            did = library.repair(dataset, damage, workers, images_dir, progress)
             left = library.verify(dataset, progress) if damage else damage
     if as_json:
         found = {

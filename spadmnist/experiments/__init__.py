@@ -41,6 +41,7 @@ from ..errors import SpadError
 from ..factory import Progress
 from ..pages import Story, Table
 from ..plugins import Plugin, Registry
+from ..workers import executor
 
 FORMAT = "spadmnist-result/1"
 RESULTS = "results"
@@ -224,8 +225,8 @@ def run(experiment: PaperExperiment, setting: Setting) -> Outcome:
                 drawn = time.monotonic()
 
         if missing:
-            jobs = min(setting.jobs, len(missing))
-            factory.run_tasks(experiment.measure, lambda keys: (tasks[key] for key in keys), missing, jobs, done)
+            workers = executor(min(setting.jobs, len(missing)))
+            workers.run(experiment.measure, lambda keys: (tasks[key] for key in keys), missing, done)
         if not results:
             raise SpadError(f"{experiment.name}: nothing was asked for, so there is nothing to show; ask for more")
         page, story = _write(experiment, results, setting.out)

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from .. import units
+from .. import golden, units
 from ..errors import InputError
-from ..factory import pool
 from ..measurement import Measurement
 from ..recording import Capture
 from ..sensor import Sensor
 from ..statistics import Summary
+from ..workers import Executor, executor
 from .candidates import with_values
 from .coordinates import Key, Values
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
@@ -153,7 +153,7 @@ def compare(
     measurement: Measurement,
     seed: int = 0,
     tolerance: float | None = None,
-    jobs: int = 2,
+    jobs: int | Executor = 2,
     replicates: int = REPLICATES,
     progress: Callable[[str, float], None] | None = None,
 ) -> Comparison:
@@ -163,15 +163,16 @@ def compare(
         sensor: the model.
         seed: of the replicates.
         tolerance: a failing check with a smaller relative deviation passes, as not material.
-        jobs: number of workers.
+        jobs: number of workers of this machine, or an executor.
         replicates: of each capture.
         progress: called with the name of a capture and the share of the work that is done.
     Raises:
         InputError: where sensor and measurement do not belong together, or nothing can be compared.
     """
-    with pool(jobs, "generator") as parallel:
+    with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         say = progress or (lambda capture, share: None)
-        simulations = Replicates(sensor, measurement, seed, parallel, replicates, progress=say)
+        simulations = Replicates(sensor, measurement, seed, workers, replicates, progress=say)
         evaluation, _ = evaluate_start(simulations)
         return comparison_of(simulations, evaluation, tolerance)
 

@@ -14,11 +14,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from .. import golden
 from ..effects import Mimic
 from ..errors import UNABLE, why
-from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
+from ..workers import Executor, executor
 from . import experiment_design, setups, time_blocks, upper_limits
 from .budget import FITS, STEPS, Budget, OutOfBudget, clock
 from .candidates import Candidate
@@ -58,7 +59,7 @@ def diagnose(
     seed: int = 0,
     max_steps: int = MAX_STEPS,
     quick: bool = False,
-    jobs: int = 2,
+    jobs: int | Executor = 2,
     progress: Callable[[str], None] | None = None,
     within: float = math.inf,
     keep: Callable[[Diagnosis], None] | None = None,
@@ -70,7 +71,7 @@ def diagnose(
         seed: of the replicates.
         max_steps: the largest number of steps.
         quick: fewer replicates.
-        jobs: number of workers.
+        jobs: number of workers of this machine, or an executor.
         progress: called with a line about what is being done.
         within: the budget of the search, s of two idle cores, see `budget`.
         keep: called with the diagnosis so far after each step; its verdict and misfits are those of that moment.
@@ -83,15 +84,16 @@ def diagnose(
         left = budget.left
         report(what if budget.spent == 0 or left in (0, math.inf) else f"{what} (at most {clock(left)} of steps left)")
 
-    with pool(jobs, "generator") as parallel:
+    with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         number = _QUICK if quick else REPLICATES
-        replicates = Replicates(sensor, measurement, seed, parallel, number, say, budget=budget)
+        replicates = Replicates(sensor, measurement, seed, workers, number, say, budget=budget)
         short = setups.stopped_early(replicates)
         if short:
             exposures = {
                 id: replicates.seen[id].capture.conditions.exposure * share for id, (share, _) in short.items()
             }
-            replicates = Replicates(sensor, measurement, seed, parallel, number, say, exposures, budget=budget)
+            replicates = Replicates(sensor, measurement, seed, workers, number, say, exposures, budget=budget)
         return _diagnosed(replicates, max_steps, quick, short, keep or (lambda found: None))
 
 

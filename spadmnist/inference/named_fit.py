@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from .. import golden
 from ..effects import Effect
 from ..errors import InputError, did_you_mean
-from ..factory import pool
 from ..measurement import Measurement
 from ..sensor import Sensor
+from ..workers import Executor, executor
 from . import counts_in_the_dark, map_fits, time_blocks
 from .candidates import Candidate, candidates
 from .comparison import comparison_with
@@ -38,7 +39,7 @@ def fit_named(
     free: Sequence[str] = (),
     per_pixel: Sequence[str] = (),
     seed: int = 0,
-    jobs: int = 2,
+    jobs: int | Executor = 2,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """The fit of what the caller names.
@@ -52,7 +53,7 @@ def fit_named(
         free: "effect.parameter" of listed effects.
         per_pixel: "effect.parameter" of maps.
         seed: of the replicates.
-        jobs: number of workers.
+        jobs: number of workers of this machine, or an executor.
         progress: called with a line about what is being done.
     Raises:
         InputError: where there is no such effect or parameter.
@@ -66,15 +67,16 @@ def fit_named(
     ]
     if not wanted:
         raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
-    with pool(jobs, "generator") as parallel:
+    with executor(jobs) as workers:
+        workers.greet(golden.answer, None)
         if counts_in_the_dark.may_fit(sensor.settled(), wanted):
-            replicates = Replicates(sensor, measurement, seed, parallel, REPLICATES, say, reduced=False)
+            replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
             answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
             if not isinstance(answer, str):
                 say("by the counts in the dark alone; compare sets all else beside the new model")
                 return answer
             say(f"not by counts in the dark alone, for there is {answer}")
-        replicates = Replicates(sensor, measurement, seed, parallel, REPLICATES, say)
+        replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)
         path = begin(replicates)
         start, wrong = path.evaluation, bool(path.failed)
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))

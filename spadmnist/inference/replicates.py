@@ -14,17 +14,16 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from joblib import Parallel, delayed
 
 from .. import plugins, twin
 from ..effects import Conditions
 from ..errors import UNABLE, EffectError, why
-from ..heap import keep_freed_memory
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Statistic, Summary
 from ..streams import Streams
+from ..workers import Executor
 from .blind_times import ShortestIntervals
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, on_chip, with_values
@@ -186,37 +185,43 @@ class Model:
         return Model(of, with_values(self.one, values), self.alike and not chips, known)
 
 
-def _task(
-    models: Sequence[Packed],
-    capture: Capture,
-    photons: np.ndarray,
-    numbers: np.ndarray,
-    seed: int,
-    dead: float,
-    hasty: bool = False,
-    second: bool | None = None,
-) -> CaptureReplicates | str:
-    """The replicates of one capture, reduced: the task of a worker; a reason where there are none.
+@dataclass(frozen=True)
+class _Task:
+    """What a worker simulates: replicates of one capture.
 
-    Args:
+    Attributes:
         models: one for all replicates, or one for each.
         photons: (replicates,) photons/s on each pixel.
+        numbers: (replicates,) numbers that seed each of them.
         dead: dead time for the reduction, s.
         hasty: without costly statistics.
         second: of a half, whether it is of the second, fourth, ... blocks of time; None for a whole capture.
     """
-    keep_freed_memory()
+
+    models: Sequence[Packed]
+    capture: Capture
+    photons: np.ndarray
+    numbers: np.ndarray
+    seed: int
+    dead: float
+    hasty: bool
+    second: bool | None
+
+
+def _simulate(task: _Task) -> CaptureReplicates | str:
+    """The replicates of one capture, reduced, in a worker; a reason where there are none."""
+    capture, photons, numbers = task.capture, task.photons, task.numbers
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    models[0].load_plugins()  # statistics are among them
-    known = [s for s in statistics_for(capture) if not (hasty and s.costly)]
+    task.models[0].load_plugins()  # statistics are among them
+    known = [s for s in statistics_for(capture) if not (task.hasty and s.costly)]
 
     def take(recording: Recording) -> None:
-        if second is not None:
-            half = recording.every_other(second)
+        if task.second is not None:
+            half = recording.every_other(task.second)
             assert half is not None  # the measurement's own half is there
             recording = half
-        recording = recording.beside(dead)
+        recording = recording.beside(task.dead)
         totals.append(int(recording.totals.sum()))
         for statistic in known:
             summary = reduce_with(statistic, recording)
@@ -224,12 +229,12 @@ def _task(
                 found.setdefault(statistic.name, []).append(summary.apart())
 
     try:
-        for k, model in enumerate(models):
-            some = slice(None) if len(models) == 1 else slice(k, k + 1)
+        for k, model in enumerate(task.models):
+            some = slice(None) if len(task.models) == 1 else slice(k, k + 1)
             sensor = model.sensor
             if capture.light.dark:
                 sensor = InTheDark.of(sensor)
-            for recording in simulated(sensor, capture, photons[some], numbers[some], seed):
+            for recording in simulated(sensor, capture, photons[some], numbers[some], task.seed):
                 take(recording)
     except UNABLE as error:
         return why_not(error)
@@ -253,7 +258,7 @@ class Replicates:
         sensor: Sensor,
         measurement: Measurement,
         seed: int,
-        parallel: Parallel,
+        workers: Executor,
         number: int,
         say: Callable[[str], None] = lambda what: None,
         exposures: Mapping[str, float] | None = None,
@@ -274,7 +279,7 @@ class Replicates:
         """
         measurement.check_sensor(sensor)
         self.start = sensor.settled()
-        self.seed, self.parallel, self.number, self.say, self.progress = seed, parallel, number, say, progress
+        self.seed, self.workers, self.number, self.say, self.progress = seed, workers, number, say, progress
         self.dead = self.start.nominal_dead_time
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
@@ -345,7 +350,7 @@ class Replicates:
         Raises:
             OutOfBudget: where the budget does not allow them.
         """
-        tasks: list[list[tuple[Any, ...]]] = []
+        tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | str] = [""] * len(wanted)
         for k, (sensors, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
@@ -356,18 +361,23 @@ class Replicates:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
                     models = [Packed.of(sensors.of(id, number)) for number in each]
                     rest = self.seed, self.dead, hasty, second
-                    tasks[k].append((models, capture, photons[part], numbers[part], *rest))
+                    tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
                 tasks[k], out[k] = [], why_not(error)
         asked = [(id, len(numbers)) for some, (_, id, _, numbers) in zip(tasks, wanted, strict=True) if some]
         self.budget.spend(sum(number * self._work(id) for id, number in asked))
         self.simulations += sum(number for _, number in asked)
         ids = [wanted[k][1] for k, some in enumerate(tasks) for _ in some]
-        simulated = []
-        for one in self.parallel(delayed(_task)(*task) for some in tasks for task in some):
-            simulated.append(one)
-            self.progress(ids[len(simulated) - 1], len(simulated) / len(ids))
-        results = iter(simulated)
+        given = {f"replicates of {id} ({n + 1} of {len(ids)})": n for n, id in enumerate(ids)}
+        every = [task for some in tasks for task in some]
+        simulated: dict[str, CaptureReplicates | str] = {}
+
+        def done(key: str, one: CaptureReplicates | str) -> None:
+            simulated[key] = one
+            self.progress(ids[given[key]], len(simulated) / len(ids))
+
+        self.workers.run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
+        results = (simulated[key] for key in given)
         for k, some in enumerate(tasks):
             made = [next(results) for _ in some]
             wrong = [p for p in made if isinstance(p, str)]
@@ -443,18 +453,17 @@ class InTheDark(Sensor):
 class Packed:
     """A sensor on its way to a worker, which must load the user's plug-in files before it can unpack it."""
 
-    files: tuple[str, ...]
+    files: tuple[plugins.Carried, ...]
     packed: bytes
 
     @staticmethod
     def of(sensor: Sensor) -> Packed:
         """The packed sensor."""
-        return Packed(tuple(str(path) for path in plugins.loaded_files()), pickle.dumps(sensor))
+        return Packed(plugins.carried(), pickle.dumps(sensor))
 
     def load_plugins(self) -> None:
         """Run the user's plug-in files, where that has not been done in this process."""
-        for file in self.files:
-            plugins.load_file(file)
+        plugins.load_carried(self.files)
 
     @property
     def sensor(self) -> Sensor:

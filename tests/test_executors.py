@@ -1,0 +1,199 @@
+"""The contract of an executor, for each of them: this process, processes of this machine, a cluster, and a stand-in.
+
+The stand-in does tasks in this process as soon as they are handed out; for it a task that kills is one that says so.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from spadmnist.errors import SpadError
+from spadmnist.workers import Executor, Loky, Serial
+
+
+class Death(Exception):
+    """A worker of the stand-in has died."""
+
+
+class StandIn(Executor):
+    threads = 4
+
+    def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(task))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    def _is_death(self, error: BaseException) -> bool:
+        return isinstance(error, Death)
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    distributed = pytest.importorskip("distributed", reason="the cluster's library is not installed")
+    dask = pytest.importorskip("dask")
+    quiet = {"silence_logs": 60, "dashboard_address": None, "host": "127.0.0.1"}
+    # a task is lost with its second worker, and not with its fourth: a test need not wait for as many to start again
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster,
+    ):
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(params=["serial", "loky", pytest.param("cluster", marks=pytest.mark.slow), "stand-in"])
+def workers(request: pytest.FixtureRequest) -> Iterator[Executor]:
+    if request.param == "cluster":
+        from spadmnist.cluster import Cluster
+
+        found: Executor = Cluster(request.getfixturevalue("scheduler"))
+    else:
+        found = {"serial": Serial, "loky": lambda: Loky(2), "stand-in": StandIn}[request.param]()
+    with found:
+        yield found
+
+
+def kill(where: int) -> None:
+    """Kill this process; in that of the test itself, say so."""
+    if os.getpid() == where:
+        raise Death
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+# --- tasks --------------------------------------------------------------------------------------------------------
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def fail_at_three(number: int) -> int:
+    if number == 3:
+        raise SpadError("three is not possible")
+    if number == 10:
+        time.sleep(60)
+    return number
+
+
+def kill_once(task: tuple[int, str, int]) -> int:
+    number, marker, here = task
+    if number == 2:
+        try:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            return number
+        kill(here)
+    return number
+
+
+def kill_at_two(task: tuple[int, int]) -> int:
+    if task[0] == 2:
+        kill(task[1])
+    return task[0]
+
+
+def kill_always(here: int) -> None:
+    kill(here)
+
+
+# --- the contract -------------------------------------------------------------------------------------------------
+
+
+def test_each_key_is_done_once_and_tasks_are_made_as_they_are_called_for(workers: Executor) -> None:
+    made, found = [0], {}
+    most = 0
+
+    def make(keys: Any) -> Iterator[int]:
+        for key in keys:
+            made[0] += 1
+            yield int(key)
+
+    def done(key: str, result: int) -> None:
+        nonlocal most
+        assert key not in found
+        found[key] = result
+        most = max(most, made[0] - len(found) + 1)
+
+    workers.run(square, make, [str(n) for n in range(50)], done)
+    assert found == {str(n): n * n for n in range(50)}
+    assert most <= 2 * workers.threads
+    workers.run(square, make, [], done)  # of nothing, nothing
+
+
+def test_an_error_of_a_task_ends_the_run_at_once(workers: Executor) -> None:
+    """The same error, though another task takes a minute still."""
+    done: dict[int, int] = {}
+    keys = [3] if isinstance(workers, Serial | StandIn) else [10, 3, *range(20, 40)]
+    started = time.monotonic()
+    with pytest.raises(SpadError, match=r"^three is not possible$"):
+        workers.run(fail_at_three, iter, keys, done.__setitem__)
+    assert time.monotonic() - started < 40
+    assert 10 not in done and 3 not in done
+    again: dict[int, int] = {}
+    workers.run(square, iter, [5], again.__setitem__)  # and they can be worked with again
+    assert again == {5: 25}
+
+
+def test_an_error_with_a_result_is_passed_on(workers: Executor) -> None:
+    def done(key: int, result: int) -> None:
+        raise ZeroDivisionError(key)
+
+    with pytest.raises(ZeroDivisionError, match="7"):
+        workers.run(square, iter, [7], done)
+
+
+def test_what_a_dead_worker_lost_is_done_by_another(workers: Executor, tmp_path: Path) -> None:
+    if isinstance(workers, Serial):
+        pytest.skip("it has no worker that could die alone")
+    found: dict[int, int] = {}
+    marker, here = str(tmp_path / "marker"), os.getpid()
+    workers.run(kill_once, lambda keys: ((key, marker, here) for key in keys), range(12), found.__setitem__)
+    assert os.path.exists(marker) and found == {n: n for n in range(12)}
+
+
+def test_a_task_that_kills_is_named_when_all_others_are_done(workers: Executor) -> None:
+    if isinstance(workers, Serial):
+        pytest.skip("it has no worker that could die alone")
+    found: dict[int, int] = {}
+    with pytest.raises(SpadError, match=r"a worker died each time it made 2 .*all else is complete"):
+        workers.run(kill_at_two, lambda keys: ((key, os.getpid()) for key in keys), range(8), found.__setitem__)
+    assert found == {n: n for n in range(8) if n != 2}
+
+
+@pytest.mark.parametrize("workers", ["loky", "stand-in"], indirect=True)
+def test_where_all_workers_die_not_every_task_is_tried(workers: Executor) -> None:
+    tried = 0
+
+    def make(keys: Any) -> Iterator[int]:
+        nonlocal tried
+        for _ in keys:
+            tried += 1
+            yield os.getpid()
+
+    with pytest.raises(SpadError, match=r"a worker died each time it made .*what is complete is kept"):
+        workers.run(kill_always, make, range(1000), lambda key, result: None)
+    assert tried < 50
+
+
+# --- scale --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_tasks() -> None:
+    """More than 500 a second, in less than 1 GB."""
+    found: dict[int, int] = {}
+    started = time.monotonic()
+    StandIn().run(square, iter, range(100_000), found.__setitem__)
+    assert time.monotonic() - started < 200
+    assert len(found) == 100_000 and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 1 << 20  # KiB
