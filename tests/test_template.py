@@ -61,7 +61,9 @@ def test_a_new_effect_is_known_and_explained(stage: str, tmp_path: Path) -> None
     for value in (parameter.off, parameter.default, low, high):
         parameter.check(value)
     if "expected_rate" in vars(cls):
-        assert f"Mean rate after the effect: {reference.mean_law(cls)}" in page and reference.mean_law(cls).startswith("r = ")
+        assert f"Mean rate after the effect: {reference.mean_law(cls)}" in page and reference.mean_law(cls).startswith(
+            "r = "
+        )
 
 
 @pytest.mark.parametrize("rules", ["paper", "device"])
