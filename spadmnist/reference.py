@@ -192,6 +192,7 @@ def allowed_values(declared: Parameter) -> tuple[str, str, str, str, str]:
 
 
 def varies(declared: Parameter) -> str:
+    """What its value may differ by: "pixel", "row", "wavelength", "pixel or wavelength"; "-" for nothing."""
     ways = {declared.per: bool(declared.per), "wavelength": declared.by_wavelength}
     return " or ".join(way for way, can in ways.items() if can) or "-"
 

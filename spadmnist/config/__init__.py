@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import numpy as np
-from pydantic import Field
 
 from .. import document
 from ..document import Document, Path_
@@ -22,12 +21,12 @@ from ..sensor import Sensor
 from ..validated import brief
 from ._reader import _Described, _Reader
 from ._resolved import _resolved
-from ._sections import _DEFAULTS, _SECTIONS, _Scene, _Sensor
+from ._sections import _DEFAULTS, _SECTIONS, _SENSOR, _Scene, _Sensor
 
 
 def entries() -> dict[str, tuple[Any, Any]]:
     """The entries of a config by name: pydantic's kind, and the default, `...` where there is none."""
-    kinds = {**_SECTIONS, "sensor": Annotated[str | _Sensor, Field(description="the sensor, or the file of one")]}
+    kinds = {**_SECTIONS, "sensor": _SENSOR}
     return {name: (kind, _DEFAULTS.get(name, ...)) for name, kind in kinds.items()}
 
 

@@ -130,6 +130,8 @@ class _Sensor(Section):
     effects: dict[str, Any]  # each is read by what its class declares
 
 
+_SENSOR = Annotated[str | _Sensor, Field(description="the sensor, or the file of one")]
+
 # the sections of a config: each is checked by itself, so that a mistake in one hides none in another
 _SECTIONS: dict[str, Any] = {
     "seed": Annotated[int, Field(ge=0, lt=2**63, description="seed of all random numbers")],

@@ -27,7 +27,8 @@ class Neighbours(Statistic):
 
     Directions: horizontal, vertical, both diagonals; then 2 and 3 pitches. In a layout with positions: the nearest
     pixels, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart in either order, and for each
-    direction one cell for its sign. Frames: the same frame, and the next one. First stamps of frames (STR): both.
+    direction one cell for the order of the two. Frames: the same frame, and the next one. First stamps of frames (STR):
+    both.
     Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
     Its variance is the number by chance; for frames it is (1 - p)(1 - p') times that, with p the share of frames with a
     detection.
