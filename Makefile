@@ -56,8 +56,8 @@ docs-two: DOCS_ONLY = -D nb_execution_excludepatterns=notebooks/effect.md
 docs-two: docs  ## the same with the cells of two pages alone: what a change must pass
 
 lint: $(VENV)/installed
-	$(RUN)/ruff check spadmnist scripts tests
-	$(RUN)/ruff format --check spadmnist scripts tests
+	$(RUN)/ruff check spadmnist scripts tests docs
+	$(RUN)/ruff format --check spadmnist scripts tests docs/conf.py docs/_pages
 	$(RUN)/mypy
 
 bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)

@@ -9,6 +9,7 @@ says which commands are run otherwise, and why.
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import os
 import re
@@ -22,17 +23,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
 import commands
 import h5py
 import pytest
 
-from spadmnist import document
+from spadmnist import document, experiments
 from spadmnist.cli import cli
+from spadmnist.experiments import PaperExperiment
 
 ROOT = Path(__file__).parents[1]
 MNIST = Path(__file__).parents[2] / "shared" / "mnist"
 _SLOW = r"^spadmnist (?:diagnose|fit|compare)\b|\b(?:sp|spadmnist)\.diagnose\("
 
+_CLUSTER = "it needs a scheduler and workers, which test_cluster.py starts"
 # a command -> what is run in its place (nothing: ""), and why
 RULES = {
     "make demo": ("make -o .venv/installed demo", "setting up fetches packages; the program stands in .venv"),
@@ -63,6 +67,13 @@ RULES = {
         "spadmnist experiment sensors",
         "it takes some minutes; test_experiment_sensors.py does a small one",
     ),
+    "dask scheduler --host 127.0.0.1 --port 8786 &": ("", _CLUSTER),
+    "dask worker tcp://127.0.0.1:8786 --nworkers 4 --nthreads 1 &": ("", _CLUSTER),
+    "spadmnist generate configs/quick.yaml -o out --cluster tcp://127.0.0.1:8786": (
+        "spadmnist generate configs/quick.yaml -o out",
+        _CLUSTER,
+    ),
+    "spadmnist generate configs/spad_mnist.yaml -o spad_mnist --cluster tcp://HOST:PORT": ("", _CLUSTER),
     "spadmnist generate configs/spad23.yaml -o lab": (
         "spadmnist generate configs/spad23.yaml -o lab --limit 1",
         "compare and diagnose take a tenth of the time with one capture of ten",
@@ -250,21 +261,36 @@ def codes_in_lines(page: str) -> list[str]:
     return [" ".join(code.split()) for code in re.findall(r"(?<![`}])`([^`]+)`(?!`)", text)]
 
 
-def wrong_verbs(page: str, known: set[str]) -> list[str]:
-    """Sentences about verbs and options in lines of text that are not there. known: options of all verbs."""
+@functools.cache
+def _options() -> tuple[dict[str, set[str]], set[str]]:
+    """(verb -> its options, those of all verbs and of the experiments)."""
+    context = click.Context(cli, info_name="spadmnist")
+    verbs = {}
+    for name in cli.list_commands(context):
+        command = cli.get_command(context, name)
+        assert command is not None
+        params = command.get_params(click.Context(command, parent=context, info_name=name))
+        verbs[name] = {option for param in params for option in (*param.opts, *param.secondary_opts)}
+    declared = map(PaperExperiment.registry.find, PaperExperiment.registry)
+    every = {experiments.word(key) for experiment in declared for key in experiment.options}
+    return verbs, every.union({"--help", "--version"}, *verbs.values())
+
+
+def wrong_verbs(page: str) -> list[str]:
+    """Sentences about verbs and options in lines of text of a page that are not there."""
+    verbs, every = _options()
     found = []
     for code in codes_in_lines(page):
         words = shlex.split(code) if code.count('"') % 2 == 0 else code.split()
         if words[:1] == ["spadmnist"] and len(words) > 1:
             words = words[1:]
-            if words[0] not in cli.commands and not words[0].startswith("-"):
+            if words[0] not in verbs and not words[0].startswith("-"):
                 found.append(f"{page}: `{code}`: there is no such verb")
                 continue
-        verb = cli.commands.get(words[0]) if words else None
-        if verb is None and not (words and words[0].startswith("--")):
+        if not words or not (words[0] in verbs or words[0].startswith("--")):
             continue
-        there = known if verb is None else {n for p in verb.params for n in (*p.opts, *p.secondary_opts)}
+        there = verbs.get(words[0], every) | {"--help"}
         for option in (word for word in words if re.fullmatch(r"--?[a-z][a-z-]*", word)):
-            if option not in there | {"--help", "--version"}:
+            if option not in there:
                 found.append(f"{page}: `{code}`: there is no option {option}")
     return found

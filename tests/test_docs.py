@@ -1,4 +1,4 @@
-"""What the pages in docs say works: every shell, Python and MATLAB block as it stands, in a folder as a reader has it.
+"""What README and the pages in docs say works: every shell, Python and MATLAB block as it stands, in one folder.
 
 The code cells of notebooks are executed by the build (`make docs`), the commands of the tutorial by `test_tutorial.py`.
 """
@@ -16,7 +16,6 @@ import documents
 import numpy as np
 import pytest
 from documents import ROOT, Block, Reader
-from test_readme import options
 
 import spadmnist
 from spadmnist.photos import srgb_to_light
@@ -26,7 +25,7 @@ from spadmnist.testing import check_effect
 _OTHERS = ("challenge.md", "experiments.md", "faults.md", "start/loop.md", "gallery/", "reference/")
 PAGES = {
     page: documents.blocks(page)
-    for page in sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))
+    for page in ("README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")))
     if not page.removeprefix("docs/").startswith(_OTHERS)
 }
 BLOCKS = [block for blocks in PAGES.values() for block in blocks]
@@ -51,7 +50,7 @@ def test_every_block_has_a_language_that_is_looked_at() -> None:
 
 
 def test_every_rule_is_of_a_command() -> None:
-    shell = [block for block in (*BLOCKS, *documents.blocks("README.md")) if block.language == "bash"]
+    shell = [block for block in BLOCKS if block.language == "bash"]
     there = {command for block in shell for command, _ in documents.commands_of(block)}
     assert documents.RULES.keys() <= there
 
@@ -60,7 +59,7 @@ def test_the_tree_names_every_module() -> None:
     """And every name in it is a file or a folder."""
     (tree,) = (block.text for block in PAGES["docs/house.md"] if block.language == "text")
     for name in re.findall(r"[\w*]+\.py\b|\b\w+/", tree):
-        places = [ROOT, *(ROOT / folder for folder in ("spadmnist", "scripts", "tests"))]
+        places = [ROOT, *(ROOT / folder for folder in ("spadmnist", "scripts", "tests", "docs"))]
         assert any(list(place.glob(name)) for place in places), f"{name} is not there"
     for path in (ROOT / "spadmnist").glob("*.py"):
         assert path.stem == "__init__" or path.name in tree, f"{path.name} is not in the tree of docs/house.md"
@@ -96,6 +95,14 @@ def test_the_effect_of_the_pages_works(reader: Reader) -> None:
     assert hazy.reconstruction["counts"][0][dark].mean() > 5 * clear.reconstruction["counts"][0][dark].mean()
 
 
+def test_what_the_python_of_the_readme_reads(reader: Reader) -> None:
+    (block,) = (block for block in PAGES["README.md"] if "spadmnist.open" in block.text)
+    reader.read(block, PAGES[block.page])
+    part = reader.names[block.page]["part"]
+    assert len(part) == 400 and part.reconstruction["counts"][0:64].shape == (64, 28, 28)
+    assert (reader.folder / "out.png").stat().st_size > 10_000
+
+
 def test_what_gamma_does_to_the_photons() -> None:
     """A value of 128 gets 22 % of white's photons, and 50 % without gamma, as the pages say."""
     assert f"{srgb_to_light(np.array(128 / 255)):.0%}" == "22%" and f"{128 / 255:.0%}" == "50%"
@@ -109,7 +116,7 @@ def test_what_gamma_does_to_the_photons() -> None:
 
 @pytest.mark.parametrize("page", [*PAGES, "docs/start/loop.md"])
 def test_every_verb_and_option_in_a_line_is_there(page: str) -> None:
-    assert not documents.wrong_verbs(page, options())
+    assert not documents.wrong_verbs(page)
 
 
 def test_every_file_in_a_line_is_there() -> None:
