@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import signal
 from pathlib import Path
 
 import pytest
 from commands import run
-from test_factory import SLOW, assert_same, assert_sentence, make, records, running, tree, wait_for, write_config
+from test_factory import SLOW, assert_same, assert_sentence, make, running, tree, wait_for, write_config
 
 from spadmnist import config, factory
 from spadmnist.errors import InputError, SpadError
@@ -99,25 +100,20 @@ def test_sixteen_parts_two_at_once_and_three_of_them_killed(tmp_path: Path) -> N
     levels = ("5 mlux", "10 mlux", "40 mlux", "160 mlux", "320 mlux", "640 mlux", "1280 mlux")
     file, root = write_config(tmp_path / "c.yaml", levels=levels, more="    slow: {}\n"), tmp_path / "out"
     command = ("generate", file, "-o", root, "--jobs", 1, "--plugin", tmp_path / "slow.py")
-    rng = random.Random(3)
-    order = rng.sample(range(1, 17), 16)
-    killed = 0
+    order, killed = random.Random(3).sample(range(1, 17), 16), 0
     while order:
         pair, order = order[:2], order[2:]
-        with (
-            running(*command, "--part", f"{pair[0]}/16") as first,
-            running(*command, "--part", f"{pair[-1]}/16") as second,
-        ):
+        with contextlib.ExitStack() as open_ones:
+            parts = [open_ones.enter_context(running(*command, "--part", f"{k}/16")) for k in pair]
             if killed < 3:
-                before = records(root) if root.exists() else 0
-                wait_for(lambda before=before: (root / ".spadmnist" / "plan.json").exists() or before > 0, 60)
-                first.send_signal(signal.SIGKILL)
-                killed += 1
+                held = root / ".spadmnist" / f"part-{pair[0]}-of-16"
+                assert wait_for(held.exists, 60)
+                parts[0].send_signal(signal.SIGKILL)
+                assert parts.pop(0).wait(10) == -signal.SIGKILL
                 order.append(pair[0])
-                first.wait(10)
-            for process in (first, second):
-                process.wait(120)
-            assert second.returncode == 0, second.stderr.read()
+                killed += 1
+            for process in parts:
+                assert process.wait(120) == 0, process.stderr.read()
     assert killed == 3
     result = run(*command)
     assert result.returncode == 0, result.stderr
