@@ -15,6 +15,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import resource
 import secrets
 import shutil
@@ -92,6 +93,25 @@ class Run:
                 f"a worker on {socket.gethostname()} does not see this run in {Path(self.path).parents[1]}; mount that "
                 "folder there under the same name, or say --no-shared, with which workers write nothing themselves"
             )
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of several parts of a dataset, for batch systems: every `of`-th shard, from shard `number` on (from 1)."""
+
+    number: int
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """The part that `K/N` names. Raises InputError where there is none."""
+        found = re.fullmatch(r"([1-9][0-9]{0,8})/([1-9][0-9]{0,8})", text)
+        if not found or int(found[1]) > int(found[2]):
+            raise InputError(f"--part {text}: is no part; write K/N with K from 1 to N, as 3/16")
+        return cls(int(found[1]), int(found[2]))
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
 
 
 @dataclass(frozen=True)
@@ -178,32 +198,51 @@ def note(root: Path, shard: Shard, files: Files) -> None:
 
 
 @contextlib.contextmanager
-def locked(root: Path) -> Iterator[None]:
-    """Hold the dataset for writing. The system frees the lock of a process that is killed."""
+def locked(root: Path, part: Part | None = None) -> Iterator[None]:
+    """Hold the dataset for writing: alone, or one part of it beside other parts.
+
+    The system frees the locks of a process that is killed. Raises SpadError where another run holds them.
+    """
+    busy = f"{root}: another run is writing there; wait for it, or choose another folder with -o"
+    with contextlib.ExitStack() as held:
+        whole = held.enter_context(_flocked(root, "lock", fcntl.LOCK_SH if part else fcntl.LOCK_EX, busy))
+        if part:
+            busy = f"{root}: another run is making part {part} of it; wait for that one"
+            held.enter_context(_flocked(root, f"part-{part.number}-of-{part.of}", fcntl.LOCK_EX, busy))
+        try:
+            yield
+        finally:
+            with contextlib.suppress(BlockingIOError):  # by other parts, of which one is the last
+                if part:
+                    fcntl.flock(whole, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _leave(root)
+
+
+@contextlib.contextmanager
+def _flocked(root: Path, name: str, kind: int, busy: str) -> Iterator[int]:
+    """A lock in the state of a dataset, which is made. Raises SpadError(busy) where another process holds it."""
     state = root / STATE
-    path = state / "lock"
+    path = state / name
     while True:
         with _writable(root):
             state.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            try:
+                handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            except FileNotFoundError:  # the run that ended meanwhile has removed the folder
+                continue
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, kind | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
-            raise SpadError(
-                f"{root}: another run is writing there; wait for it, or choose another folder with -o"
-            ) from None
+            raise SpadError(busy) from None
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), os.stat(path)):
                 break
         os.close(handle)  # the run that held it has finished and removed it: what is locked is nobody's lock
     try:
-        yield
+        yield handle
     finally:
-        try:
-            _leave(root)
-        finally:
-            os.close(handle)
+        os.close(handle)
 
 
 def _leave(root: Path) -> None:
@@ -353,7 +392,7 @@ def _refuse_other(root: Path, wanted: dict[str, Any], there: Mapping[str, Any]) 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run did."""
+    """What a run did. manifest: empty where it was a part, which finishes nothing."""
 
     root: Path
     made: int
@@ -368,10 +407,11 @@ def generate(
     root: Path,
     jobs: int | Executor,
     progress: Progress = Progress(),
+    part: Part | None = None,
 ) -> Outcome:
     """Make the dataset in `root`, or go on with it. Raises SpadError where it cannot be done.
 
-    jobs: how many workers of this machine, or an executor.
+    jobs: how many workers of this machine, or an executor. part: make these shards alone, and finish nothing.
     """
     started = time.monotonic()
     check_volume(experiment, splits)
@@ -383,15 +423,19 @@ def generate(
     if _check_place(root, wanted):
         tidy(root)
         return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
-    with locked(root):
+    with locked(root, part):
         if _check_place(root, wanted):  # another run has finished it meanwhile
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
-        begin(root, wanted)
+        begin(root, wanted, part)
         greet(workers, experiment)
         _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
+        if part:
+            shards = shards[part.number - 1 :: part.of]
         missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
         _make(experiment, splits, root, shards, missing, workers, progress)
+        if part:
+            return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})
         manifest = finish(experiment, root, wanted, shards, workers, progress)
     return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
 
@@ -486,14 +530,22 @@ def _plan(root: Path) -> dict[str, Any]:
     return found
 
 
-def begin(root: Path, wanted: dict[str, Any]) -> None:
-    """Note what is being made, so that the same command can go on with it and no other can."""
+def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
+    """Note what is being made, so that the same command can go on with it and no other can.
+
+    Raises SpadError where another part has begun to make something else.
+    """
     with _writable(root):
-        disk.sweep(disk.temporary(root))
-        if not (root / STATE / "plan.json").exists():
-            # records without a plan are those of a run that has finished
-            shutil.rmtree(root / STATE / "shards", ignore_errors=True)
-        disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
+        if part is None:
+            disk.sweep(disk.temporary(root))
+        with open(root / STATE / "begin", "wb") as file:  # parts begin one after the other
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if not (root / STATE / "plan.json").exists():
+                # records without a plan are those of a run that has finished
+                shutil.rmtree(root / STATE / "shards", ignore_errors=True)
+            elif part:
+                _refuse_other(root, wanted, _plan(root))
+            disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
 def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images]) -> None:
@@ -578,7 +630,7 @@ def make_shards(
 ) -> None:
     """Make shards in `root`, which is a dataset or lies in its state; `done` is called with the path of each, and the
     digests of its files."""
-    by_path, job, run = {s.path: s for s in shards}, job_of(experiment), run_of(root, workers)
+    by_path, job = {s.path: s for s in shards}, job_of(experiment)
 
     def tasks(paths: Sequence[str]) -> Iterator[Task]:
         return (task_of(experiment, job, root, by_path[p], splits[by_path[p].split], run) for p in paths)
@@ -589,10 +641,11 @@ def make_shards(
         note(root, by_path[path], made)
         done(path, made)
 
-    if workers.shared:
-        workers.run(make_shard, tasks, list(by_path), done)
-    else:
-        workers.run(encode_shard, tasks, list(by_path), keep)
+    with running(root, workers) as run:
+        if workers.shared:
+            workers.run(make_shard, tasks, list(by_path), done)
+        else:
+            workers.run(encode_shard, tasks, list(by_path), keep)
 
 
 def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
@@ -628,13 +681,19 @@ def greet(workers: Executor, experiment: Experiment) -> None:
         workers.greet(golden.answer, None)
 
 
-def run_of(root: Path, workers: Executor) -> Run | None:
+@contextlib.contextmanager
+def running(root: Path, workers: Executor) -> Iterator[Run | None]:
     """The mark in a dataset's state by which workers of other machines know this run; None where none need it."""
     if workers.local or not workers.shared:
-        return None
-    run = Run(os.path.abspath(root / STATE / "run"), secrets.token_hex(16))
-    disk.commit_file(run.path, run.token.encode(), disk.temporary(root))
-    return run
+        yield None
+        return
+    token = secrets.token_hex(16)
+    run = Run(os.path.abspath(root / STATE / f"run-{token}"), token)
+    disk.commit_file(run.path, token.encode(), disk.temporary(root))
+    try:
+        yield run
+    finally:
+        Path(run.path).unlink(missing_ok=True)  # a worker that was given up writes nothing any more
 
 
 def _warm(experiment: Experiment, progress: Progress) -> None:
@@ -715,7 +774,7 @@ def add_reconstructions(
                 _refuse_other(root, wanted, there)
         begin(root, wanted)
         by_path = {s.path: s for s in shards if _record(root, s) is None}
-        job, like, run = job_of(after), Likeness.of(manifest), run_of(root, workers)
+        job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
@@ -734,12 +793,12 @@ def add_reconstructions(
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
             place = os.path.abspath(root)
-            workers.run(
-                add_methods,
-                lambda paths: (Addition(job, place, by_path[p], new, like, files_of(by_path[p]), run) for p in paths),
-                list(by_path),
-                done,
-            )
+            with running(root, workers) as run:
+
+                def additions(paths: Sequence[str]) -> Iterator[Addition]:
+                    return (Addition(job, place, by_path[p], new, like, files_of(by_path[p]), run) for p in paths)
+
+                workers.run(add_methods, additions, list(by_path), done)
         progress.stop()
         return list(new), finish(after, root, wanted, shards, workers, progress)
 

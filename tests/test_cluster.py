@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -274,7 +275,7 @@ def test_a_worker_without_the_shared_folder(
 ) -> None:
     """It looks for the file of this run where there is none."""
     elsewhere = factory.Run(str(tmp_path / "elsewhere" / ".spadmnist" / "run"), "token")
-    monkeypatch.setattr(factory, "run_of", lambda root, workers: elsewhere)
+    monkeypatch.setattr(factory, "running", lambda root, workers: contextlib.nullcontext(elsewhere))
     with pytest.raises(SpadError, match=r"does not see this run in .*elsewhere.*--no-shared"):
         on(cluster, many[0], tmp_path / "out")
 

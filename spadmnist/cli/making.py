@@ -51,6 +51,11 @@ if TYPE_CHECKING:
 @options.cluster
 @options.no_shared
 @click.option(
+    "--part",
+    metavar="K/N",
+    help="Only every N-th shard, from the K-th on, on any machine that sees OUT. Without it the rest is made.",
+)
+@click.option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
     default=None,
@@ -77,6 +82,7 @@ def generate(
     jobs: int | None,
     cluster: str | None,
     no_shared: bool,
+    part: str | None,
     seed: int | None,
     format_: str | None,
     causes: bool,
@@ -102,6 +108,7 @@ def generate(
     from .. import factory
     from .. import images as sources
 
+    one = None if part is None else factory.Part.parse(part)
     options.load_plugins(plugin_files)
     experiment = configs.read(config, seed, format_, levels, limit, causes)
     for note in experiment.notes:
@@ -121,11 +128,15 @@ def generate(
             terminal.print_lines(plan.text(estimate, root))
         return
     with options.workers_of(jobs, cluster, no_shared, most) as workers, terminal.progress() as progress:
-        outcome = factory.generate(experiment, images, root, workers, progress)
+        outcome = factory.generate(experiment, images, root, workers, progress, one)
     if as_json:
         terminal.print_json(
             {"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds}
         )
+        return
+    if not outcome.manifest:
+        terminal.say(f"Part {one}: made {outcome.made} shards in {terminal.duration(outcome.seconds)}: {root}")
+        terminal.say("When all parts are there, the same command without --part makes the dataset whole.")
         return
     from .. import report
 
