@@ -22,6 +22,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -234,6 +235,8 @@ class Loky(Executor):
         clear_once(os.getpid())
         _own_place(os.getpid())
         self._started = max(self._started, min(self.threads, number))
+        # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers warns, too
         debugging = os.environ.get("SPADMNIST_DEBUG")
         silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"

@@ -2,8 +2,8 @@
 
 A shell block is run command by command, a Python block with the names of those before it in the same page. A block
 whose first line is a comment with the name of a file is that file. Of MATLAB each line is checked against the file that
-it reads. Code cells (`{code-cell}`) are run by the build of the pages; `text` is output, which nobody runs. `RULES`
-says which commands are run otherwise, and why.
+it reads; of a Makefile what it would run is asked. Code cells (`{code-cell}`) are run by the build of the pages; `text`
+is output, which nobody runs. `RULES` says which commands are run otherwise, and why.
 """
 
 from __future__ import annotations
@@ -129,8 +129,10 @@ class Block:
                 return f"{name} is not installed"
         if "spad_mnist.yaml" in self.text and not MNIST.is_dir():
             return f"MNIST's four files are not in {MNIST}"
-        if re.search(r"^make ", self.text, re.M) and shutil.which("make") is None:
-            return "make is not installed"
+        for program in ("make", "sbatch"):
+            used = self.language == program or re.search(rf"(?:^|\(){program} ", self.text, re.M)
+            if self.language in ("bash", program) and used and shutil.which(program) is None:
+                return f"{program} is not installed"
         return ""
 
     def _imported(self) -> set[str]:
@@ -198,7 +200,8 @@ class Reader:
         elif block.language == "yaml":
             document.parse(block.text, block.place)
         elif block.language != "text":
-            {"bash": self._shell, "python": self._python, "matlab": self._matlab}[block.language](block)
+            takes = {"bash": self._shell, "python": self._python, "matlab": self._matlab, "make": self._make}
+            takes[block.language](block)
 
     def _shell(self, block: Block) -> None:
         for line, status in commands_of(block):
@@ -212,6 +215,11 @@ class Reader:
                 done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=600)
             assert done.returncode == status, f"{block.place}: {command}\n{done.stdout}{done.stderr}"
             self.run.add(line)
+
+    def _make(self, block: Block) -> None:
+        """What its first target would run."""
+        done = subprocess.run(["make", "-n", "-f", "-"], input=block.text, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0 and done.stdout, f"{block.place}: {done.stdout}{done.stderr}"
 
     def _python(self, block: Block) -> None:
         names = self.names.setdefault(block.page, {"__name__": block.page})
