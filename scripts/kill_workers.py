@@ -66,7 +66,9 @@ def kill(site: distributed.LocalCluster, kills: list[int], over: threading.Event
     """Kill a worker now and then, until it is over; kills: how many."""
     rng = random.Random(asked.seed)
     while kills[0] < asked.kills and not over.wait(rng.expovariate(1 / asked.every)):
-        there = [nanny.pid for nanny in site.workers.values() if nanny.pid]
+        # a nanny does not replace a worker that dies while it starts: that is none of ours
+        begun = [nanny.process for nanny in site.workers.values() if nanny.process]
+        there = [process.pid for process in begun if process.pid and process.status.name == "running"]
         if len(there) > 1:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(rng.choice(there), signal.SIGKILL)
