@@ -106,7 +106,7 @@ def fit_named(
             [],
             [],
             [],
-            traces(replicates, start, path.evaluation),
+            traces(replicates, start, path.evaluation, path.steps),
             path.values,
             None,
             replicates.simulations,
@@ -114,6 +114,7 @@ def fit_named(
             str(replicates.start.window) if replicates.start.window else None,
             covariance=_covariance(path, exact),
             in_sample=comparison_with(replicates, path.values, path.scan.phases),
+            shape=replicates.start.layout.shape,
             asked="fit",
         )
 

@@ -36,6 +36,7 @@ class Delays(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
     among = "far"
     unit = "standard deviations"
     costly = True

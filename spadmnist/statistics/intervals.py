@@ -58,6 +58,7 @@ class EdgeIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 3
     among = "pixel"
     unit = "detections"
 
@@ -98,6 +99,8 @@ class Intervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
+    pools = ("edge_intervals", "fine_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
 
@@ -132,6 +135,8 @@ class FineIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 3
+    pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
 
@@ -168,6 +173,8 @@ class EarlyIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
+    pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "1"
 
@@ -237,6 +244,7 @@ class Rescaled(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("intervals",)
     among = "pixel"
     unit = "detections"
 
@@ -263,6 +271,7 @@ class RescaledLag(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("autocorrelation",)
     among = "pixel"
     unit = "standard errors"
 

@@ -132,6 +132,7 @@ class PixelMap(Statistic):
     """
 
     modalities = _ALL
+    specific = 2
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -181,6 +182,8 @@ class Rows(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -195,6 +198,8 @@ class Columns(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -254,6 +259,8 @@ class Surface(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -296,6 +303,7 @@ class Outliers(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -329,6 +337,7 @@ class Tails(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -363,6 +372,7 @@ class Spread(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 

@@ -21,6 +21,7 @@ class Spacing(Statistic):
     """
 
     modalities = ("tr", "str")
+    pools = ("multiplicity", "array_fano")
     among = "array"
     unit = "detections"
 
@@ -56,6 +57,7 @@ class Crowds(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("multiplicity", "array_fano")
     among = "array"
     unit = "standard deviations"
 
@@ -98,6 +100,7 @@ class Multiplicity(Statistic):
     """
 
     modalities = ("tr", "str")
+    pools = ("neighbours", "far_pairs")
     among = "neighbours"
     unit = "clusters"
 
