@@ -216,9 +216,9 @@ def failing_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Comparison, 
 def test_a_failing_model_is_told_first_with_the_numbers_that_matter(failing_page: tuple[Comparison, str]) -> None:
     found, text = failing_page
     parts = Parts(text)
-    clearest = found.failing[0]
-    verdict = parts.text.index("The model fails 14 of 28 checks,")
-    sentence = parts.text[verdict : parts.text.index("What was compared")]
+    clearest = found.deviations[0][0]
+    verdict = parts.text.index("The model fails 14 of 28 checks: " + clearest.where)
+    sentence = parts.text[verdict : parts.text.index("Next:")]
     for words in (
         "6.43",
         "1.21",
@@ -235,7 +235,7 @@ def test_a_failing_model_is_told_first_with_the_numbers_that_matter(failing_page
 
 def test_an_adequate_model_shows_what_came_nearest(tmp_path: Path) -> None:
     _, parts = written(adequate(), tmp_path)
-    assert "The model is adequate: none of 13 checks fails, with a misfit of 1.03" in parts.text
+    assert "The model is adequate: none of 13 checks fails. The misfit is 1.03" in parts.text
     assert "What came nearest to failing" in parts.text and "Where it fails" not in parts.text
     assert len(parts.images) == 1 + 3  # the light
 
@@ -261,7 +261,7 @@ def test_what_is_real_but_small_is_told_apart_from_what_matters(tmp_path: Path) 
     never = check_of("rows", 0.3, statistic="no_one")
     assert small.relative == pytest.approx(0.2) and large.relative == pytest.approx(8.0)
     text, parts = written(comparison_of([small, large, never], tolerance=0.5), tmp_path)
-    assert "The model fails 1 of 3 checks," in parts.text
+    assert "The model fails 1 of 3 checks: " in parts.text
     beside = text[text.index("Real, but smaller than the tolerance") : text.index("All checks at a glance")]
     assert "small_one" in beside and "large_one" not in beside and "no_one" not in beside
     text, parts = written(comparison_of([small, never], tolerance=0.5), tmp_path)

@@ -8,7 +8,7 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,10 @@ from ..statistics import Statistic, Summary
 from .candidates import Candidate
 from .comparison import Comparison, headline
 from .coordinates import Coordinate, Key
-from .pixel_maps import PixelMap
 from .replicates import Cell
+
+if TYPE_CHECKING:
+    from .pixel_maps import PixelMap
 
 NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
 # what remains, in words, by what a statistic compares (`Statistic.among`)

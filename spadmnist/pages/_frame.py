@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib.metadata
 import math
 import re
@@ -46,6 +47,17 @@ class Source:
         """The files, a very long one without its end."""
         cut = f"\n... (the first {_LONGEST:,} characters)"
         return [(name, text[:_LONGEST] + cut * (len(text) > _LONGEST)) for name, text in self.files.items()]
+
+
+def source_of(command: str, seed: int | None, files: Mapping[str, Path]) -> Source:
+    """Where a page comes from, today; files: what each is -> its path. What cannot be read as text is left out."""
+    texts = {}
+    for name, path in files.items():
+        try:
+            texts[name] = disk.read_file(path, 16 << 20).decode()
+        except (OSError, UnicodeDecodeError, SpadError):
+            continue
+    return Source(command, datetime.date.today().isoformat(), seed, texts)
 
 
 # --- the file -------------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from ._counting import (
     root_of,
     span,
     tick_of,
+    whole,
     whole_ticks,
 )
 from ._scores import number_at, pooled_score, shares, unequal_pairs_law
@@ -217,7 +218,7 @@ class EarlyIntervals(Statistic):
             found, wanted = at(measured), at(expected)
             # by so much do the numbers differ that make the pairs
             change = root_of((found - wanted) / max(float(law.mean), 1.0))
-            text = f"{found:.4g} pairs in the same pixel of {few:.0f}, {wanted:.4g} expected"
+            text = f"{whole(found)} pairs in the same pixel of {few:.0f}, {whole(wanted)} expected"
             return text, few / max(1.0, float(detections.sum())) * min(max(change, -1.0), 1.0)
 
         seconds = bounds * tick
