@@ -898,11 +898,11 @@ def compare(
         found = comparison.compare(model, data, seed, smallest, jobs or processors(), progress=told)
         progress.stop()
     _write_answer(json_file, comparison.canonical(found))
+    what = next_step.after_comparison(found, quoted(sensor), quoted(measurement))
     if output is not None:
-        page = pages.comparison(found, output, _source(sensor, measurement, seed))
+        page = pages.comparison(found, output, _source(sensor, measurement, seed, then=what))
         _say(f"Report: {page}")
-    _print_lines(comparison.table(found))
-    _print_lines(f"\nNext: {next_step.after_comparison(found, quoted(sensor), quoted(measurement))}")
+    _print_lines(f"{comparison.table(found)}\n\nNext: {what}")
     if found.verdict != "adequate":
         sys.exit(1)
 
@@ -974,13 +974,12 @@ def diagnose(
     )
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
+    new = quoted(found.file or "next/sensor.yaml")
+    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), new)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
-            source = _source(sensor, measurement, seed, found.file)
+            source = _source(sensor, measurement, seed, found.file, what)
             last.callback(lambda: _say(f"Report: {pages.diagnosis(found, output, source)}"))
-        what = next_step.after_diagnosis(
-            found, quoted(sensor), quoted(measurement), quoted(found.file or "next/sensor.yaml")
-        )
         last.callback(lambda: _print_lines(f"{results.table(found)}\n\nNext: {what}"))
         last.callback(lambda: _write_answer(json_file, results.canonical(found)))
     if found.unwritten:
@@ -1029,14 +1028,14 @@ def fit(
         sys.exit(2)
 
 
-def _source(sensor: Path, measurement: Path, seed: int, following: str | None = None) -> Source:
+def _source(sensor: Path, measurement: Path, seed: int, following: str | None = None, then: str = "") -> Source:
     """Where a report comes from: the command, the date, the seed, and the files as text."""
     from . import pages
 
     files = {f"the sensor, {sensor.name}": sensor, "measurement.yaml": measurement / "measurement.yaml"}
     if following:
         files[f"the next sensor, {Path(following).name}"] = Path(following)
-    return pages.source_of(shlex.join(["spadmnist", *sys.argv[1:]]), seed, files)
+    return pages.source_of(shlex.join(["spadmnist", *sys.argv[1:]]), seed, files, then)
 
 
 def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:

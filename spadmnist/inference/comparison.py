@@ -424,7 +424,7 @@ def headline(comparison: Comparison) -> str:
 
 def found_in(check: Check) -> str:
     """Where a check deviates most, in which capture, and by how much."""
-    return f"{check.where}, of {check.capture or 'all captures'}: {check.size}"
+    return f"{check.where}, in {check.capture or 'all captures'}: {check.size}"
 
 
 def others_of(group: Sequence[Check]) -> str:
@@ -441,10 +441,14 @@ def table(comparison: Comparison) -> str:
     lines = []
     if failing:
         text = f"The model fails {len(failing)} of {number} checks: {headline(comparison)}."
-        lines += [*textwrap.wrap(text, 100), ""]
-        several = len(groups) > 1
-        lines += [f"{len(groups)} deviations, the clearest first:" if several else "What shows it:", ""]
-        for k, group in enumerate(groups[:_GROUPS], 1):
+        lines += textwrap.wrap(text, 100)
+        if len(failing) > 1:
+            lines.append("")
+        if len(groups) == 1 and len(failing) > 1:
+            lines += textwrap.wrap(f"The same deviation is in {others_of(groups[0])}.", 100)
+        elif len(groups) > 1:
+            lines += [f"{len(groups)} deviations, the clearest first:", ""]
+        for k, group in enumerate(groups[:_GROUPS] if len(groups) > 1 else [], 1):
             first, also = group[0], others_of(group)
             text = f"{found_in(first)} ({first.statistic}, p = {first.p_value:.1g})"
             lines += textwrap.wrap(text, 100, initial_indent=f"{k:>3}. ", subsequent_indent="     ")

@@ -300,7 +300,7 @@ def remains(found: Diagnosis) -> str:
         return ""
     first = found.unexplained[0]
     size = f": {first['size']}" if first.get("size") else f" ({first['significance']:.1f} sigma)"
-    return f"{first['where']}, of {first['capture'] or 'all captures'}{size} ({first['statistic']})"
+    return f"{first['where']}, in {first['capture'] or 'all captures'}{size} ({first['statistic']})"
 
 
 def named(entry: Mapping[str, Any]) -> str:

@@ -231,7 +231,7 @@ td.lowish, .key.lowish { background: var(--lowish); }
 {% block body %}
 <section class="verdict {{ 'fails' if failing else 'adequate' }}">
 {% if failing %}
-<h1>The model fails {{ failing | length }} of {{ found.checks | length }} checks: {{ clearest.where }}, of \
+<h1>The model fails {{ failing | length }} of {{ found.checks | length }} checks: {{ clearest.where }}, in \
 {{ clearest.capture or "all captures" }}: {{ clearest.size }}.</h1>
 <p class="lead">The misfit is <b>{{ found.misfit | number }}</b>; 95 % of the model's own recordings stay below \
 {{ found.misfit_null_95 | number }}. The checks show \
@@ -250,7 +250,7 @@ td.lowish, .key.lowish { background: var(--lowish); }
 <p class="lead">The measurement has neither data nor a light level that is known.</p>
 {% endif %}
 {% if found.checks and not failing %}<p>Worst check: {{ headline }}.</p>{% endif %}
-<p class="next"><b>Next:</b> {{ then }}</p>
+<p class="next"><b>Next:</b> {{ source.then or then }}</p>
 </section>
 <!-- contents -->
 
@@ -373,6 +373,7 @@ In {{ found.checks | length }} checks of a right model chance alone leaves about
 {% endif %}
 
 <h2>Words</h2>
+<details><summary>What the words mean</summary>
 <dl class="words">
 <dt>model</dt><dd>The sensor as its file describes it, with the effects that are listed there and no others.</dd>
 <dt>check</dt><dd>One statistic of one capture: the same numbers are computed from the measured data and from many
@@ -393,5 +394,6 @@ Beyond 3, what is stated should be doubted.</dd>
 <dt>tolerance</dt><dd>What is too small to matter (--tolerance). A smaller difference is listed, and does not count as a
 failure.</dd>
 </dl>
+</details>
 {% endblock %}
 """

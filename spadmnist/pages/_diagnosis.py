@@ -400,7 +400,7 @@ against {{ found.measurement }}\
 {% if not found.steps %} (nothing was added){% endif %}{% endif %}\
 {% if found.unwritten %} &middot; the next sensor file was not written: {{ found.unwritten }}{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
-<p class="next"><b>Next:</b> {{ then }}</p>
+<p class="next"><b>Next:</b> {{ source.then or then }}</p>
 </section>
 <!-- contents -->
 

@@ -34,13 +34,15 @@ SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 class Source:
     """Where a page comes from. command: as it was typed; date: of the day; seed: of the simulations.
 
-    files: what each file is -> its text, such as the sensor and the measurement.yaml.
+    files: what each file is -> its text, such as the sensor and the measurement.yaml; then: the next step, with the
+    names that the command has.
     """
 
     command: str = ""
     date: str = ""
     seed: int | None = None
     files: Mapping[str, str] = field(default_factory=dict)
+    then: str = ""
 
     @property
     def shown(self) -> list[tuple[str, str]]:
@@ -49,7 +51,7 @@ class Source:
         return [(name, text[:_LONGEST] + cut * (len(text) > _LONGEST)) for name, text in self.files.items()]
 
 
-def source_of(command: str, seed: int | None, files: Mapping[str, Path]) -> Source:
+def source_of(command: str, seed: int | None, files: Mapping[str, Path], then: str = "") -> Source:
     """Where a page comes from, today; files: what each is -> its path. What cannot be read as text is left out."""
     texts = {}
     for name, path in files.items():
@@ -57,7 +59,7 @@ def source_of(command: str, seed: int | None, files: Mapping[str, Path]) -> Sour
             texts[name] = disk.read_file(path, 16 << 20).decode()
         except (OSError, UnicodeDecodeError, SpadError):
             continue
-    return Source(command, datetime.date.today().isoformat(), seed, texts)
+    return Source(command, datetime.date.today().isoformat(), seed, texts, then)
 
 
 # --- the file -------------------------------------------------------------------------------------------------------
