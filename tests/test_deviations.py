@@ -118,7 +118,7 @@ def test_what_a_statistic_pools_is_a_statistic_and_never_itself() -> None:
             {"edge_intervals", "fine_intervals"},
             "intervals of",
         ),
-        ("dead_time", {"duration": 70e-9}, {"edge_intervals"}, "intervals of"),
+        ("dead_time", {"duration": 100e-9}, {"edge_intervals", "fine_intervals", "intervals"}, "intervals of"),
     ],
 )
 def test_a_simulated_effect_is_named_by_its_physics(

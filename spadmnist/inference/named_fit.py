@@ -73,7 +73,7 @@ def fit_named(
             replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
             answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
             if not isinstance(answer, str):
-                say("by the counts in the dark alone; compare sets all else beside the new model")
+                say("by the counts in the dark alone; compare checks the new model in all other statistics")
                 return answer
             say(f"not by counts in the dark alone, for there is {answer}")
         replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)

@@ -21,7 +21,7 @@ class Spacing(Statistic):
     """
 
     modalities = ("tr", "str")
-    pools = ("multiplicity", "array_fano")
+    pools = ("multiplicity", "array_fano", "intervals", "autocorrelation")
     among = "array"
     unit = "detections"
 
@@ -57,7 +57,7 @@ class Crowds(Statistic):
     """
 
     modalities = ("tr",)
-    pools = ("multiplicity", "array_fano")
+    pools = ("multiplicity", "array_fano", "intervals", "autocorrelation")
     among = "array"
     unit = "standard deviations"
 
