@@ -361,7 +361,7 @@ _TEMPLATE = """\
 {% block style %}
 main { max-width: 1160px; }
 .verdict.open { border-left-color: var(--open); }
-.ladder { display: grid; grid-template-columns: minmax(0, 10fr) minmax(0, 11fr); gap: 20px; align-items: start; }
+.ladder { display: grid; grid-template-columns: minmax(0, 9fr) minmax(0, 12fr); gap: 20px; align-items: start; }
 .ladder figure { background: var(--card); border: 1px solid var(--line); padding: 10px 12px; margin: 0; }
 .ladder img { width: 100%; height: auto; display: block; }
 .ladder .narrow { display: none; }
