@@ -269,7 +269,8 @@ class _Found:
             numbers = {key: _rounded(value) for key, value in self.found.values.items()}
             made = sensor_file.save(candidates.with_values(self.start, numbers), out, notes, ours)
         self.found.file = str(made)
-        pages.diagnosis(self.found, place)
+        files = {} if self._source is None else {f"the sensor, {self._source.name}": self._source}
+        pages.diagnosis(self.found, place, pages.source_of("", None, files | {"the next sensor, sensor.yaml": made}))
         return place
 
     def __repr__(self) -> str:

@@ -128,7 +128,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
             "matplotlib",
             {
                 *("report/_sheet.py", "pictures.py", "library.py"),
-                *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis")),
+                *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis", "_pixels")),
             },
         ),
         ("jinja2", {"pages/_frame.py"}),

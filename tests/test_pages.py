@@ -216,9 +216,9 @@ def failing_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Comparison, 
 def test_a_failing_model_is_told_first_with_the_numbers_that_matter(failing_page: tuple[Comparison, str]) -> None:
     found, text = failing_page
     parts = Parts(text)
-    clearest = found.failing[0]
-    verdict = parts.text.index("The model fails 14 of 28 checks,")
-    sentence = parts.text[verdict : parts.text.index("What was compared")]
+    clearest = found.deviations[0][0]
+    verdict = parts.text.index("The model fails 14 of 28 checks: " + clearest.where)
+    sentence = parts.text[verdict : parts.text.index("Next:")]
     for words in (
         "6.43",
         "1.21",
@@ -235,19 +235,18 @@ def test_a_failing_model_is_told_first_with_the_numbers_that_matter(failing_page
 
 def test_an_adequate_model_shows_what_came_nearest(tmp_path: Path) -> None:
     _, parts = written(adequate(), tmp_path)
-    assert "The model is adequate: none of 13 checks fails, with a misfit of 1.03" in parts.text
+    assert "The model is adequate: none of 13 checks fails. The misfit is 1.03" in parts.text
     assert "What came nearest to failing" in parts.text and "Where it fails" not in parts.text
     assert len(parts.images) == 1 + 3  # the light
 
 
 def test_every_check_is_in_the_table_and_the_matrix(failing_page: tuple[Comparison, str]) -> None:
     found, text = failing_page
-    rows = re.findall(
-        r"<tr><td>(.*?)</td><td>(.*?)</td><td class=\"(.*?)\">", text[text.index("All checks, the clearest") :]
-    )
+    listed = text[text.index("<h2>All checks, the clearest") :]
+    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td class=\"(.*?)\">", listed)
     assert sorted((s, c) for s, c, _ in rows) == sorted((c.statistic, c.capture or "all") for c in found.checks)
     assert sum(mark == "fails" for *_, mark in rows) == len(found.failing)
-    matrix = text[text.index("All checks at a glance") : text.index("All checks, the clearest")]
+    matrix = text[text.index("<h2>All checks at a glance") : text.index("<h2>All checks, the clearest")]
     assert len(re.findall(r'<td class="fails">', matrix)) == len(found.failing)
     assert len(re.findall(r'<td class="\w', matrix)) == len(found.checks)
     assert all(f'<th scope="col">{name}</th>' in matrix for name in ("all captures", "dark", "flat-20k"))
@@ -261,9 +260,9 @@ def test_what_is_real_but_small_is_told_apart_from_what_matters(tmp_path: Path) 
     never = check_of("rows", 0.3, statistic="no_one")
     assert small.relative == pytest.approx(0.2) and large.relative == pytest.approx(8.0)
     text, parts = written(comparison_of([small, large, never], tolerance=0.5), tmp_path)
-    assert "The model fails 1 of 3 checks," in parts.text
-    beside = text[text.index("Real, but smaller than the tolerance") : text.index("All checks at a glance")]
-    assert "small_one" in beside and "large_one" not in beside and "no_one" not in beside
+    assert "The model fails 1 of 3 checks: " in parts.text
+    small_ones = text[text.index("<h2>Real, but smaller than the tolerance") : text.index("<h2>All checks at a glance")]
+    assert "small_one" in small_ones and "large_one" not in small_ones and "no_one" not in small_ones
     text, parts = written(comparison_of([small, never], tolerance=0.5), tmp_path)
     assert "none of 2 checks fails beyond the tolerance" in parts.text
     assert "1 differs by more than chance, but by less than 50 %" in parts.text
@@ -280,22 +279,30 @@ def test_the_significant_are_those_that_compare_finds() -> None:
     assert told == {c.capture for c in strict.failing}
 
 
-def test_the_clearest_of_every_statistic_is_shown_and_few_of_one() -> None:
-    checks = [replace(check_of("rows", 10.0 ** -(60 - k), f"c{k}"), passes=False) for k in range(20)]
-    checks += [replace(check_of("rows", 1e-20, f"c{k}", "other"), passes=False) for k in range(20)]
-    checks += [replace(check_of("rows", 1e-8, "c0", f"kind_{k}"), passes=False) for k in range(9)]
-    shown = _comparison._chosen(sorted(checks, key=lambda c: c.p_value))
-    assert len(shown) == 12
-    assert [c.statistic for c in shown] == ["rows", "rows", "other", *(f"kind_{k}" for k in range(9))]
-    assert len(_comparison._chosen(checks[:20])) == 3
-    assert shown[0] is checks[0]
+def test_one_card_a_deviation_with_its_captures_overlaid_and_the_rest_folded(tmp_path: Path) -> None:
+    def check(statistic: str, p: float, capture: str, kind: str = "rows") -> Check:
+        return replace(check_of(kind, p, capture, statistic, factor=4.0), excess=300.0)
+
+    checks = [check("neighbours", 1e-40, c) for c in ("flat", "dim", "dark")]
+    checks += [check("multiplicity", 1e-50, "flat"), check("pixel_map", 1e-9, "flat", "map")]
+    text, _ = written(comparison_of(checks), tmp_path)
+    shown = text[text.index("<h2>Where it fails") : text.index("<h2>What was compared")]
+    cards = shown.split('<section class="card">')[1:]
+    assert len(cards) == 2 and "neighbours</b> of <b>flat" in cards[0] and "pixel_map</b> of <b>flat" in cards[1]
+    assert "The same deviation is in multiplicity of flat; neighbours of dim, dark." in cards[0].replace("\n", " ")
+    first, _, folded = cards[0].partition("<details>")
+    (source,) = re.findall(r'src="(.*?)"', first)
+    drawing = decoded(source)[1].decode()
+    assert all(f">{name}<" in drawing for name in ("dim", "dark")) and "measured, flat" in drawing
+    assert "3 more checks" in folded and len(re.findall("<img", folded)) == 1 and "multiplicity" in folded
+    assert "<details>" not in cards[1]
 
 
 def test_nothing_to_check_and_one_check(tmp_path: Path) -> None:
     _, parts = written(comparison_of([], nuisances=()), tmp_path)
     assert "Nothing could be checked" in parts.text and not parts.images
     _, parts = written(comparison_of([check_of("one", 1e-9, factor=3.0)], nuisances=()), tmp_path)
-    assert "The model fails 1 of 1 checks" in parts.text and len(parts.images) == 1
+    assert "The model fails 1 of 1 checks: " in parts.text and len(parts.images) == 1
 
 
 @pytest.mark.parametrize(
@@ -331,7 +338,7 @@ def test_every_kind_of_summary_has_a_picture(kind: str, factor: float) -> None:
     picture = _comparison._picture(check_of(kind, 1e-9, factor=factor))
     assert picture is not None
     form, data = decoded(picture.source)
-    assert form == ("png" if kind == "many" else "svg+xml")
+    assert form == "svg+xml"
     assert len(data) < 170_000
     if form == "png":
         with Image.open(io.BytesIO(data)) as image:
@@ -341,6 +348,9 @@ def test_every_kind_of_summary_has_a_picture(kind: str, factor: float) -> None:
         words = " ".join("".join(e.itertext()) for e in drawing.iter("{http://www.w3.org/2000/svg}text"))
         assert "measured" in words and (kind == "score map" or "simulated" in words)
         assert ("sigmas" in words) == (kind != "exact")
+        assert ("residual at the ring: +" in words or "residual at the ring: -" in words) == (
+            kind in ("line of pixels", "many", "rows", "intervals", "power", "scores")
+        )
         assert ("measured / simulated" in words) == (kind in ("map", "large map"))  # scores have no ratio
         if kind == "intervals":
             assert "100 ns" in words and words.split().count("interval") == 1
@@ -401,9 +411,9 @@ def test_an_axis_that_is_no_axis_is_not_used() -> None:
     assert good.axis is not None
     for axis in (None, good.axis[:-1], np.where(good.axis > 1e-6, np.nan, good.axis), np.tile(good.axis[:12], 2)):
         assert _figures._axis_of(replace(good, axis=axis))[0] is None
-    long, _ = summary_of("rows", cells=100)
+    long, _ = summary_of("rows", cells=1000)
     axis, label, _ = _figures._axis_of(replace(long, axis=None))
-    assert axis is not None and axis.size == 100 and label == "cell, 0 to 99"
+    assert axis is not None and axis.size == 1000 and label == "cell, 0 to 999"
     zero = replace(good, axis=good.axis - good.axis[0])  # a lag of 0 is not on a logarithmic scale
     assert _figures._axis_of(zero)[2] is False
     falling = _comparison._picture(replace(check_of("intervals", 1e-9), summary=replace(good, axis=good.axis[::-1])))
@@ -479,7 +489,7 @@ def test_it_is_one_small_file_and_always_the_same(tmp_path: Path, failing_page: 
     assert [p.name for p in path.parent.iterdir()] == ["index.html"]
     assert path.read_text() == before
     assert 50_000 < path.stat().st_size < 3_000_000
-    assert len(Parts(before).images) == 1 + 12  # the light
+    assert len(Parts(before).images) == 1 + 8  # the light, and the clearest deviations
 
 
 def test_twelve_large_maps_are_still_a_small_page() -> None:
@@ -571,10 +581,12 @@ def test_no_name_can_do_anything(tmp_path: Path) -> None:
         "tr",
         "th",
         "td",
+        *("nav", "ul", "li", "a", "details", "summary", "pre", "code"),
     }
     assert {tag for tag, _ in parts.elements} <= allowed
     for tag, attributes in parts.elements:
-        assert not any(name.startswith("on") or name in ("href", "style", "srcset") for name in attributes), tag
+        assert not any(name.startswith("on") or name in ("style", "srcset") for name in attributes), tag
+        assert re.fullmatch(r"#part-\d+", attributes.get("href") or "#part-1"), attributes
     assert parts.text.count("{{ 7*7 }}") > 5 and "49" not in re.sub(r"\d\.\d+|10⁻\d+", "", parts.text)
     assert parts.text.count("<script>") > 5  # as words
     for source in parts.images:
@@ -647,7 +659,43 @@ def test_a_browser_shows_words_and_pictures(tmp_path: Path, failing_page: tuple[
     assert background[:, :100].all() and background[:, -100:].all()  # nothing runs over the edge
     # of a page whose pictures are forbidden the same test fails
     page.write_text(page.read_text().replace("img-src data:;", ""))
-    assert near(screenshot(page, tmp_path), _figures.MODEL).sum() < 1000
+    assert near(screenshot(page, tmp_path), _figures.BAND).sum() < 1000
+
+
+def framed(page: Path, folder: Path, width: int, height: int) -> np.ndarray:
+    """A page as wide as a telephone, which is less than a browser's least window: in a frame with scroll bars."""
+    outer = folder / "outer.html"
+    style = f"border:0;width:{width}px;height:{height}px"
+    outer.write_text(f'<body style="margin:0;background:#ff00ff"><iframe src="{page.name}" style="{style}"></iframe>')
+    return screenshot(outer, folder, height, 600)[:, :width]
+
+
+@needs_a_browser
+def test_four_hundred_points_are_wide_enough(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
+    page = tmp_path / "index.html"
+    page.write_text(failing_page[1])
+    seen = framed(page, tmp_path, 400, 3000)
+    background = near(seen, "#fafaf8") | near(seen, "#ffffff")
+    assert background[:, :8].all() and background[:, -8:].all()  # nothing runs over the edge
+    assert (seen[:, 12:-12] < 100).all(axis=2).mean() > 0.01
+    # a page that holds something wider has it at the edge
+    page.write_text(page.read_text().replace("<main>", '<main><p style="width:900px;background:#000">.</p>'))
+    wider = framed(page, tmp_path, 400, 3000)
+    assert not (near(wider, "#fafaf8") | near(wider, "#ffffff"))[:, -8:].all()
+
+
+@needs_a_browser
+def test_it_is_dark_where_the_reader_wants_it(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
+    page, target = tmp_path / "index.html", tmp_path / "screen.png"
+    page.write_text(failing_page[1])
+    # 0: dark
+    options = ("--blink-settings=preferredColorScheme=0", "--window-size=1280,2500", f"--screenshot={target}")
+    browse(page, tmp_path, *options)
+    with Image.open(target) as image:
+        seen = np.asarray(image.convert("RGB")).astype(int)
+    assert (seen.max(axis=2) < 70).mean() > 0.8  # pictures, too, that have no ground of their own
+    assert (seen.min(axis=2) > 170).mean() > 0.003  # letters
+    assert not near(seen, "#ffffff").mean() > 0.02
 
 
 @pytest.fixture

@@ -1,9 +1,10 @@
-"""Verbs that set a model beside a measurement."""
+"""Verbs that compare a model with a measurement, diagnose it and fit it."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from ._group import cli
 
 if TYPE_CHECKING:
     from ..inference.results import Diagnosis
+    from ..pages import Source
     from ..sensor import Sensor
 
 
@@ -87,11 +89,11 @@ def compare(
         found = comparison.compare(model, data, seed, smallest, workers, progress=told)
         progress.stop()
     _write_answer(json_file, comparison.canonical(found))
+    what = next_step.after_comparison(found, quoted(sensor), quoted(measurement))
     if output is not None:
-        page = pages.comparison(found, output)
+        page = pages.comparison(found, output, _source(sensor, measurement, seed, then=what))
         terminal.say(f"Report: {page}")
-    terminal.print_lines(comparison.table(found))
-    terminal.print_lines(f"\nNext: {next_step.after_comparison(found, quoted(sensor), quoted(measurement))}")
+    terminal.print_lines(f"{comparison.table(found)}\n\nNext: {what}")
     if found.verdict != "adequate":
         sys.exit(1)
 
@@ -157,7 +159,7 @@ def diagnose(
         """What is found so far, should the rest be interrupted."""
         if output is not None:
             _write_next(so_far, sensor, output / "sensor.yaml", model)
-            pages.diagnosis(so_far, output)
+            pages.diagnosis(so_far, output, _source(sensor, measurement, seed, so_far.file))
         _write_answer(json_file, results.canonical(so_far))
 
     found = model_selection.diagnose(
@@ -165,12 +167,12 @@ def diagnose(
     )
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
+    new = quoted(found.file or "next/sensor.yaml")
+    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), new)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
-            last.callback(lambda: terminal.say(f"Report: {pages.diagnosis(found, output)}"))
-        what = next_step.after_diagnosis(
-            found, quoted(sensor), quoted(measurement), quoted(found.file or "next/sensor.yaml")
-        )
+            source = _source(sensor, measurement, seed, found.file, what)
+            last.callback(lambda: terminal.say(f"Report: {pages.diagnosis(found, output, source)}"))
         last.callback(lambda: terminal.print_lines(f"{results.table(found)}\n\nNext: {what}"))
         last.callback(lambda: _write_answer(json_file, results.canonical(found)))
     if found.unwritten:
@@ -225,6 +227,16 @@ def fit(
     terminal.print_lines(f"{results.table(found)}\n\nNext: {what}")
     if found.unwritten:
         sys.exit(2)
+
+
+def _source(sensor: Path, measurement: Path, seed: int, following: str | None = None, then: str = "") -> Source:
+    """Where a report comes from: the command, the date, the seed, and the files as text."""
+    from .. import pages
+
+    files = {f"the sensor, {sensor.name}": sensor, "measurement.yaml": measurement / "measurement.yaml"}
+    if following:
+        files[f"the next sensor, {Path(following).name}"] = Path(following)
+    return pages.source_of(shlex.join(["spadmnist", *sys.argv[1:]]), seed, files, then)
 
 
 def _write_next(found: Diagnosis, source: Path, out: Path, model: Sensor) -> None:

@@ -28,6 +28,7 @@ from ..statistics import Summary
 from ..workers import Executor, executor
 from .candidates import with_values
 from .coordinates import Key, Values
+from .deviations import Deviation, deviations, excess
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
@@ -43,6 +44,7 @@ from .replicates import (
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
 _LEAST_P = 1e-300  # a p-value is never 0
+_GROUPS = 8  # deviations that a terminal lists
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Check:
         relative: that deviation, relative.
         significant: it lies outside the model's scatter, after Holm's correction.
         material: it is significant and exceeds the tolerance, so that it fails.
+        excess: excess chi square (`deviations.excess`).
         summary, judgement: the measured summary and the model's expectation, for pictures; None for totals.
     """
 
@@ -69,6 +72,7 @@ class Check:
     passes: bool = True
     material: bool = False
     significant: bool = False
+    excess: float = 0.0
     summary: Summary | None = field(default=None, repr=False)
     judgement: Judgement | None = field(default=None, repr=False)
 
@@ -80,6 +84,7 @@ class Comparison:
     Attributes:
         verdict: "adequate" or "fails".
         misfit: the mean over the blocks; misfit_null_95: its 95 % quantile under the null.
+        misfit_in_sample: the same number, for no capture is left out.
         replicates: of each capture.
         tolerance: relative; None for none.
         false_alarm_rate: probability that a right model fails.
@@ -103,9 +108,17 @@ class Comparison:
         return sorted((c for c in self.checks if not c.passes), key=lambda c: (c.p_value, -c.misfit))
 
     @property
+    def deviations(self) -> list[list[Check]]:
+        """The failing checks in groups that show one deviation each, the check that names it first (`deviations`)."""
+        failing = self.failing
+        passing = {(c.capture, c.statistic) for c in self.checks if c.passes}
+        return [[failing[i] for i in members] for members in deviations([_deviation(c) for c in failing], passing)]
+
+    @property
     def worst(self) -> Check:
-        """The check with the smallest p-value."""
-        return min(self.checks, key=lambda c: (c.p_value, -c.misfit))
+        """The check that names the clearest deviation; where none fails, that with the smallest p-value."""
+        groups = self.deviations
+        return groups[0][0] if groups else min(self.checks, key=lambda c: (c.p_value, -c.misfit))
 
     def as_data(self) -> dict[str, Any]:
         """The result as JSON data: `formats`, spadmnist-comparison/1."""
@@ -141,6 +154,16 @@ class Comparison:
                 for c in self.checks
             ],
         }
+
+
+def _deviation(check: Check) -> Deviation:
+    """A check as its group needs it; of a total the excess is that of its p-value."""
+    beyond = check.excess or float(stats.norm.isf(max(check.p_value, _LEAST_P) / 2)) ** 2
+    worst, residuals, at = 0, np.zeros(0), None
+    if check.judgement is not None and check.summary is not None:
+        worst, residuals, axis = check.judgement.worst, check.judgement.residuals, check.summary.axis
+        at = None if axis is None or check.summary.shape is not None else float(axis[worst])
+    return Deviation(check.statistic, check.capture, beyond, worst, check.where, check.relative, residuals, at)
 
 
 def _plain(value: float) -> float:
@@ -211,7 +234,10 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
                 text, relative = summary.size(judged.worst, measured, expected)
                 misfit, where = of_cells.get((id, name), judged.misfit), summary.where(judged.worst)
                 p = max(judged.p_value, _LEAST_P)
-                checks.append(Check(name, id, misfit, p, where, text, relative, summary=summary, judgement=judged))
+                beyond = excess(summary, judged.expected, judged.residuals)
+                checks.append(
+                    Check(name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged)
+                )
     captures = [seen.capture for seen in replicates.seen.values()]
     nuisances, common = light_of(levels, captures)
     checks += common
@@ -267,7 +293,7 @@ def _between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], c
         p_sum = float(stats.chi2.sf(square * z.size, z.size))
         p_cell = min(1.0, 2 * z.size * float(stats.norm.sf(abs(float(z[worst])))))
         place = f"row {worst // columns}, column {worst % columns}"
-        names = " beside ".join(units.show(wave, "m") for wave in (long, short))
+        names = " over ".join(units.show(wave, "m") for wave in (long, short))
         size = f"{float(difference[worst]):+.2%} in the worst pixel"
         p = min(1.0, 2 * min(p_sum, p_cell))
         out.append(Check("wavelength_ratio", None, square, p, f"{place}, {names}", size, float(difference[worst])))
@@ -358,7 +384,7 @@ def light_of(
                 )
             )
         change = math.expm1((log - mean) * elasticity)
-        size = f"{change:+.2%} detections beside the other captures"
+        size = f"{change:+.2%} detections relative to the other captures"
         checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))
     return nuisances, checks
 
@@ -393,38 +419,59 @@ def headline(comparison: Comparison) -> str:
     """The worst check with its physical size as text; the misfit may be blind to it."""
     c = comparison.worst
     p = f"p = {c.p_value:.1g}, " + ("passes" if c.passes else "fails")
-    return f"{c.statistic} of {c.capture or 'all captures'}, {c.where}: {c.size} ({p})"
+    return f"{found_in(c)} ({c.statistic}, {p})"
+
+
+def found_in(check: Check) -> str:
+    """Where a check deviates most, in which capture, and by how much."""
+    return f"{check.where}, in {check.capture or 'all captures'}: {check.size}"
+
+
+def others_of(group: Sequence[Check]) -> str:
+    """The checks behind the first of a group as text, "multiplicity of flat and dark; spacing of flat"."""
+    by_statistic: dict[str, list[str]] = {}
+    for check in group[1:]:
+        by_statistic.setdefault(check.statistic, []).append(check.capture or "all captures")
+    return "; ".join(f"{name} of {', '.join(captures)}" for name, captures in by_statistic.items())
 
 
 def table(comparison: Comparison) -> str:
     """The result as text for a terminal, at most 100 characters wide: verdict, failing checks, light."""
-    failing = comparison.failing
+    failing, groups, number = comparison.failing, comparison.deviations, len(comparison.checks)
     lines = []
     if failing:
-        lines.append(f"The model fails {len(failing)} of {len(comparison.checks)} checks. The clearest first:")
-        lines.append("")
-        for c in failing[:12]:
-            head = f"  p = {c.p_value:.1g}"
-            text = f"{c.statistic}, {c.capture or 'all captures'}: {c.where}; {c.size}"
-            lines += textwrap.wrap(text, 100, initial_indent=f"{head:<13}", subsequent_indent=" " * 13)
-        if len(failing) > 12:
-            lines.append(f"... and {len(failing) - 12} more (--json FILE or -o REPORT holds all)")
+        text = f"The model fails {len(failing)} of {number} checks: {headline(comparison)}."
+        lines += textwrap.wrap(text, 100)
+        if len(failing) > 1:
+            lines.append("")
+        if len(groups) == 1 and len(failing) > 1:
+            lines += textwrap.wrap(f"The same deviation is in {others_of(groups[0])}.", 100)
+        elif len(groups) > 1:
+            lines += [f"{len(groups)} deviations, the clearest first:", ""]
+        for k, group in enumerate(groups[:_GROUPS] if len(groups) > 1 else [], 1):
+            first, also = group[0], others_of(group)
+            text = f"{found_in(first)} ({first.statistic}, p = {first.p_value:.1g})"
+            lines += textwrap.wrap(text, 100, initial_indent=f"{k:>3}. ", subsequent_indent="     ")
+            if also:
+                lines += textwrap.wrap(f"also in {also}", 100, initial_indent="     ", subsequent_indent="     ")
+        if len(groups) > _GROUPS:
+            lines.append(f"... and {len(groups) - _GROUPS} more (--json FILE or -o REPORT holds all)")
     else:
-        lines.append(f"The model is adequate: none of {len(comparison.checks)} checks fails.")
-        closest = sorted(comparison.checks, key=lambda c: c.p_value)[:3]
-        near = ", ".join(f"{c.statistic} of {c.capture or 'all'} (p = {c.p_value:.2g})" for c in closest)
-        lines += textwrap.wrap(f"Nearest to failing: {near}.", 100)
+        lines.append(f"The model is adequate: none of {number} checks fails.")
+        closest = sorted(comparison.checks, key=lambda c: c.p_value)[1:3]
+        near = ", ".join(f"{c.statistic} of {c.capture or 'all captures'} (p = {c.p_value:.2g})" for c in closest)
+        text = f"Worst check: {headline(comparison)}" + (f"; then {near}." if near else ".")
+        lines += textwrap.wrap(text, 100)
     lines.append("")
-    lines += textwrap.wrap(f"Worst check: {headline(comparison)}.", 100)
     about = (
-        f"misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
+        f"Misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
         f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture; a right model is "
         f"called wrong in {comparison.false_alarm_rate:.0%} of comparisons."
     )
     lines += textwrap.wrap(about, 100)
     for n in comparison.nuisances:
         where = n.capture or "all lit captures"
-        interval = f"95 %: {n.low:.4f} to {n.high:.4f}"
+        interval = f"95 % interval {n.low:.4f} to {n.high:.4f}"
         text_of_light = f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}"
         lines += textwrap.wrap(text_of_light, 100)
     return "\n".join(lines)

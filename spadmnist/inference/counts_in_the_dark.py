@@ -137,6 +137,7 @@ def _answer(
     mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
     step = Step(candidate, results, found.misfit, _clear(start.misfit, free), f"mean of the map {mean - 1:+.2%}")
+    step.map = map_
     return Diagnosis(
         replicates.start.name,
         measurement.name,
@@ -153,6 +154,8 @@ def _answer(
         [],
         [],
         values={candidate.carrier: map_.values()},
+        shape=replicates.start.layout.shape,
+        asked="fit",
         dark=replicates.dark,
         crop=str(replicates.start.window) if replicates.start.window else None,
     )

@@ -65,7 +65,7 @@ class Rung:
 def physical_errors(
     replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray], shift: Signature | None = None
 ) -> dict[str, float]:
-    """The physical errors of a model, relative, by name.
+    """The physical errors of a model, relative, by name; of what was not measured there is none.
 
     The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates.
     linearity: the largest deviation of a lit one from the others. map: rms error of the pixels. intervals: share of
@@ -76,7 +76,7 @@ def physical_errors(
         shift: the signature of a model that was not simulated itself.
     """
     ids, elasticities, _, common = totals_space(replicates, evaluation)
-    errors = {"mean_rate": 0.0, "linearity": 0.0}
+    errors = {}
     if ids:
         logs = {i: math.log(max(s.total, 0.5)) for i, s in replicates.seen.items()}
         x = log_levels(replicates, evaluation, ids, logs)
@@ -92,7 +92,7 @@ def physical_errors(
             light = float(weight @ x[lit]) / float(weight.sum() + 1 / width**2)
             x = x - light * lit
         errors["mean_rate"] = float(np.sqrt(np.mean((x * elasticities) ** 2)))
-        if lit.any():
+        if lit.sum() > 1:
             errors["linearity"] = float(np.max(np.abs((x[lit] - np.median(x[lit])) * elasticities[lit])))
     shares: dict[str, list[float]] = {"map": [], "intervals": [], "neighbours": []}
     for cell, z in residuals.items():
@@ -112,7 +112,7 @@ def physical_errors(
             k = int(np.argmax(np.abs(z)))
             far = abs(float(values[k] - expected[k])) if abs(z[k]) > _CLEAR else 0.0
             shares["neighbours"].append(far / max(seen.total, 1.0))
-    whole = errors | {k: float(np.mean(v)) if v else 0.0 for k, v in shares.items()}
+    whole = errors | {k: float(np.mean(v)) for k, v in shares.items() if v}
     return {k: plain(v) for k, v in whole.items()}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,16 @@ from scipy import stats
 from ..effects import Mimic
 from ..statistics import Statistic
 from . import comparison
-from .evaluation import Evaluation, block_checks, failing
+from .deviations import Deviation, deviations, excess
+from .evaluation import BlockCheck, Evaluation, block_checks, failing
 from .light_levels import LEAST_ELASTICITY, totals_space
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
 _LEAST_P = 1e-300  # a p-value is never 0
+_PICTURES, _CAPTURES = 6, 4  # deviations that have pictures, and captures of each, at most
+_MOVED = 9.0  # sum of squares of a signature in a check, in variances, above which the step moves it
+_ENTRIES = 20  # checks that are listed as unexplained, at most
 _TOLD_APART = 4.0  # standard deviations of a signature in statistics where the mimic has none: with more it is excluded
 _REGISTRY = Statistic.registry
 
@@ -38,59 +42,81 @@ def _among(name: str) -> str:
 def remainder(
     replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray]
 ) -> list[dict[str, Any]]:
-    """What remains unexplained, for the JSON data: statistic, capture, significance, place.
+    """What remains unexplained, for the JSON data: statistic, capture, significance, place, size.
+
+    The entries are in groups that show one deviation each (`deviations`), the one that names it first.
 
     Args:
         residuals: (cells,) by block.
     """
+    checks = block_checks(replicates, evaluation, residuals)
+    failed = failing(checks)
+    passing = {block.cell for block in checks} - {block.cell for block in failed}
+    seen = [_failed(replicates, evaluation, residuals, block) for block in failed]
+    groups = deviations([one for one, _ in seen], passing)
     out = []
-    for block in failing(block_checks(replicates, evaluation, residuals))[:20]:
-        id, name = block.cell
-        if id == "":
-            ids, *_ = totals_space(replicates, evaluation)
-            which = ids[block.worst] if block.worst < len(ids) else None
-            out.append(
-                {"statistic": "rate", "capture": which, "significance": plain(abs(block.z)), "where": "all pixels"}
-            )
-            continue
-        summary = replicates.seen[id].summaries[name]
-        out.append(
-            {
-                "statistic": name,
-                "capture": id,
-                "significance": plain(max(abs(block.z), float(stats.norm.isf(max(block.p, _LEAST_P) / 2)))),
-                "where": summary.where(block.worst),
-            }
-        )
-    return out
+    for number, members in enumerate(groups, 1):
+        for i in members:
+            one, size = seen[i]
+            significance = max(abs(failed[i].z), float(stats.norm.isf(max(failed[i].p, _LEAST_P) / 2)))
+            entry = {"statistic": one.statistic, "capture": one.capture, "significance": plain(significance)}
+            out.append(entry | {"where": one.where, "size": size, "deviation": number})
+    return out[:_ENTRIES]
 
 
-def traces(replicates: Replicates, start: Evaluation, last: Evaluation) -> list[Trace]:
-    """The clearest failing checks of the first model, as it was and as it is, up to four statistics."""
+def _failed(
+    replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray], block: BlockCheck
+) -> tuple[Deviation, str]:
+    """(a failing check as its group needs it, its size in words)."""
+    id, name = block.cell
+    if id == "":
+        ids, *_ = totals_space(replicates, evaluation)
+        which = ids[block.worst] if block.worst < len(ids) else None
+        return Deviation("rate", which, block.z**2, 0, "all pixels", 0.0, np.zeros(0)), ""
+    seen = replicates.seen[id]
+    summary, z = seen.summaries[name], residuals.get(block.cell, np.zeros(0))
+    expected, _ = evaluation.usual(block.cell, seen.total)
+    text, relative = summary.size(block.worst, float(summary.values[block.worst]), float(expected[block.worst]))
+    at = None if summary.axis is None or summary.shape is not None else float(summary.axis[block.worst])
+    beyond = excess(summary, expected, z) if z.size else block.z**2
+    return Deviation(name, id, beyond, block.worst, summary.where(block.worst), relative, z, at), text
+
+
+def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:
+    """The deviations of the first model, as they were and as they are: each by the check that names it.
+
+    Of each group of failing checks (`deviations`), the clearest first: that check, and the others of its statistic in
+    other captures.
+    """
+    blocks = block_checks(replicates, start, start.residuals)
+    failed = [b for b in failing(blocks) if b.cell[0] and b.cell in last.nulls and not start.nulls[b.cell].law.exact]
+    seen = [_failed(replicates, start, start.residuals, block) for block in failed]
+    passing = {block.cell for block in blocks} - {block.cell for block in failed}
     out: list[Trace] = []
-    for block in failing(block_checks(replicates, start, start.residuals)):
-        id, name = block.cell
-        if id == "" or block.cell not in last.nulls or start.nulls[block.cell].law.exact:
-            continue
-        if any(t.statistic == name for t in out):
-            continue
-        seen = replicates.seen[id]
-        summary, null = seen.summaries[name], last.nulls[block.cell]
-        now = null.expected(seen.total)[0]
-        out.append(
-            Trace(
-                name,
-                id,
-                summary,
-                start.nulls[block.cell].expected(seen.total)[0],
-                now,
-                null.spread_at(now),
-                start.residuals[block.cell],
-                last.residuals[block.cell],
+    for number, members in enumerate(deviations([one for one, _ in seen], passing)[:_PICTURES]):
+        alike = [i for i in members if seen[i][0].statistic == seen[members[0]][0].statistic][:_CAPTURES]
+        for i in alike:
+            (id, name), (one, size) = failed[i].cell, seen[i]
+            total, null = replicates.seen[id].total, last.nulls[id, name]
+            now = null.expected(total)[0]
+            moved = [float(np.sum(step.template.get((id, name), np.zeros(1)) ** 2)) for step in steps]
+            out.append(
+                Trace(
+                    name,
+                    id,
+                    replicates.seen[id].summaries[name],
+                    start.nulls[id, name].expected(total)[0],
+                    now,
+                    null.spread_at(now),
+                    start.residuals[id, name],
+                    last.residuals[id, name],
+                    one.where,
+                    size,
+                    number,
+                    i == members[0],
+                    int(np.argmax(moved)) if moved and max(moved) > _MOVED else None,
+                )
             )
-        )
-        if len(out) == 4:
-            break
     return out
 
 

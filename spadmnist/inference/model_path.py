@@ -252,6 +252,7 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
     for step in path.steps:
         if step.candidate.carrier and step.candidate.carrier in maps:
             step.values = map_values(maps[step.candidate.carrier])
+            step.map = maps[step.candidate.carrier]
         for (effect, name), (low, high) in step.intervals.items():
             unit = next(d.unit for d in step.candidate.coordinates if d.key == (effect, name))
             own = step.values.get(name) if any(d.key == (effect, name) for d in step.coordinates) else None

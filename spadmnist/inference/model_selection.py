@@ -255,7 +255,7 @@ def _answer(
         excluded=excluded,
         invisible=invisible,
         unlimited=unlimited,
-        traces=traces(replicates, start, path.evaluation),
+        traces=traces(replicates, start, path.evaluation, path.steps),
         values=path.values,
         simulations=replicates.simulations,
         dark=replicates.dark,
@@ -263,6 +263,7 @@ def _answer(
         untried=path.scan.untried,
         in_sample=in_sample,
         finished=path.finished,
+        shape=replicates.start.layout.shape,
     )
 
 

@@ -73,7 +73,7 @@ def fit_named(
             replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
             answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
             if not isinstance(answer, str):
-                say("by the counts in the dark alone; compare sets all else beside the new model")
+                say("by the counts in the dark alone; compare checks the new model in all other statistics")
                 return answer
             say(f"not by counts in the dark alone, for there is {answer}")
         replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)
@@ -106,7 +106,7 @@ def fit_named(
             [],
             [],
             [],
-            traces(replicates, start, path.evaluation),
+            traces(replicates, start, path.evaluation, path.steps),
             path.values,
             None,
             replicates.simulations,
@@ -114,6 +114,7 @@ def fit_named(
             str(replicates.start.window) if replicates.start.window else None,
             covariance=_covariance(path, exact),
             in_sample=comparison_with(replicates, path.values, path.scan.phases),
+            shape=replicates.start.layout.shape,
             asked="fit",
         )
 

@@ -8,7 +8,7 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,13 +21,16 @@ from .comparison import Comparison, headline
 from .coordinates import Coordinate, Key
 from .replicates import Cell
 
+if TYPE_CHECKING:
+    from .pixel_maps import PixelMap
+
 NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
 # what remains, in words, by what a statistic compares (`Statistic.among`)
 _WHO = {
-    "far": "pixels far from each other share it",
-    "neighbours": "pixels that are close to each other share it",
-    "pixel": "it stays in its own pixel",
-    "array": "the whole array shares it",
+    "far": "it is correlated between distant pixels",
+    "neighbours": "it is correlated between neighbouring pixels",
+    "pixel": "it stays within a pixel",
+    "array": "it is common to the whole array",
 }
 
 
@@ -84,6 +87,7 @@ class Step:
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     # (cells, coordinates) by block, where the effect is faint
     jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
+    map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
 
     def as_data(self) -> dict[str, Any]:
         kind = "per_pixel" if self.candidate.kind == "per_pixel" else self.candidate.kind
@@ -104,6 +108,9 @@ class Trace:
     """A check before and after, for a picture.
 
     Attributes:
+        size: of its clearest deviation from the first model, in words; where: that cell.
+        deviation: the number of its group (`deviations`), 0 the clearest; first: it names the group.
+        step: the number of the step that moves it most, None where none does.
         before, after: (cells,) the expectation of each model.
         spread: (cells,) the scatter of the last model.
         residuals_before, residuals_after: (cells,).
@@ -117,6 +124,11 @@ class Trace:
     spread: np.ndarray
     residuals_before: np.ndarray
     residuals_after: np.ndarray
+    where: str = ""
+    size: str = ""
+    deviation: int = 0
+    first: bool = True
+    step: int | None = None
 
 
 @dataclass
@@ -150,6 +162,7 @@ class Diagnosis:
     asked: str = "diagnosis"  # or "fit"
     in_sample: Comparison | None = field(default=None, repr=False)  # of the model with all steps, to all captures
     finished: bool = True  # False: a budget ended it, and the verdict is that of the steps so far
+    shape: tuple[int, int] | None = None  # rows, columns of the measured pixels
     unwritten: str = ""  # why there is no next sensor file where one was wanted
 
     def as_data(self) -> dict[str, Any]:
@@ -192,9 +205,9 @@ def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
         dark: captures without light.
     """
     kinds = {Statistic.registry.find(str(r["statistic"])).among for r in found if r["statistic"] in Statistic.registry}
-    who = next((words for kind, words in _WHO.items() if kind in kinds), "it is a matter of rates and maps")
+    who = next((words for kind, words in _WHO.items() if kind in kinds), "it is in the rates and maps")
     in_dark = any(r["capture"] in dark for r in found)
-    return f"{who}; {'it is there in the dark, too' if in_dark else 'it shows in light alone'}"
+    return f"{who}; {'it is in the dark captures, too' if in_dark else 'it is in the lit captures alone'}"
 
 
 def mimic(candidate: Candidate) -> Mimic | None:
@@ -224,39 +237,39 @@ def table(found: Diagnosis) -> str:
         either = " (or)" if entry["confused"] else ""
         lines.append(
             f"set-up{either}: {entry['quantity']} of {where} x {units.factor(f['value'])} "
-            f"(95 %: {units.factor(f['low'])} to {units.factor(f['high'])})"
+            f"(95 % interval {units.factor(f['low'])} to {units.factor(f['high'])})"
         )
     if found.steps or found.setup:
         lines.append("")
-    names = ("mean_rate", "map", "linearity", "intervals", "neighbours")
-    rows: list[tuple[str, ...]] = [("model", "misfit", *(n.replace("_", " ") + " %" for n in names))]
-    for row in found.ladder:
-        rows.append((row["model"], f"{row['misfit']:.3f}", *(f"{100 * row['errors'].get(n, 0.0):.3f}" for n in names)))
-    rows.append(("noise floor (95 %)", f"{found.null_95:.3f}", *("" for _ in names)))
-    lines += columns(rows)
     if found.in_sample is not None:
         text = f"In sample, misfit {found.in_sample.misfit:.3f}; worst check: {headline(found.in_sample)}."
-        lines += ["", *textwrap.wrap(text, 100)]
+        lines += [*textwrap.wrap(text, 100), ""]
+    names = ("mean_rate", "map", "linearity", "intervals", "neighbours")
+    rows: list[tuple[str, ...]] = [("model", "held-out misfit", *(n.replace("_", " ") + " %" for n in names))]
+    for row in found.ladder:
+        rows.append((row["model"], f"{row['misfit']:.3f}", *(error_of(row, n) for n in names)))
+    rows.append(("noise floor (95 %)", f"{found.null_95:.3f}", *("" for _ in names)))
+    lines += columns(rows)
     if found.unexplained:
-        lines += ["", "What remains:"]
+        lines += ["", "What remains, the clearest first:"]
         lines += columns(
             [
-                (r["statistic"], r["capture"] or "all", f"{r['significance']:.1f} sigma", r["where"])
+                (r["statistic"], r["capture"] or "all", f"{r['significance']:.1f} sigma", r["where"], r.get("size", ""))
                 for r in found.unexplained[:8]
             ]
         )
         near = [named(other) for other in found.unexplained[0].get("alternatives", [])]
         if near:
-            text = f"Nearest, but it leaves too much of what it should explain: {', '.join(near)}."
+            text = f"Nearest, but it explains too little of its own cells: {', '.join(near)}."
             lines += textwrap.wrap(text, 100)
     for one in found.advice:
         text = (
-            f"To tell {' from '.join(one['separates'])}: take {one['capture']} "
+            f"To separate {' from '.join(one['separates'])}: take {one['capture']} "
             f"(now {one['significance_now']:.1f} sigma, then {one['significance_then']:.1f})."
         )
         lines += ["", *textwrap.wrap(text, 100)]
     if found.excluded:
-        lines += ["", "Would have been seen (95 % upper limits):"]
+        lines += ["", "Not found; 95 % upper limits:"]
         about = [f"{e['effect']}.{e['parameter']} {_limit(e)}" for e in found.excluded]
         lines += textwrap.wrap("; ".join(about), 100, initial_indent="  ", subsequent_indent="  ")
     if found.invisible:
@@ -266,13 +279,28 @@ def table(found: Diagnosis) -> str:
         about = [e["effect"] for e in found.unlimited]
         lines += textwrap.wrap(f"Tried and not found, without a limit: {', '.join(about)}.", 100)
     if found.untried:
-        lines += ["", "Not tried there:"]
+        lines += ["", "Not tried:"]
         for e in found.untried:
             text = ", ".join(filter(None, (named(e), str(e["where"])))) + f": {e['why']}"
             lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
     if found.unwritten:
         lines += ["", *textwrap.wrap(f"The next sensor file was not written: {found.unwritten}", 100)]
     return "\n".join(lines)
+
+
+def error_of(row: Mapping[str, Any], name: str) -> str:
+    """A physical error of a row of the ladder in per cent; "-" where it was not measured."""
+    error = row["errors"].get(name)
+    return "-" if error is None else f"{100 * error:.3f}"
+
+
+def remains(found: Diagnosis) -> str:
+    """The clearest deviation that remains, in physical words; "" where nothing does."""
+    if not found.unexplained:
+        return ""
+    first = found.unexplained[0]
+    size = f": {first['size']}" if first.get("size") else f" ({first['significance']:.1f} sigma)"
+    return f"{first['where']}, in {first['capture'] or 'all captures'}{size} ({first['statistic']})"
 
 
 def named(entry: Mapping[str, Any]) -> str:
@@ -300,7 +328,7 @@ def _limit(entry: Mapping[str, Any]) -> str:
 def sentence(found: Diagnosis) -> str:
     """The verdict in words."""
     if not found.finished:
-        return "not finished, what follows is of the steps so far: " + sentence(
+        return "not finished; the verdict is that of the steps so far: " + sentence(
             dataclasses.replace(found, finished=True)
         )
     fitted = " and ".join(title(s.candidate) for s in found.steps)
@@ -309,16 +337,20 @@ def sentence(found: Diagnosis) -> str:
     if found.verdict == "adequate":
         return "nothing is missing that this measurement could show."
     if found.verdict == "setup":
-        return "the set-up explains everything, the sensor nothing."
+        return "the set-up explains the deviations; no change of the sensor is needed."
     if found.verdict == "explained":
-        return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} what the model lacked."
+        return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model."
     if found.verdict == "confused" and found.setup and not found.steps:
-        return f"the set-up of {found.setup[0]['capture']}, or {NONLINEARITY}: it is the brightest capture."
+        where = found.setup[0]["capture"] or "all captures"
+        return f"the set-up of {where}, or {NONLINEARITY}: it is the brightest capture."
     if found.verdict == "confused":
-        return f"{fitted}, or something that looks the same here."
+        return f"{fitted}, or another effect with the same signature in this measurement."
     if found.verdict == "partly_explained":
-        return f"{fitted} {'is' if len(found.steps) == 1 else 'are'} missing, and something else remains."
-    return f"something is missing that no known effect explains: {mechanism(found.unexplained, found.dark)}."
+        what = remains(found)
+        rest = f"What remains: {what}." if what else "Some checks still fail."
+        return f"{fitted} {'is' if len(found.steps) == 1 else 'are'} missing, but not all. {rest}"
+    what = f": {remains(found)}" if found.unexplained else ""
+    return f"no known effect explains what differs{what}. {mechanism(found.unexplained, found.dark).capitalize()}."
 
 
 def notes(found: Diagnosis) -> dict[Key, str]:

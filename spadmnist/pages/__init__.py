@@ -7,11 +7,12 @@ page forbids the browser to fetch or run anything. The same answer gives the sam
 from ._comparison import check_figure, comparison
 from ._diagnosis import diagnosis, trace_figure
 from ._experiment import Drawing, Story, Table, experiment, markdown
-from ._frame import FILES, check_place
+from ._frame import FILES, Source, check_place, source_of
 
 __all__ = [
     "FILES",
     "Drawing",
+    "Source",
     "Story",
     "Table",
     "check_figure",
@@ -20,5 +21,6 @@ __all__ = [
     "diagnosis",
     "experiment",
     "markdown",
+    "source_of",
     "trace_figure",
 ]

@@ -4,88 +4,95 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..inference import next_step
-from ..inference.comparison import Check, Comparison, headline
+from ..inference.comparison import Check, Comparison, headline, others_of
 from ..inference.light_levels import Nuisance
 from . import _figures as figures
 from ._figures import BAND, COVERED, MEASURED, MODEL, WIDTH, WORST, Cells, Picture
-from ._frame import title_of, write
+from ._frame import Source, title_of, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PICTURES = 12  # of failing checks; the others stand in a table
-_ALIKE = 3  # of them of one statistic
+_PICTURES = 8  # of deviations; the others stand in a table
+_FOLDED = 3  # pictures of further checks of one deviation
+_OVERLAID = 4  # further captures in one picture
 _NEAREST = 3  # pictures where nothing fails
 _ACROSS = 8  # captures side by side in the table of all checks
 _MOST = 4000  # checks that are listed, so that the page stays small whatever is compared
 _LIGHTS = 24
 
 
-def comparison(found: Comparison, folder: Path) -> Path:
+def comparison(found: Comparison, folder: Path, source: Source | None = None) -> Path:
     """Write the page of a comparison as `index.html` in a folder, which is made if it is not there; its path.
 
     A page that an earlier comparison left there is replaced, whatever else lies there stays as it is. Raises SpadError
     as `check_place` does, or where the file cannot be written.
     """
-    return write(folder, "comparison", _TEMPLATE, _words(found))
+    return write(folder, "comparison", _TEMPLATE, _words(found), source)
 
 
 @dataclass(frozen=True)
 class _Card:
+    """A deviation, or a check that passes. check: the one that names it; more: the others; folded: their pictures."""
+
     check: Check
     title: str
     picture: Picture | None
+    more: Sequence[Check] = ()
+    also: str = ""
+    folded: Sequence[tuple[Check, Picture]] = ()
 
 
 def _words(found: Comparison) -> dict[str, Any]:
-    failing = found.failing
+    failing, groups = found.failing, found.deviations
     significant = {id(c) for c in found.checks if c.significant}
     immaterial = []
     if found.tolerance is not None:
         immaterial = [c for c in _clearest(found.checks) if c.passes and id(c) in significant]
     nearest = [c for c in _clearest(found.checks) if c.passes and c.summary is not None][:_NEAREST]
-    chosen = _chosen(failing) if failing else nearest
     captures = list(dict.fromkeys(c.capture for c in found.checks if c.capture is not None))
     listed = _clearest(found.checks)[:_MOST]
+    cards = [_card(group) for group in groups[:_PICTURES]] if groups else [_card([check]) for check in nearest]
     return {
         "found": found,
         "then": next_step.after_comparison(found),
         "headline": headline(found) if found.checks else "",
         "failing": failing,
-        "clearest": failing[0] if failing else None,
+        "groups": groups,
+        "clearest": found.worst if failing else None,
         "immaterial": immaterial,
         "captures": captures,
         "statistics": {c.statistic: title_of(c.statistic) for c in found.checks},
         "light": _light_picture(found.nuisances) if found.nuisances else None,
-        "cards": [_Card(c, title_of(c.statistic), _picture(c)) for c in chosen],
-        "others": [c for c in failing if id(c) not in {id(shown) for shown in chosen}],
+        "cards": cards,
+        "others": [c for group in groups[_PICTURES:] for c in group],
         "matrix": list(_matrix(listed, captures, significant)),
         "listed": listed,
         "judged": lambda check: _judged(check, significant),
     }
 
 
+def _card(group: Sequence[Check]) -> _Card:
+    """One card a deviation: its check with the other captures of that statistic overlaid, pictures of others folded."""
+    first = group[0]
+    alike = [c for c in group[1:] if c.statistic == first.statistic][:_OVERLAID]
+    folded: list[tuple[Check, Picture]] = []
+    for check in group[1:]:
+        if check.statistic not in {first.statistic, *(c.statistic for c, _ in folded)} and len(folded) < _FOLDED:
+            picture = _picture(check)
+            folded += [(check, picture)] if picture else []
+    return _Card(first, title_of(first.statistic), _picture(first, alike), group[1:], others_of(group), folded)
+
+
 def _clearest(checks: Iterable[Check]) -> list[Check]:
     return sorted(checks, key=lambda c: (c.p_value, -c.misfit))
-
-
-def _chosen(failing: Sequence[Check]) -> list[Check]:
-    """Which failing checks are shown: the clearest of every statistic first, then its others, a few of each."""
-    ranks: dict[str, int] = {}
-    order = []
-    for check in failing:
-        rank = ranks[check.statistic] = ranks.get(check.statistic, 0) + 1
-        if rank <= _ALIKE:
-            order.append((rank > 1, check))
-    taken = {id(check) for _, check in sorted(order, key=lambda item: item[0])[:_PICTURES]}
-    return [check for check in failing if id(check) in taken]
 
 
 def _judged(check: Check, significant: set[int]) -> str:
@@ -124,11 +131,14 @@ def check_figure(check: Check) -> Figure:
     return figures.figure_of(cells)
 
 
-def _picture(check: Check) -> Picture | None:
-    """Measured beside simulated, cell by cell, and how far they are apart."""
+def _picture(check: Check, alike: Sequence[Check] = ()) -> Picture | None:
+    """Measured and simulated, cell by cell, and the residuals; alike: of further captures, which are overlaid."""
     cells = _cells(check)
     words = f"{check.statistic} of {check.capture}: measured and simulated. Clearest at {check.where}: {check.size}"
-    return None if cells is None else figures.picture(cells, words)
+    if cells is None:
+        return None
+    others = [(str(other.capture), more) for other in alike if (more := _cells(other)) is not None]
+    return figures.picture(replace(cells, overlaid=tuple(others)), words)
 
 
 def _cells(check: Check) -> Cells | None:
@@ -137,7 +147,9 @@ def _cells(check: Check) -> Cells | None:
         return None
     spread = np.broadcast_to(figures.finite(judgement.spread), np.shape(summary.values))
     expected, residuals = figures.finite(judgement.expected), figures.finite(judgement.residuals)
-    return Cells(check.statistic, summary, expected, spread, residuals, int(judgement.worst))
+    return Cells(
+        check.statistic, summary, expected, spread, residuals, int(judgement.worst), name=str(check.capture or "")
+    )
 
 
 def _light_picture(nuisances: Sequence[Nuisance]) -> Picture:
@@ -200,10 +212,10 @@ _TEMPLATE = """\
 {% endfor %}
 </tbody></table></div>
 {% endmacro %}
-{% block title %}{{ found.sensor }} beside {{ found.measurement }}: {{ found.verdict }}{% endblock %}
+{% block title %}{{ found.sensor }} against {{ found.measurement }}: {{ found.verdict }}{% endblock %}
 {% block style %}
 .light img { width: 100%; height: auto; display: block; margin-top: .5rem; }
-.light { background: #fff; border: 1px solid #dfe2e4; padding: 8px 14px; margin: 0; break-inside: avoid; }
+.light { background: var(--card); border: 1px solid var(--line); padding: 8px 14px; margin: 0; break-inside: avoid; }
 .matrix { width: auto; table-layout: auto; }
 .matrix thead th { max-width: 9rem; min-width: 3.6rem; font-weight: 500; }
 .matrix td { text-align: center; white-space: nowrap; font-variant-numeric: tabular-nums; }
@@ -211,33 +223,77 @@ _TEMPLATE = """\
 .list th, .lights th, .lights td:not(:first-child) { white-space: nowrap; }
 .list td:nth-child(1) { min-width: 9em; } .list td:nth-child(2) { min-width: 6.5em; }
 .list td:nth-child(5) { min-width: 14em; } .list td:nth-child(6) { min-width: 16em; }
-td.small-one, .key.small-one { background: #f6e0ae; }
-td.low, .key.low { background: #faf3d3; }
-td.lowish, .key.lowish { background: #f3f6e4; }
+td.small-one, .key.small-one { background: var(--small); }
+td.low, .key.low { background: var(--low); }
+td.lowish, .key.lowish { background: var(--lowish); }
 {% endblock %}
 {% block kind %}Comparison of a model with a measurement{% endblock %}
 {% block body %}
 <section class="verdict {{ 'fails' if failing else 'adequate' }}">
 {% if failing %}
-<h1>The model fails {{ failing | length }} of {{ found.checks | length }} checks,</h1>
-<p class="lead">with a misfit of <b>{{ found.misfit | number }}</b> (95 % of its own recordings stay below \
-{{ found.misfit_null_95 | number }}), most clearly in <b>{{ clearest.statistic }}</b> of \
-<b>{{ clearest.capture or "all captures" }}</b>, {{ clearest.where }}: <b>{{ clearest.size }}</b> \
+<h1>The model fails {{ failing | length }} of {{ found.checks | length }} checks: {{ clearest.where }}, in \
+{{ clearest.capture or "all captures" }}: {{ clearest.size }}.</h1>
+<p class="lead">The misfit is <b>{{ found.misfit | number }}</b>; 95 % of the model's own recordings stay below \
+{{ found.misfit_null_95 | number }}. The checks show \
+{{ "one deviation" if groups | length == 1 else groups | length ~ " deviations" }}, most clearly \
+<b>{{ clearest.statistic }}</b> of <b>{{ clearest.capture or "all captures" }}</b> \
 ({{ clearest.p_value | p_words }}).</p>
 {% elif found.checks %}
 <h1>The model is adequate: none of {{ found.checks | length }} checks fails\
-{{ " beyond the tolerance" if immaterial }},</h1>
-<p class="lead">with a misfit of <b>{{ found.misfit | number }}</b> (95 % of its own recordings stay below \
-{{ found.misfit_null_95 | number }}){% if immaterial %}; {{ immaterial | length }} \
+{{ " beyond the tolerance" if immaterial }}.</h1>
+<p class="lead">The misfit is <b>{{ found.misfit | number }}</b>; 95 % of the model's own recordings stay below \
+{{ found.misfit_null_95 | number }}{% if immaterial %}; {{ immaterial | length }} \
 {{ "differs" if immaterial | length == 1 else "differ" }} by more than chance, but by less than \
 {{ found.tolerance | percent }}{% endif %}.</p>
 {% else %}
-<h1>Nothing could be checked,</h1>
-<p class="lead">for the measurement has neither data nor a light level that is known.</p>
+<h1>Nothing could be checked.</h1>
+<p class="lead">The measurement has neither data nor a light level that is known.</p>
 {% endif %}
-{% if found.checks and not failing %}<p class="small">Worst check: {{ headline }}.</p>{% endif %}
-<p class="next"><b>Next:</b> {{ then }}</p>
+{% if found.checks and not failing %}<p>Worst check: {{ headline }}.</p>{% endif %}
+<p class="next"><b>Next:</b> {{ source.then or then }}</p>
 </section>
+<!-- contents -->
+
+{% if failing %}
+<h2>Where it fails</h2>
+{% elif cards %}
+<h2>What came nearest to failing</h2>
+{% endif %}
+{% if cards %}
+<p class="small">Dots are measured; the blue line is the mean of the simulations, and the light blue band holds 95 % of
+their scatter. Residuals are the differences in units of that scatter (sigmas); those of further captures are coloured
+lines. A ring marks where the residual is largest.</p>
+{% endif %}
+{% for card in cards %}
+<section class="card">
+<h3>{% if groups | length > 1 %}{{ loop.index }}. {% endif %}\
+{{ card.check.where[:1] | upper }}{{ card.check.where[1:] }}: \
+<span class="size">{{ card.check.size }}</span></h3>
+<p class="tag"><b>{{ card.check.statistic }}</b> of <b>{{ card.check.capture or "all captures" }}</b> &middot; \
+{{ card.check.p_value | p_words }} &middot; misfit {{ card.check.misfit | number }} &middot; {{ card.title }}</p>
+{% if card.picture %}
+<div class="pan"><img src="{{ card.picture.source }}" alt="{{ card.picture.alternative }}"></div>
+{% if card.picture.note %}<p class="small">{{ card.picture.note }}</p>{% endif %}
+{% endif %}
+{% if card.more %}
+<p>The same deviation is in {{ card.also }}.</p>
+<details><summary>{{ card.more | length }} more {{ "check" if card.more | length == 1 else "checks" }}</summary>
+{{ table(card.more[:40]) }}
+{% for check, picture in card.folded %}
+<p class="tag"><b>{{ check.statistic }}</b> of <b>{{ check.capture or "all captures" }}</b></p>
+<div class="pan"><img src="{{ picture.source }}" alt="{{ picture.alternative }}"></div>
+{% endfor %}
+</details>
+{% endif %}
+</section>
+{% endfor %}
+{% if others %}
+<h3>{{ others | length }} more {{ "check fails" if others | length == 1 else "checks fail" }}</h3>
+{{ table(others[:20]) }}
+{% if others | length > 20 %}
+<p class="small">The {{ others | length - 20 }} others stand in the list of all checks.</p>
+{% endif %}
+{% endif %}
 
 <h2>What was compared</h2>
 <dl class="facts">
@@ -255,9 +311,9 @@ td.lowish, .key.lowish { background: #f3f6e4; }
 
 {% if light %}
 <h2>Light</h2>
-<p>How bright it was is known only so well, and so it is adjusted until the model gives as many detections as were
-measured: by the factors below. The pull tells whether they agree with what the measurement states.</p>
-<figure class="light"><img src="{{ light.source }}" alt="{{ light.alternative }}">
+<p>The light level has an uncertainty. It is fitted, so that the model gives as many detections as were measured. The
+pull is the deviation from the stated level in units of its uncertainty.</p>
+<figure class="light"><div class="pan"><img src="{{ light.source }}" alt="{{ light.alternative }}"></div>
 {% if light.note %}<figcaption class="small">{{ light.note }}</figcaption>{% endif %}</figure>
 <div class="wide"><table class="lights">
 <thead><tr><th>light of</th><th>factor on what is stated</th><th>95 % interval</th><th>pull</th></tr></thead>
@@ -267,37 +323,6 @@ measured: by the factors below. The pull tells whether they agree with what the 
 <td>{{ "%.4f" | format(n.low) }} to {{ "%.4f" | format(n.high) }}</td><td>{{ "%+.1f" | format(n.pull) }}</td></tr>
 {% endfor %}
 </tbody></table></div>
-{% endif %}
-
-{% if failing %}
-<h2>Where it fails, the clearest first</h2>
-{% elif cards %}
-<h2>What came nearest to failing</h2>
-{% endif %}
-{% if cards %}
-<p class="small">In the pictures, dots or a dark line are measured; the blue line is the mean of the simulations, and
-the light blue band holds 95 % of their own scatter. Residuals are the differences in units of that scatter (sigmas).
-A ring marks where the difference is clearest. Numbers may be transformed so that their scatter is even; the size
-in words is physical.</p>
-{% endif %}
-{% for card in cards %}
-<section class="card">
-<h3>{{ card.title }}</h3>
-<p class="tag"><b>{{ card.check.statistic }}</b> of <b>{{ card.check.capture or "all captures" }}</b> &middot; \
-{{ card.check.p_value | p_words }} &middot; misfit {{ card.check.misfit | number }}</p>
-<p>{{ card.check.where[:1] | upper }}{{ card.check.where[1:] }}: <span class="size">{{ card.check.size }}</span></p>
-{% if card.picture %}
-<img src="{{ card.picture.source }}" alt="{{ card.picture.alternative }}">
-{% if card.picture.note %}<p class="small">{{ card.picture.note }}</p>{% endif %}
-{% endif %}
-</section>
-{% endfor %}
-{% if others %}
-<h3>{{ others | length }} more {{ "check fails" if others | length == 1 else "checks fail" }}</h3>
-{{ table(others[:20]) }}
-{% if others | length > 20 %}
-<p class="small">The {{ others | length - 20 }} others stand in the list of all checks.</p>
-{% endif %}
 {% endif %}
 
 {% if immaterial %}
@@ -330,24 +355,31 @@ In {{ found.checks | length }} checks of a right model chance alone leaves about
 {% endfor %}
 
 <h2>All checks, the clearest first</h2>
+<details><summary>{{ listed | length }} checks</summary>
 {% if listed | length < found.checks | length %}
 <p class="small">The {{ listed | length }} clearest of {{ found.checks | length }}; --json FILE holds all.</p>
 {% endif %}
 {{ table(listed) }}
+</details>
 
 <h2>What each statistic looks at</h2>
+<details><summary>{{ statistics | length }} statistics</summary>
 <dl class="words">
 {% for name, title in statistics.items() %}
 <dt>{{ name }}</dt><dd>{{ title }}</dd>
 {% endfor %}
 </dl>
+</details>
 {% endif %}
 
 <h2>Words</h2>
+<details><summary>What the words mean</summary>
 <dl class="words">
 <dt>model</dt><dd>The sensor as its file describes it, with the effects that are listed there and no others.</dd>
 <dt>check</dt><dd>One statistic of one capture: the same numbers are computed from the measured data and from many
-simulations of that capture, and set side by side.</dd>
+simulations of that capture, and compared.</dd>
+<dt>deviation</dt><dd>Failing checks that show the same difference between data and model: a sum over cells deviates
+where the cells do. It is named by its most specific check.</dd>
 <dt>residual, sigma</dt><dd>The difference between measured and simulated, divided by the scatter (standard deviation)
 that the simulations show among themselves. Within 2 sigmas lie 95 of 100 numbers if the model is right.</dd>
 <dt>misfit</dt><dd>The mean squared residual. 1 is what the model's own simulations have; 4 means that data and model
@@ -359,8 +391,9 @@ so a check fails only if its p-value stays small after that is allowed for.</dd>
 p-value only tells whether it is there.</dd>
 <dt>pull</dt><dd>By how many of its own uncertainties a quantity, here the light, had to be moved from what is stated.
 Beyond 3, what is stated should be doubted.</dd>
-<dt>tolerance</dt><dd>What you said is too small to matter (--tolerance). A difference that is real but smaller is told,
-and does not count as a failure.</dd>
+<dt>tolerance</dt><dd>What is too small to matter (--tolerance). A smaller difference is listed, and does not count as a
+failure.</dd>
 </dl>
+</details>
 {% endblock %}
 """

@@ -1,4 +1,4 @@
-"""The page of `diagnose`: what is missing, and the ladder of errors from the first model to the last."""
+"""The page of `diagnose` and `fit`: what is missing, the residuals before and after, the error of each model."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +18,13 @@ from ..inference.comparison import headline
 from ..inference.results import Diagnosis, Step, Trace, Value
 from . import _figures as figures
 from ._figures import MEASURED, ROUGH, Cells, Picture
-from ._frame import number, title_of, write
+from ._frame import Source, number, title_of, write
+from ._pixels import OddPixels, odd_pixels_of, write_list
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BROAD, _NARROW = 5.9, 3.8  # inches; the ladder beside its table, and on a telephone
+_BROAD, _NARROW = 5.9, 3.8  # inches; the ladder on a broad page, and on a telephone
 _FLOOR, _REACHED, _ABOVE, _PLACEBO = "#e3efe6", "#3f7f57", "#c8584c", "#bcc2c6"
 _LINE = 14  # letters of a name below a bar
 _LETTER = 0.078  # inches that one takes
@@ -58,13 +59,18 @@ _OF_A_MAP = {
 }
 
 
-def diagnosis(found: Diagnosis, folder: Path) -> Path:
-    """Write the page of a diagnosis as `report.html` in a folder, which is made if it is not there; its path.
+def diagnosis(found: Diagnosis, folder: Path, source: Source | None = None) -> Path:
+    """Write the page of a diagnosis or a fit as `report.html` in a folder, made if it is not there; its path.
 
-    A page that an earlier diagnosis left there is replaced, whatever else lies there stays as it is. Raises SpadError
-    as `check_place` does, or where the file cannot be written.
+    The odd pixels of each map are listed in a CSV file in the same folder. A page that an earlier diagnosis left there
+    is replaced, whatever else lies there stays as it is. Raises SpadError as `check_place` does, or where the file
+    cannot be written.
     """
-    return write(folder, "diagnosis", _TEMPLATE, _words(found))
+    maps = {k: odd for k, step in enumerate(found.steps) if (odd := odd_pixels_of(found, step)) is not None}
+    page = write(folder, "diagnosis", _TEMPLATE, _words(found, maps), source)
+    for odd in maps.values():
+        write_list(odd, folder)
+    return page
 
 
 # --- words ----------------------------------------------------------------------------------------------------------
@@ -79,25 +85,41 @@ class _Number:
 
 
 @dataclass(frozen=True)
+class _Picture:
+    """A deviation of the first model. trace: the check that names it; alike: the same in other captures."""
+
+    trace: Trace
+    title: str
+    before: float
+    after: float
+    picture: Picture | None
+    alike: Sequence[Trace] = ()
+
+
+@dataclass(frozen=True)
 class _Card:
-    """A step, or a check: what stands above and below its picture."""
+    """A step: what stands above and below its pictures."""
 
     title: str
-    step: Step | None = None
-    kind: str = ""
-    about: str = ""
-    numbers: Sequence[_Number] = ()
-    trace: Trace | None = None
-    picture: Picture | None = None
-    before: float = 0.0
-    after: float = 0.0
+    step: Step
+    kind: str
+    about: str
+    numbers: Sequence[_Number]
+    pictures: Sequence[_Picture] = ()
+    odd: OddPixels | None = None
 
 
-def _words(found: Diagnosis) -> dict[str, Any]:
+def _words(found: Diagnosis, maps: Mapping[int, OddPixels]) -> dict[str, Any]:
     word, look = _VERDICTS.get(found.verdict, (found.verdict, "open"))
     ladder = sorted(found.ladder, key=lambda row: bool(row["placebo"]))
+    pictures = [_pictured(group) for group in _groups(found.traces)]
+    steps = [
+        replace(_step(step), pictures=[one for one in pictures if one.trace.step == k], odd=maps.get(k))
+        for k, step in enumerate(found.steps)
+    ]
     return {
         "found": found,
+        "kind": "Fit of a model" if found.asked == "fit" else "Diagnosis of a model",
         "verdict": word,
         "look": look,
         "sentence": results.sentence(found),
@@ -108,9 +130,10 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "broad": _ladder_picture(ladder, found.null_95, _BROAD) if ladder else None,
         "narrow": _ladder_picture(ladder, found.null_95, _NARROW) if ladder else None,
         "columns": _COLUMNS,
+        "error": results.error_of,
         "fallen": _fallen(found),
-        "steps": [_step(step) for step in found.steps],
-        "traces": [_checked(trace) for trace in found.traces],
+        "steps": steps,
+        "others": [one for one in pictures if one.trace.step is None],
         "remains": found.unexplained[:_MOST],
         "titles": {str(r["statistic"]): title_of(str(r["statistic"])) for r in found.unexplained},
         "mechanism": results.mechanism(found.unexplained, found.dark) if found.unexplained else "",
@@ -120,6 +143,14 @@ def _words(found: Diagnosis) -> dict[str, Any]:
         "named": results.named,
         "about": _about,
     }
+
+
+def _groups(traces: Sequence[Trace]) -> list[list[Trace]]:
+    """The traces of one deviation together, the one that names it first."""
+    by_number: dict[int, list[Trace]] = {}
+    for trace in traces:
+        by_number.setdefault(trace.deviation, []).append(trace)
+    return [sorted(some, key=lambda trace: not trace.first) for some in by_number.values()]
 
 
 def _fallen(found: Diagnosis) -> tuple[str, float, float] | None:
@@ -221,19 +252,22 @@ def _cells(trace: Trace) -> Cells:
     return Cells(trace.statistic, trace.summary, after, spread, now, worst, before, earlier)
 
 
-def _checked(trace: Trace) -> _Card:
-    earlier, now = _residuals(trace)
+def _pictured(traces: Sequence[Trace]) -> _Picture:
+    """The picture of a deviation: the check that names it, with the residuals before of other captures."""
+    first = traces[0]
+    earlier, now = _residuals(first)
     picture = None
     if now.size:
-        words = f"{trace.statistic} of {trace.capture}: measured, model before, model after"
-        picture = figures.picture(_cells(trace), words)
+        words = f"{first.statistic} of {first.capture}: measured, model before, model after"
+        others = tuple((trace.capture, _cells(trace)) for trace in traces[1:])
+        picture = figures.picture(replace(_cells(first), overlaid=others, name=first.capture), words)
     squares = [float(np.mean(z**2)) if z.size else 0.0 for z in (earlier, now)]
-    return _Card(title_of(trace.statistic), trace=trace, picture=picture, before=squares[0], after=squares[1])
+    return _Picture(first, title_of(first.statistic), squares[0], squares[1], picture, traces[1:])
 
 
 def _ladder_picture(rows: Sequence[Mapping[str, Any]], floor: float, width: float) -> Picture:
     words = ", ".join(f"{row['model']}: {number(row['misfit'])}" for row in rows)
-    words = f"The ladder of errors: misfit of each model. {words}; noise floor: {number(floor)}"
+    words = f"The ladder of errors: misfit of each model on held-out data. {words}; noise floor: {number(floor)}"
     return Picture(figures.drawn(_draw_ladder, rows, floor, width), words)
 
 
@@ -293,7 +327,7 @@ def _draw_ladder(figure: Figure, rows: Sequence[Mapping[str, Any]], floor: float
         turned = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
     axes.set_xticks(x, names, **turned)
     axes.tick_params(axis="x", length=0, labelcolor=MEASURED)
-    axes.set_ylabel("misfit")
+    axes.set_ylabel("misfit on held-out data")
     figures.powers(axes.yaxis)
 
 
@@ -311,98 +345,77 @@ def _broken(name: str) -> str:
 
 _TEMPLATE = """\
 {% extends "frame" %}
-{% block title %}{{ found.sensor }} beside {{ found.measurement }}: {{ verdict | lower }}{% endblock %}
-{% block kind %}Diagnosis of a model by a measurement{% endblock %}
+{% macro pictured(one) %}
+<p><b>{{ one.trace.where[:1] | upper }}{{ one.trace.where[1:] }}</b>\
+{% if one.trace.size %}: <span class="size">{{ one.trace.size }}</span>{% endif %}</p>
+<p class="tag"><b>{{ one.trace.statistic }}</b> of <b>{{ one.trace.capture or "all captures" }}</b> &middot; \
+{{ one.title }} &middot; mean squared residual {{ one.before | number }} before, <b>{{ one.after | number }}</b> after\
+{% if one.alike %} &middot; also in {{ one.alike | map(attribute="capture") | join(", ") }}{% endif %}</p>
+{% if one.picture %}
+<div class="pan"><img src="{{ one.picture.source }}" alt="{{ one.picture.alternative }}"></div>
+{% if one.picture.note %}<p class="small">{{ one.picture.note }}</p>{% endif %}
+{% endif %}
+{% endmacro %}
+{% block title %}{{ found.sensor }} against {{ found.measurement }}: {{ verdict | lower }}{% endblock %}
+{% block kind %}{{ kind }} with a measurement{% endblock %}
 {% block style %}
 main { max-width: 1160px; }
-.verdict.open { border-left-color: #d98a1f; }
-.ladder { display: grid; grid-template-columns: minmax(0, 10fr) minmax(0, 11fr); gap: 20px; align-items: start; }
-.ladder figure { background: #fff; border: 1px solid #dfe2e4; padding: 10px 12px; margin: 0; }
+.verdict.open { border-left-color: var(--open); }
+.ladder { display: grid; grid-template-columns: minmax(0, 9fr) minmax(0, 12fr); gap: 20px; align-items: start; }
+.ladder figure { background: var(--card); border: 1px solid var(--line); padding: 10px 12px; margin: 0; }
 .ladder img { width: 100%; height: auto; display: block; }
 .ladder .narrow { display: none; }
 .rungs td:not(:first-child), .rungs th:not(:first-child) { text-align: right; font-variant-numeric: tabular-nums; }
 .rungs td:first-child { min-width: 8.5em; overflow-wrap: break-word; }
 .rungs th { overflow-wrap: normal; padding: 3px 5px; } .rungs td:not(:first-child) { white-space: nowrap; }
-.rungs .placebo td { color: #77818a; }
-.rungs .floor td { border-top: 2px dashed #4b8b62; color: #3d7350; }
+.rungs .placebo td { color: var(--soft); }
+.rungs .floor td { border-top: 2px dashed var(--good); color: var(--good); }
 .list th { overflow-wrap: normal; }
 .list td:first-child { min-width: 9em; overflow-wrap: break-word; } .remains td:last-child { min-width: 10em; }
 .list .figure { white-space: nowrap; font-variant-numeric: tabular-nums; }
 .chosen td { font-weight: 600; }
-.beside { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
-.fall { font-size: 1.5rem; font-weight: 650; font-variant-numeric: tabular-nums; }
+.pair { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
 @media (max-width: 1180px) { .ladder { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
-@media (max-width: 900px) { .beside { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
-@media (max-width: 600px) {
-  main { padding: 16px 12px 40px; }
-  h1 { font-size: 1.35rem; }
-  .ladder .narrow { display: block; } .ladder .broad { display: none; }
-  .facts { grid-template-columns: 1fr; } .facts dd { margin-bottom: .4rem; }
-  .card { padding: 12px 12px 8px; }
-  .pan { overflow-x: auto; } .pan img { min-width: 620px; }
-}
+@media (max-width: 900px) { .pair { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
+@media (max-width: 600px) { .ladder .narrow { display: block; } .ladder .broad { display: none; } }
 {% endblock %}
 {% block body %}
 <section class="verdict {{ look }}">
 <h1>{{ verdict }}: {{ sentence }}</h1>
 <p class="lead">{% if found.steps %}\
-The misfit {{ "fell" if found.after < found.before else "went" }} from <b>{{ found.before | number }}</b> to \
-<b>{{ found.after | number }}</b>{% else %}The misfit is <b>{{ found.before | number }}</b>{% endif %}; \
-chance alone leaves a right model below {{ found.null_95 | number }} in 95 of 100 measurements.\
-{% if fallen %} It was there before, for it knows no totals: the error of the {{ fallen[0] }} fell from \
+The misfit on held-out data {{ "fell" if found.after < found.before else "went" }} from \
+<b>{{ found.before | number }}</b> to <b>{{ found.after | number }}</b>\
+{% else %}The misfit is <b>{{ found.before | number }}</b>{% endif %}; \
+a right model stays below {{ found.null_95 | number }} in 95 of 100 measurements.\
+{% if fallen %} The misfit does not contain the totals: the error of the {{ fallen[0] }} fell from \
 <b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.\
 {% elif found.steps and found.before <= found.null_95 %} It was as low before: a mean over everything hardly \
-shows what is faint in each statistic, or what only a few of them tell.{% endif %}</p>
+shows what is faint in each statistic, or what only a few of them show.{% endif %}</p>
+{% if headline %}<p>In sample, the misfit is {{ found.in_sample.misfit | number }}; worst check: \
+{{ headline }}.</p>{% endif %}
 <p class="small">{{ found.sensor or "A sensor without a name" }}\
 {% if found.crop %}, its rows and columns {{ found.crop }} (places count from the first of them),{% endif %} \
-beside {{ found.measurement }}\
-{% if next %} &middot; {{ "the next model lies" if found.steps else "the same model, for nothing was added, lies" }} \
-beside this page: <b>{{ next }}</b>{% endif %}\
+against {{ found.measurement }}\
+{% if next %} &middot; the {{ "next" if found.steps else "same" }} model is in the file <b>{{ next }}</b>\
+{% if not found.steps %} (nothing was added){% endif %}{% endif %}\
 {% if found.unwritten %} &middot; the next sensor file was not written: {{ found.unwritten }}{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
-{% if headline %}<p class="small">In sample, the misfit is {{ found.in_sample.misfit | number }}; worst check: \
-{{ headline }}.</p>{% endif %}
-<p class="next"><b>Next:</b> {{ then }}</p>
+<p class="next"><b>Next:</b> {{ source.then or then }}</p>
 </section>
-
-{% if ladder %}
-<h2>The ladder of errors</h2>
-<div class="ladder">
-<figure><img class="broad" src="{{ broad.source }}" alt="{{ broad.alternative }}">\
-<img class="narrow" src="{{ narrow.source }}" alt="{{ narrow.alternative }}"></figure>
-<div class="wide"><table class="rungs">
-<thead><tr><th>model</th><th>misfit</th>\
-{% for label in columns.values() %}<th>{{ label }}, %</th>{% endfor %}</tr></thead>
-<tbody>
-{% for row in ladder %}
-<tr{% if row.placebo %} class="placebo"{% endif %}><td>{{ row.model }}</td>\
-<td{% if row.misfit <= found.null_95 and not row.placebo %} class="passes"{% endif %}>{{ row.misfit | number }}</td>\
-{% for key in columns %}<td>{{ "%.3f" | format(100 * row.errors.get(key, 0.0)) }}</td>{% endfor %}</tr>
-{% endfor %}
-<tr class="floor"><td>noise floor (95 %)</td><td>{{ found.null_95 | number }}</td>\
-{% for key in columns %}<td></td>{% endfor %}</tr>
-</tbody></table>
-</div>
-</div>
-<p class="small">The misfit is the mean squared difference between data and model in units of the model's own scatter,
-on data that the model was not settled by: each capture is judged by what the others settle, and where one alone tells
-a number or a map, it is cut into alternating blocks of time, and each half is judged by what the other settles (a
-misfit of half as many detections is about half as large); what was tried in its place below is judged by whole
-captures. It can hardly fall below 1. A bar that reaches the dashed
-line is as good as a right model.{% for row in ladder if row.placebo %} The placebo is an effect that has nothing to do
-with it, at the strength that suits it best: that much falls whatever is added.{% endfor %} The columns say what is
-still wrong, in physical units.</p>
-{% endif %}
+<!-- contents -->
 
 {% if steps %}
-<h2>What is missing</h2>
+<h2>{{ "What was fitted" if found.asked == "fit" else "What is missing" }}</h2>
+<p class="small">In the pictures, dots are measured, orange is the model before all steps, blue the model after them;
+the light blue band holds 95 % of its scatter. Below, or to the right, are the residuals of both models in units of
+that scatter (sigmas); coloured lines are the residuals before of further captures. A ring marks the clearest place.</p>
 {% for card in steps %}
 <section class="card">
 <h3>{{ loop.index }}. {{ card.title }}</h3>
 <p class="tag">{{ card.kind }} &middot; <b>{{ "%.1f" | format(card.step.significance) }} sigma</b> &middot; \
-<b>{{ card.step.material }}</b> &middot; misfit with it <b>{{ card.step.misfit | number }}</b></p>
+<b>{{ card.step.material }}</b> &middot; misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 {% if card.about %}<p>{{ card.about }}</p>{% endif %}
-<div class="beside">
+<div class="pair">
 {% if card.numbers %}
 <div class="wide"><table class="list">
 <thead><tr><th>parameter</th><th>value, 95 % interval</th></tr></thead>
@@ -416,7 +429,7 @@ still wrong, in physical units.</p>
 {% endif %}
 {% if card.step.alternatives %}
 <div class="wide"><table class="list">
-<thead><tr><th>tried in its place</th><th>misfit that it leaves</th></tr></thead>
+<thead><tr><th>alternative</th><th>misfit with it</th></tr></thead>
 <tbody>
 <tr class="chosen"><td>{{ card.title }} (chosen)</td><td class="figure">{{ card.step.misfit | number }}</td></tr>
 {% for other in card.step.alternatives %}
@@ -427,8 +440,52 @@ still wrong, in physical units.</p>
 </tbody></table></div>
 {% endif %}
 </div>
+{% if card.odd %}
+<div class="pan"><img src="{{ card.odd.picture.source }}" alt="{{ card.odd.picture.alternative }}"></div>
+<p>{{ card.odd.sentence }} <a href="{{ card.odd.file }}">{{ card.odd.file }}</a> lists them.</p>
+{% if card.odd.rows %}
+<details><summary>{{ card.odd.rows | length }} odd pixels\
+{% if card.odd.number > card.odd.rows | length %} of {{ card.odd.number }}{% endif %}</summary>
+<div class="wide"><table class="list">
+<thead><tr><th>pixel</th><th>value</th><th>relative to the median</th><th>kind</th></tr></thead>
+<tbody>
+{% for row in card.odd.rows %}
+<tr><td>{{ row.where }}</td><td class="figure">{{ row.value }}</td>\
+<td class="figure">{{ row.ratio | number }}</td><td>{{ row.kind }}</td></tr>
+{% endfor %}
+</tbody></table></div>
+</details>
+{% endif %}
+{% endif %}
+{% for one in card.pictures[:1] %}
+{{ pictured(one) }}
+{% endfor %}
+{% if card.pictures | length > 1 %}
+<details><summary>{{ card.pictures | length - 1 }} more \
+{{ "deviation" if card.pictures | length == 2 else "deviations" }}</summary>
+{% for one in card.pictures[1:] %}
+{{ pictured(one) }}
+{% endfor %}
+</details>
+{% endif %}
 </section>
 {% endfor %}
+{% endif %}
+
+{% if remains %}
+<h2>What remains</h2>
+<p>{{ mechanism[:1] | upper }}{{ mechanism[1:] }}.</p>
+<div class="wide"><table class="list remains">
+<thead><tr><th>statistic</th><th>capture</th><th>significance</th><th>clearest place and size</th></tr></thead>
+<tbody>
+{% for entry in remains %}
+<tr><td><b>{{ entry.statistic }}</b>\
+{% if loop.changed(entry.statistic) %}<br><span class="small">{{ titles[entry.statistic] }}</span>{% endif %}</td>\
+<td>{{ entry.capture or "all" }}</td>\
+<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td><td>{{ entry.where }}\
+{% if entry.get('size') %}: <b>{{ entry['size'] }}</b>{% endif %}</td></tr>
+{% endfor %}
+</tbody></table></div>
 {% endif %}
 
 {% if found.setup or found.nuisances %}
@@ -444,12 +501,12 @@ still wrong, in physical units.</p>
 {% endfor %}
 </tbody></table></div>
 {% if found.setup | selectattr("confused") | list %}
-<p class="small">Those that begin with "or" cannot be told apart by this measurement: any of them is enough.</p>
+<p class="small">This measurement cannot separate those that begin with "or": any of them is enough.</p>
 {% endif %}
 {% endif %}
 {% if found.nuisances %}
-<p class="small">How bright it was is known only so well, and so it is adjusted; the pull tells by how many of its own
-uncertainties. Beyond 3, what is stated should be doubted.</p>
+<p class="small">The light level has an uncertainty and is fitted. The pull is its deviation from the stated level in
+units of that uncertainty; beyond 3, the stated level should be doubted.</p>
 <div class="wide"><table class="list">
 <thead><tr><th>light of</th><th>factor on what is stated</th><th>95 % interval</th><th>pull</th></tr></thead>
 <tbody>
@@ -462,53 +519,57 @@ uncertainties. Beyond 3, what is stated should be doubted.</p>
 {% endif %}
 {% endif %}
 
-{% if traces %}
-<h2>The clearest checks, before and after</h2>
-<p class="small">Dark dots or a dark line are measured, orange is the model as it was, blue the model as it is now; the
-light blue band holds 95 % of its own scatter. Below, or to the right: how far both models are from the data, in units
-of their own scatter. A ring marks where the first model failed most clearly.</p>
-{% for card in traces %}
-<section class="card">
-<h3>{{ card.title }}</h3>
-<p class="tag"><b>{{ card.trace.statistic }}</b> of <b>{{ card.trace.capture or "all captures" }}</b> &middot; mean \
-squared residual {{ card.before | number }} before, <b>{{ card.after | number }}</b> after</p>
-{% if card.picture %}
-<div class="pan"><img src="{{ card.picture.source }}" alt="{{ card.picture.alternative }}"></div>
-{% if card.picture.note %}<p class="small">{{ card.picture.note }}</p>{% endif %}
-{% endif %}
-</section>
-{% endfor %}
-{% endif %}
-
-{% if remains %}
-<h2>What remains</h2>
-<p>What it is like: {{ mechanism }}.</p>
-<div class="wide"><table class="list remains">
-<thead><tr><th>statistic</th><th>capture</th><th>significance</th><th>where it is clearest</th></tr></thead>
-<tbody>
-{% for entry in remains %}
-<tr><td><b>{{ entry.statistic }}</b>\
-{% if loop.changed(entry.statistic) %}<br><span class="small">{{ titles[entry.statistic] }}</span>{% endif %}</td>\
-<td>{{ entry.capture or "all" }}</td>\
-<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td><td>{{ entry.where }}</td></tr>
-{% endfor %}
-</tbody></table></div>
-{% endif %}
-
 {% if found.advice %}
 <h2>What to measure next</h2>
 {% for one in found.advice %}
 <section class="card">
-<h3>To tell {{ one.separates | join(" from ") }}: take {{ one.capture }}</h3>
-<p class="tag">They are <b>{{ "%.1f" | format(one.significance_now) }} sigma</b> apart now, and would be \
-<b>{{ "%.1f" | format(one.significance_then) }} sigma</b> apart with it.</p>
+<h3>To separate {{ one.separates | join(" from ") }}: take {{ one.capture }}</h3>
+<p class="tag">They differ by <b>{{ "%.1f" | format(one.significance_now) }} sigma</b> now, and would differ by \
+<b>{{ "%.1f" | format(one.significance_then) }} sigma</b> with it.</p>
+</section>
+{% endfor %}
+{% endif %}
+
+{% if ladder %}
+<h2>The ladder of errors</h2>
+<div class="ladder">
+<figure><img class="broad" src="{{ broad.source }}" alt="{{ broad.alternative }}">\
+<img class="narrow" src="{{ narrow.source }}" alt="{{ narrow.alternative }}"></figure>
+<div class="wide"><table class="rungs">
+<thead><tr><th>model</th><th>misfit on held-out data</th>\
+{% for label in columns.values() %}<th>{{ label }}, %</th>{% endfor %}</tr></thead>
+<tbody>
+{% for row in ladder %}
+<tr{% if row.placebo %} class="placebo"{% endif %}><td>{{ row.model }}</td>\
+<td{% if row.misfit <= found.null_95 and not row.placebo %} class="passes"{% endif %}>{{ row.misfit | number }}</td>\
+{% for key in columns %}<td>{{ error(row, key) }}</td>{% endfor %}</tr>
+{% endfor %}
+<tr class="floor"><td>noise floor (95 %)</td><td>{{ found.null_95 | number }}</td>\
+{% for key in columns %}<td></td>{% endfor %}</tr>
+</tbody></table>
+</div>
+</div>
+<p class="small">The misfit is the mean squared residual on data that the model was not fitted to. Each capture is
+judged by parameters fitted to the others. Where one capture alone informs a parameter or a map, it is cut into
+alternating blocks of time, and each half is judged by the fit of the other (a misfit of half as many detections is
+about half as large); alternatives are judged by whole captures. A bar that reaches the dashed line is as good as a
+right model.{% for row in ladder if row.placebo %} The placebo is an unrelated effect at its best strength: as much
+falls whatever is added.{% endfor %} The columns are the errors that are left, in physical units; "-" was not
+measured.</p>
+{% endif %}
+
+{% if others %}
+<h2>Further deviations</h2>
+{% for one in others %}
+<section class="card">
+{{ pictured(one) }}
 </section>
 {% endfor %}
 {% endif %}
 
 {% if limits %}
 <h2>What is not there</h2>
-<p class="small">Had any of these been stronger than this, it would have been seen (95 % upper limits).</p>
+<details><summary>95 % upper limits of {{ limits | length }} parameters</summary>
 <div class="wide"><table class="list">
 <thead><tr><th>effect</th><th>parameter</th><th>at most</th></tr></thead>
 <tbody>
@@ -518,6 +579,7 @@ squared residual {{ card.before | number }} before, <b>{{ card.after | number }}
 <td class="figure"><b>{{ limit }}</b></td></tr>
 {% endfor %}
 </tbody></table></div>
+</details>
 {% endif %}
 
 {% if found.untried %}
@@ -534,29 +596,33 @@ squared residual {{ card.before | number }} before, <b>{{ card.after | number }}
 
 {% if hidden %}
 <h2>What this measurement cannot show</h2>
+<details><summary>{{ hidden | length }} effects</summary>
 <dl class="words">
 {% for effect, meaning in hidden %}
 <dt>{{ effect }}</dt><dd>{{ meaning }}</dd>
 {% endfor %}
 </dl>
+</details>
 {% endif %}
 
 <h2>Words</h2>
+<details><summary>What the words mean</summary>
 <dl class="words">
-<dt>misfit</dt><dd>The mean, over all statistics of all captures, of the squared difference between data and model in
-units of the model's own scatter. 1 is what the model's own simulations have; 4 means that data and model are typically
-twice as far apart as chance makes them.</dd>
+<dt>residual, sigma</dt><dd>The difference between data and model in units of the model's scatter. Of a step, sigma is
+its significance, with the number of candidates allowed for.</dd>
+<dt>misfit</dt><dd>The mean squared residual over all statistics of all captures. 1 is what the model's own simulations
+have; 4 means that data and model are typically twice as far apart as chance makes them. On held-out data: the model
+was fitted to other data. In sample: to the same.</dd>
 <dt>noise floor</dt><dd>95 of 100 measurements of a right model have a misfit below this.</dd>
-<dt>mean rate, map, linearity, intervals, neighbours</dt><dd>What is still wrong in physical units: the rates of the
-captures; the rate of a typical pixel; the largest deviation of one light level from the others; the share of intervals
-between detections that stand elsewhere; the share of detections whose neighbours fire too often or too seldom.</dd>
-<dt>sigma</dt><dd>One standard deviation of what chance does. Of a step: how unlikely it is that chance alone makes its
-effect look so helpful, with all that was tried allowed for.</dd>
-<dt>95 % interval</dt><dd>The range of values that the data bear with, if the model found is right. Where checks still
-fail, or another law is at work than the model's, the truth may lie outside.</dd>
-<dt>placebo</dt><dd>An effect that has nothing to do with it, added all the same: that much falls by itself.</dd>
+<dt>mean rate, map, linearity, intervals, neighbours</dt><dd>Errors in physical units: the rms error of the captures'
+rates; of the pixels' rates; the largest deviation of one light level from the others; the share of intervals between
+detections in wrong cells; the share of detections whose neighbours fire too often or too seldom.</dd>
+<dt>95 % interval</dt><dd>It contains the true value in 95 of 100 measurements if the fitted model is right. Where
+checks still fail, or another law is at work, the true value may lie outside.</dd>
+<dt>placebo</dt><dd>An unrelated effect, fitted all the same: as much falls by itself.</dd>
 <dt>set-up</dt><dd>Light level, exposure, wavelength, a leak in a dark capture: what the measurement states of itself.
-Where it explains everything, the sensor is not to blame.</dd>
+Where it explains everything, the sensor is right.</dd>
 </dl>
+</details>
 {% endblock %}
 """

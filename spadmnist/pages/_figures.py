@@ -1,4 +1,4 @@
-"""The pictures of pages: what was measured beside what a model expects, as images that a page holds in itself."""
+"""The pictures of pages: the measured data and what a model expects, as images that a page holds in itself."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import re
 import textwrap
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,11 +27,14 @@ WIDTH = 9.6  # inches; a page is as wide
 _DPI = 150
 MEASURED, MODEL, BAND, WORST = "#1d2329", "#2f6ea5", "#bcd6ec", "#c0392b"
 BEFORE = "#d98a1f"  # an earlier model
+OTHERS = ("#7a5ea8", "#3b8a7a", "#a8577e", "#7d7433")  # further captures
 ROUGH, SMOOTH = "#5b6670", "#e3e6e8"
-_FEW_CELLS = 40  # without an axis, up to here each with its own words
+_FEW_CELLS = 400  # without an axis, up to here each with its own words
 _POINTS = 150  # more cells are drawn as steps
-_VECTOR = 400  # more cells are drawn in points of the screen
-_STEPS = 1500  # still more are a cloud of dots
+_ZOOMED = 70  # more cells are drawn about the clearest one, with all residuals in a strip below
+_SIDE = 25  # cells to either side of the clearest one
+_NAMES = 16  # cells with words of their own, about the clearest one
+_VECTOR = 1500  # more cells are drawn in points of the screen
 _DRAWN = 100_000
 _LARGEST_MAP = 192
 _NOTHING = -1e3  # the logarithm of none measured: beyond every scale
@@ -43,6 +46,7 @@ _STYLE: Any = {
     "svg.hashsalt": "spadmnist",
     "text.parse_math": False,
     "font.size": 9.5,
+    "axes.facecolor": "none",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": ROUGH,
@@ -59,7 +63,7 @@ _STYLE: Any = {
 
 @dataclass(frozen=True)
 class Picture:
-    """source: a data URI; note: what a reader needs to know beside the general words on pictures."""
+    """source: a data URI; note: what a reader needs to know in addition to the general words on pictures."""
 
     source: str
     alternative: str
@@ -68,9 +72,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Cells:
-    """A summary beside what a model expects: (cells,) each, finite. worst: the clearest cell.
+    """A summary and what a model expects: (cells,) each, finite. worst: the clearest cell.
 
-    before, earlier: what an earlier model expected, and its residuals, where two models are set side by side.
+    before, earlier: what an earlier model expected, and its residuals, where two models are compared.
+    overlaid: the same statistic of further captures, of which the residuals are drawn, by name.
     """
 
     statistic: str
@@ -81,6 +86,13 @@ class Cells:
     worst: int
     before: np.ndarray | None = None
     earlier: np.ndarray | None = None
+    overlaid: tuple[tuple[str, Cells], ...] = ()
+    name: str = ""  # of the capture
+
+    @property
+    def clearest(self) -> np.ndarray:
+        """(cells,) residuals of the first model."""
+        return self.residuals if self.earlier is None else self.earlier
 
     @property
     def measured(self) -> np.ndarray:
@@ -111,7 +123,7 @@ def drawn(draw: Any, *arguments: Any, raster: bool = False) -> str:
         warnings.simplefilter("ignore")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
-        figure = Figure(dpi=_DPI, facecolor="white")
+        figure = Figure(dpi=_DPI, facecolor="none")  # the page is behind it, light or dark
         draw(figure, *arguments)
         if raster:
             FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None, "Creation Time": None})
@@ -122,14 +134,17 @@ def drawn(draw: Any, *arguments: Any, raster: bool = False) -> str:
 
 
 def picture(cells: Cells, words: str) -> Picture:
-    """Measured beside simulated, cell by cell, and how far they are apart; words: for who cannot see it."""
+    """Measured and simulated, cell by cell, and the residuals; words: for who cannot see it."""
     draw, n, note = _drawing(cells.summary), cells.summary.values.size, ""
     if draw is _draw_maps:
         factor = _merged(cells.summary.shape or (1, 1))
         note = f"Each point stands for {factor} x {factor} pixels, by the most deviating of them." if factor > 1 else ""
-    elif draw is _draw_series and n > _DRAWN:
-        note = f"Of {n:,} cells {_DRAWN:,} are drawn, evenly spread, those that deviate most among them."
-    return Picture(drawn(draw, cells, raster=draw is _draw_series and n > _VECTOR), words, note)
+    elif draw is _draw_series and n > _ZOOMED:
+        note = f"The clearest place of {n:,} cells; the strip below has the residuals of "
+        note += "all." if n <= _DRAWN else f"{_DRAWN:,}, evenly spread, those that deviate most among them."
+    elif draw is _draw_named and n > _NAMES:
+        note = f"The {_NAMES} cells about the clearest of {n}."
+    return Picture(drawn(draw, cells), words, note)
 
 
 def figure_of(cells: Cells) -> Figure:
@@ -193,69 +208,154 @@ def _logarithmic(law: str, both: np.ndarray) -> bool:
 
 
 def _draw_series(figure: Figure, cells: Cells) -> None:
-    """Cells along an axis: measured and simulated above, residuals below."""
+    """Cells along an axis about the clearest one: measured and simulated, residuals; of many, all residuals below."""
     axis, label, log = _axis_of(cells.summary)
     assert axis is not None
-    law, measured, worst = cells.summary.law, cells.measured, cells.worst
-    clearest = cells.residuals if cells.earlier is None else cells.earlier
-    at_worst = (axis[worst], measured[worst], clearest[worst])
-    some = np.argsort(axis)  # from left to right
-    if axis.size > _DRAWN:
-        some = some[_thinned(clearest[some], _DRAWN)]
-    axis, measured, spread = axis[some], measured[some], cells.spread[some]
-    models = [expected[some] for expected in cells.models]
-    residuals = [z[some] for z in (cells.residuals, cells.earlier) if z is not None]
-    edges = _edges(axis, log)
-    exact = law == "exact"
-    figure.set_size_inches(WIDTH, 2.6 if exact else 3.9)
-    heights = [1.0] if exact else [2.1, 1.0]
-    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    upper, last = panels[0], panels[-1]
+    order = np.argsort(axis)  # from left to right
+    edges = _edges(axis[order], log)
+    at = int(np.flatnonzero(order == cells.worst)[0])
+    low, high = 0, axis.size
+    zoomed = axis.size > _ZOOMED
+    if zoomed:
+        low = min(max(at - _SIDE, 0), axis.size - 2 * _SIDE - 1)
+        high = low + 2 * _SIDE + 1
+    shown, ends = order[low:high], edges[low : high + 1]
+    exact = cells.summary.law == "exact"
+    heights = [1.0] if exact else [2.1, 1.1, 0.6] if zoomed else [2.1, 1.1]
+    figure.set_size_inches(WIDTH, 2.6 if exact else 4.9 if zoomed else 4.1)
+    panels = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    _draw_values(panels[0], cells, axis, shown, ends)
+    for panel in panels[: 1 if exact else 2]:
+        panel.set_xlim(ends[0], ends[-1])
+        if log:
+            panel.set_xscale("log")
+    if not exact:
+        panels[0].tick_params(labelbottom=False)
+        panels[0].tick_params(axis="x", which="minor", labelbottom=False)
+        _draw_residuals(panels[1], cells, axis, shown)
+    _horizontal(panels[0 if exact else 1], label, log)
+    if zoomed and not exact:
+        _draw_strip(panels[2], cells, axis[order], order, ends)
+        if log:
+            panels[2].set_xscale("log")
+        _horizontal(panels[2], label, log)
+    if not exact:
+        panels[0].set_xlabel("")
+        for tick in panels[0].get_xticklabels(which="both"):
+            tick.set_visible(False)
 
+
+def _draw_values(upper: Axes, cells: Cells, axis: np.ndarray, shown: np.ndarray, edges: np.ndarray) -> None:
+    """What was measured and what the models expect in some cells, in the unit of the sentence where that has one."""
+    law = cells.summary.law
+    spread, models = cells.spread[shown], [expected[shown] for expected in cells.models]
+    measured, (low, high) = cells.measured[shown], _band(law, models[0], spread)
+    unit = _unit_of(cells)
+    said = _as_said(cells, shown, [measured, *models, low, high])
+    if said is not None:
+        (measured, *models, low, high), unit = said
+        law = "normal"
     floor = _value_scale(upper, law, measured, np.concatenate(models))
-    low, high = (np.maximum(values, floor) for values in _band(law, models[0], spread))
-    shown = np.maximum(measured, floor)
-    even = np.linspace(0, axis.size - 1, min(axis.size, _STEPS)).astype(np.int64)
-    steps = axis.size <= _STEPS
-    if not exact and steps:
+    low, high, drawn_at = (np.maximum(values, floor) for values in (low, high, measured))
+    if law != "exact":
         upper.stairs(high, edges, baseline=low, fill=True, color=BAND, label=OWN)
-    elif not exact:
-        upper.fill_between(axis[even], low[even], high[even], color=BAND, linewidth=0, label=OWN)
     for expected, line in reversed(list(zip(models, _lines(cells), strict=True))):
-        if steps:
-            upper.stairs(np.maximum(expected, floor), edges, baseline=None, **line)
-        else:
-            upper.plot(axis[even], np.maximum(expected, floor)[even], zorder=4, **line)
-    if axis.size <= _POINTS:
-        there = measured >= floor
-        upper.plot(axis[there], shown[there], "o", color=MEASURED, markersize=3.2, label="measured", zorder=3)
-        if not there.all():
-            style: dict[str, Any] = {"color": MEASURED, "markersize": 4, "zorder": 3, "clip_on": False}
-            upper.plot(axis[~there], shown[~there], "v", label="measured, below the scale", **style)
-    elif steps:
-        upper.stairs(shown, edges, baseline=None, color=MEASURED, linewidth=0.7, label="measured", zorder=3)
-    else:
-        upper.plot(axis, shown, "o", color=MEASURED, markersize=1.1, markeredgewidth=0, zorder=3)
-        upper.plot([], [], "o", color=MEASURED, markersize=3.2, label="measured")
-    _ring(upper, at_worst[0], max(at_worst[1], floor), label="clearest")
-    upper.set_ylabel(_unit_of(cells))
+        upper.stairs(np.maximum(expected, floor), edges, baseline=None, **line)
+    there = measured >= floor
+    name = f"measured, {shortened(cells.name, 30)}" if cells.overlaid and cells.name else "measured"
+    upper.plot(axis[shown][there], drawn_at[there], "o", color=MEASURED, markersize=3.2, label=name, zorder=3)
+    if not there.all():
+        style: dict[str, Any] = {"color": MEASURED, "markersize": 4, "zorder": 3, "clip_on": False}
+        upper.plot(axis[shown][~there], drawn_at[~there], "v", label="measured, below the scale", **style)
+    _ring(upper, axis[cells.worst], float(drawn_at[shown == cells.worst][0]), label="clearest")
+    upper.set_ylabel("\n".join(textwrap.wrap(unit, 26)))
     upper.use_sticky_edges = False
     upper.margins(y=0.06)
     upper.grid(axis="y")
     upper.set_axisbelow(True)
     legend(upper)
 
-    if not exact:
-        for z, colour in reversed(list(zip(residuals, (MEASURED, BEFORE), strict=False))):
-            if axis.size <= _POINTS:
-                last.vlines(axis, 0, z, color=ROUGH if colour == MEASURED else colour, linewidth=1.0)
-            last.plot(axis, z, "o", color=colour, markeredgewidth=0, markersize=_dot(axis.size))
-        _ring(last, at_worst[0], at_worst[2])
-        _residual_scale(last, np.concatenate(residuals))
-    last.set_xlim(edges[0], edges[-1])
-    if log:
-        last.set_xscale("log")
-    _horizontal(last, label, log)
+
+def _draw_residuals(lower: Axes, cells: Cells, axis: np.ndarray, shown: np.ndarray) -> None:
+    """The residuals of some cells, those of further captures in colours, and what they are at the clearest place."""
+    both = [(z[shown], c) for z, c in ((cells.residuals, MEASURED), (cells.earlier, BEFORE)) if z is not None]
+    every = [z for z, _ in both]
+    for (name, other), colour in zip(cells.overlaid, OTHERS, strict=False):
+        there, _, _ = _axis_of(other.summary)
+        if there is None:
+            continue
+        inside = (there >= axis[shown].min()) & (there <= axis[shown].max())
+        values = other.clearest[inside]
+        lower.plot(there[inside], values, "-", color=colour, linewidth=1.0, label=shortened(name, 30), zorder=2)
+        every.append(values)
+    for z, colour in reversed(both):
+        lower.vlines(axis[shown], 0, z, color=ROUGH if colour == MEASURED else colour, linewidth=1.0)
+        lower.plot(axis[shown], z, "o", color=colour, markeredgewidth=0, markersize=3.6)
+    _ring(lower, axis[cells.worst], float(cells.clearest[cells.worst]))
+    lower.set_title(_in_numbers(cells), loc="left", fontsize=9, color=MEASURED)
+    if cells.overlaid:
+        lower.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1, fontsize=8.5)
+    _residual_scale(lower, np.concatenate(every))
+
+
+def _in_numbers(cells: Cells) -> str:
+    """The residual at the clearest place, of both models where there are two."""
+    now = f"{float(cells.residuals[cells.worst]):+.1f} sigma"
+    if cells.earlier is None:
+        return f"residual at the ring: {now}"
+    return f"residual at the ring: {float(cells.earlier[cells.worst]):+.1f} sigma before, {now} after"
+
+
+def _draw_strip(strip: Axes, cells: Cells, axis: np.ndarray, order: np.ndarray, zoom: np.ndarray) -> None:
+    """The residuals of all cells, and which of them are shown above."""
+    clearest = cells.clearest[order]
+    some = _thinned(clearest, _DRAWN) if axis.size > _DRAWN else np.arange(axis.size)
+    strip.axvspan(zoom[0], zoom[-1], color=BAND, linewidth=0, zorder=0)
+    for z, colour in (
+        (cells.residuals[order], MEASURED),
+        (clearest, BEFORE if cells.earlier is not None else MEASURED),
+    ):
+        strip.plot(
+            axis[some],
+            z[some],
+            "o",
+            color=colour,
+            markersize=_dot(axis.size),
+            markeredgewidth=0,
+            rasterized=axis.size > _VECTOR,
+        )
+    strip.axhline(0, color=MODEL, linewidth=0.8)
+    strip.margins(x=0.01)
+    strip.set_ylabel("all, sigmas")
+
+
+# "2.54 times that of a steady rate, 0.936 expected": what was found, its words, what was expected
+_SAID = re.compile(
+    r"([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?([^,;\d]*), ([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?(?: [a-z]+)? expected"
+)
+
+
+def _as_said(cells: Cells, shown: np.ndarray, values: Sequence[np.ndarray]) -> tuple[list[np.ndarray], str] | None:
+    """(values in the numbers that the sentence of a check has, their unit); None where the cells are in it already.
+
+    Scores, in standard deviations, are said in physical units; `Summary.size` has them in words.
+    """
+    if cells.summary.law != "normal":
+        return None
+    out, unit = [], ""
+    try:
+        for some in values:
+            found = [
+                _SAID.search(cells.summary.size(int(k), float(x), float(m))[0])
+                for k, x, m in zip(shown, some, cells.expected[shown], strict=True)
+            ]
+            if not all(found):
+                return None
+            out.append(np.array([float(one[1]) for one in found if one]))
+            unit = next(f"{one[2] or ''}{one[3]}".strip() for one in found if one)
+    except Exception:  # of a user's own statistic: the page is worth more than one scale
+        return None
+    return (out, shortened(unit, 60)) if np.isfinite(np.concatenate(out)).all() else None
 
 
 def _lines(cells: Cells) -> list[dict[str, Any]]:
@@ -269,7 +369,7 @@ def _lines(cells: Cells) -> list[dict[str, Any]]:
 
 
 def _dot(cells: int) -> float:
-    return 3.6 if cells <= _POINTS else 1.8 if cells <= _STEPS else 1.1
+    return 3.0 if cells <= _POINTS else 1.8 if cells <= _VECTOR else 1.1
 
 
 def _ring(axes: Axes, x: float, y: float, size: float = 9.0, label: str | None = None) -> None:
@@ -286,40 +386,55 @@ def _thinned(residuals: np.ndarray, most: int) -> np.ndarray:
 
 def _draw_named(figure: Figure, cells: Cells) -> None:
     """Cells without an axis, each with its own words: measured and simulated to the left, residuals to the right."""
-    law, measured, worst = cells.summary.law, cells.measured, cells.worst
-    names = ["\n".join(textwrap.wrap(shortened(_where(cells.summary, k), 128), 64)) for k in range(measured.size)]
+    law, worst, n = cells.summary.law, cells.worst, cells.measured.size
+    first = min(max(worst - _NAMES // 2, 0), max(n - _NAMES, 0))
+    shown = np.arange(first, min(first + _NAMES, n))
+    names = ["\n".join(textwrap.wrap(shortened(_where(cells.summary, int(k)), 128), 64)) for k in shown]
     heights = np.array([0.1 + 0.13 * (name.count("\n") + 1) for name in names])  # inches
     rows = np.cumsum(heights) - heights / 2
+    here = int(np.flatnonzero(shown == worst)[0])
     exact = law == "exact"
-    figure.set_size_inches(WIDTH, 1.0 + heights.sum())
+    figure.set_size_inches(WIDTH, 1.15 + heights.sum())
     widths = [1.0] if exact else [1.5, 1.0]
     panels = figure.subplots(1, len(widths), sharey=True, width_ratios=widths, squeeze=False)[0]
     left, right = panels[0], panels[-1]
 
-    floor = _value_scale(left, law, measured, np.concatenate(cells.models), vertical=False)
-    low, high, shown = (np.maximum(x, floor) for x in (*_band(law, cells.expected, cells.spread), measured))
+    measured, models, unit = cells.measured[shown], [model[shown] for model in cells.models], _unit_of(cells)
+    low, high = _band(law, models[0], cells.spread[shown])
+    said = _as_said(cells, shown, [measured, *models, low, high])
+    if said is not None:
+        (measured, *models, low, high), unit = said
+    floor = _value_scale(left, law, measured, np.concatenate(models), vertical=False)
+    low, high, values = (np.maximum(x, floor) for x in (low, high, measured))
     if not exact:
         left.barh(rows, high - low, left=low, height=0.15, color=BAND, label=OWN)
-    for expected, line in reversed(list(zip(cells.models, _lines(cells), strict=True))):
+    for expected, line in reversed(list(zip(models, _lines(cells), strict=True))):
         left.vlines(np.maximum(expected, floor), rows - 0.075, rows + 0.075, **{**line, "linewidth": 1.6})
-    left.plot(shown, rows, "o", color=MEASURED, markersize=4.5, label="measured", zorder=3, clip_on=False)
-    _ring(left, shown[worst], rows[worst], 10.0, "clearest")
+    left.plot(values, rows, "o", color=MEASURED, markersize=4.5, label="measured", zorder=3, clip_on=False)
+    _ring(left, values[here], rows[here], 10.0, "clearest")
     left.set_yticks(rows, names, fontsize=8.2)
     left.set_ylim(heights.sum(), 0)
-    left.set_xlabel(_unit_of(cells))
+    left.set_xlabel(unit)
     left.grid(axis="x")
     left.set_axisbelow(True)
     left.use_sticky_edges = False
     left.margins(x=0.06)
     legend(left)
     if not exact:
-        residuals = [z for z in (cells.residuals, cells.earlier) if z is not None]
+        residuals = [z[shown] for z in (cells.residuals, cells.earlier) if z is not None]
+        every = list(residuals)
+        for (name, other), colour in zip(cells.overlaid, OTHERS, strict=False):
+            if other.residuals.size == n:
+                right.plot(other.clearest[shown], rows, "d", color=colour, markersize=4, label=shortened(name, 24))
+                every.append(other.clearest[shown])
         for z, colour in reversed(list(zip(residuals, (MEASURED, BEFORE), strict=False))):
             right.hlines(rows, 0, z, color=ROUGH if colour == MEASURED else colour, linewidth=1.2)
             right.plot(z, rows, "o", color=colour, markersize=4.5)
-        _ring(right, residuals[-1][worst], rows[worst], 10.0)
+        _ring(right, residuals[-1][here], rows[here], 10.0)
         right.tick_params(axis="y", length=0)
-        _residual_scale(right, np.concatenate(residuals), vertical=False)
+        _residual_scale(right, np.concatenate(every), vertical=False)
+        if len(every) > len(residuals):
+            right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1, fontsize=8.5)
 
 
 def _draw_maps(figure: Figure, cells: Cells) -> None:
@@ -368,7 +483,7 @@ def _draw_maps(figure: Figure, cells: Cells) -> None:
         written = FuncFormatter(lambda value, _: f"{math.exp(value):.3g}") if colours == "PuOr_r" else None
         bar = figure.colorbar(image, ax=panel, extend="both", shrink=0.92, pad=0.02, format=written)
         if written is not None:
-            bar.set_ticks(np.linspace(*span, 5).tolist())
+            bar.set_ticks(np.linspace(*span, 5).tolist())  # ratios of counts
         bar.outline.set_visible(False)
         panel.set_title(words, fontsize=9.5)
         for colour, width in (("white", 3.0), ("black", 1.3)):  # on light and dark

@@ -73,6 +73,12 @@ class Statistic(Plugin, abstract=True):
     unit: ClassVar[str] = "1"  # of its values
     # whose detections it sets beside each other: a pixel's own, those close by or far apart, all as one; "": it counts
     among: ClassVar[Literal["", "pixel", "neighbours", "far", "array"]] = ""
+    # how much a deviation says of the physics: 0 that there is one (a drift, a total); 1 its class (a variance, a
+    # spread, clusters); 2 between which detections or pixels; 3 also where: at which delay, frequency, row
+    specific: ClassVar[int] = 1
+    # the statistics of whose cells this one's are sums: a deviation there shows here, too (`inference.deviations`)
+    pools: ClassVar[tuple[str, ...]] = ()
+    named_from: ClassVar[int] = 0  # a deviation in a cell before this one is no more specific than 0
 
     def reduce(self, recording: Recording) -> Summary | None:
         """The summary of a recording, or None where it has nothing to say of it. The number of cells depends on the

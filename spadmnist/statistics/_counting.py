@@ -170,6 +170,11 @@ def _wilson_hilferty(count: float, mean: float) -> float:
     return float(3.0 * math.sqrt(a) * (1.0 - 1.0 / (9.0 * a) - math.cbrt(mean / a)))
 
 
+def whole(count: float) -> str:
+    """A count or its expectation as text: a whole number from 10 on, otherwise three digits."""
+    return f"{count:.0f}" if abs(count) >= 10 else f"{count:.3g}"
+
+
 def per_cent(share: float) -> str:
     """A share in per cent with three digits: 0.82 %, +1.5e-05 %."""
     return f"{100 * share:.3g} %"

@@ -35,6 +35,8 @@ class Autocorrelation(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    specific = 2
+    pools = ("intervals", "spectrum")
     among = "pixel"
     unit = "standard deviations"
 

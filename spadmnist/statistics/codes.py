@@ -45,6 +45,7 @@ class Codes(Statistic):
     """
 
     modalities = ("tr", "str")
+    specific = 3
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -81,6 +82,8 @@ class CodePeriods(Statistic):
     """
 
     modalities = ("tr", "str")
+    specific = 2
+    pools = ("codes",)
     unit = "standard deviations"
 
     def reduce(self, recording: Recording) -> Summary | None:

@@ -13,7 +13,7 @@ import numpy as np
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
-from ._counting import exposure_in, span, tick_of
+from ._counting import exposure_in, span, tick_of, whole
 from ._order import time_order
 from ._scores import largest_score, shares
 from ._walk import REACH
@@ -36,6 +36,7 @@ class Delays(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
     among = "far"
     unit = "standard deviations"
     costly = True
@@ -74,7 +75,7 @@ class Delays(Statistic):
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             found, mean = int(most[cell]), float(chance[cell])
-            text = f"{found} pairs within {show(step * tick, 's')}, {mean:.3g} by chance"
+            text = f"{found} pairs within {show(step * tick, 's')}, {whole(mean)} by chance"
             return text, (found - mean) / max(1, detections)
 
         return Summary(scores, "normal", where, size, scale=np.ones(scores.size))

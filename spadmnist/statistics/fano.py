@@ -291,6 +291,7 @@ class PixelFano(Statistic):
     """
 
     modalities = _ALL
+    pools = ("autocorrelation",)
     among = "pixel"
     unit = "1"
 
@@ -340,6 +341,7 @@ class ArrayFano(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_fano", "far_pairs", "neighbours", "spectrum")
     among = "array"
     unit = "1"
 

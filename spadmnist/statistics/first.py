@@ -33,6 +33,7 @@ class FirstArrivals(Statistic):
     """
 
     modalities = ("str",)
+    specific = 2
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -68,6 +69,7 @@ class FrameEnds(Statistic):
     """
 
     modalities = ("str",)
+    specific = 2
     unit = "detections"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -99,6 +101,7 @@ class FrameLimits(Statistic):
     """
 
     modalities = ("str",)
+    specific = 2
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:

@@ -13,6 +13,7 @@ from ..events import longest_gap
 from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
+from ._counting import whole
 from ._frames import as_words, bits, first_stamps, frame_sums, ones_of
 from ._series import has_data, slots_of_frame, stamps
 
@@ -128,7 +129,7 @@ class RepeatedFrames(Statistic):
         number = (_chances_of_repeats(recording) < np.log(_SURE_CHANCE / frames)).sum()
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            text = f"{measured:g} frames are the same as the one before, {expected:.3g} expected"
+            text = f"{measured:g} frames are the same as the one before, {whole(expected)} expected"
             return text, float((measured - expected) / frames)
 
         return Summary(np.array([float(number)]), "exact", lambda cell: "successive frames", size)
@@ -232,7 +233,7 @@ class RareFrames(Statistic):
         names = ("without a detection", "with every pixel full", "the same as the one before")
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            text = f"{measured:g} of {frames} frames, {expected:.4g} expected"
+            text = f"{measured:g} of {frames} frames, {whole(expected)} expected"
             return text, float((measured - expected) / frames)
 
         values = np.array([empty, full, repeated], np.float64)
@@ -265,7 +266,7 @@ class Disorder(Statistic):
         events = max(1, len(recording.events))
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            text = f"{measured:g} stamps go back in time, {expected:.3g} expected"
+            text = f"{measured:g} stamps go back in time, {whole(expected)} expected"
             return text, float((measured - expected) / events)
 
         return Summary(np.array([float(smaller)]), "exact", lambda cell: "successive stamps of a pixel", size)
@@ -289,7 +290,7 @@ class EqualStamps(Statistic):
         names = ("equal stamps of a pixel", "stamps behind the end of the exposure")
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            return f"{measured:g} events, {expected:.4g} expected", float((measured - expected) / events)
+            return f"{measured:g} events, {whole(expected)} expected", float((measured - expected) / events)
 
         return Summary(np.array([equal, late], np.float64), "poisson", lambda cell: names[cell], size)
 
@@ -353,6 +354,6 @@ class FullCounters(Statistic):
         number = recording.n_frames * recording.pixels
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            return f"{measured:g} of {number} counts, {expected:.5g} expected", float((measured - expected) / number)
+            return f"{measured:g} of {number} counts, {whole(expected)} expected", float((measured - expected) / number)
 
         return Summary(np.array([float(full)]), "poisson", lambda cell: f"counts of {largest}", size)

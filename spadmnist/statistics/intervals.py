@@ -20,6 +20,7 @@ from ._counting import (
     root_of,
     span,
     tick_of,
+    whole,
     whole_ticks,
 )
 from ._scores import number_at, pooled_score, shares, unequal_pairs_law
@@ -58,6 +59,7 @@ class EdgeIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 3
     among = "pixel"
     unit = "detections"
 
@@ -98,6 +100,8 @@ class Intervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
+    pools = ("edge_intervals", "fine_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
 
@@ -132,6 +136,8 @@ class FineIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 3
+    pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
 
@@ -168,6 +174,8 @@ class EarlyIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    specific = 2
+    pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "1"
 
@@ -210,7 +218,7 @@ class EarlyIntervals(Statistic):
             found, wanted = at(measured), at(expected)
             # by so much do the numbers differ that make the pairs
             change = root_of((found - wanted) / max(float(law.mean), 1.0))
-            text = f"{found:.4g} pairs in the same pixel of {few:.0f}, {wanted:.4g} expected"
+            text = f"{whole(found)} pairs in the same pixel of {few:.0f}, {whole(wanted)} expected"
             return text, few / max(1.0, float(detections.sum())) * min(max(change, -1.0), 1.0)
 
         seconds = bounds * tick
@@ -237,6 +245,7 @@ class Rescaled(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("intervals",)
     among = "pixel"
     unit = "detections"
 
@@ -263,6 +272,7 @@ class RescaledLag(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("autocorrelation",)
     among = "pixel"
     unit = "standard errors"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..events import Layout
 from . import Recording, Statistic, Summary
-from ._counting import per_cent, root_of
+from ._counting import per_cent, root_of, whole
 from ._frames import in_equal_times
 from ._scores import Pairs, number_at, pooled_score, shares
 from ._series import has_data, slots_of_frame
@@ -132,6 +132,7 @@ class PixelMap(Statistic):
     """
 
     modalities = _ALL
+    specific = 2
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -141,7 +142,7 @@ class PixelMap(Statistic):
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             found, wanted = law.detections(measured), law.detections(expected)
-            return f"{found:.6g} {law.what}, {wanted:.6g} expected", float((found - wanted) / max(wanted, 1.0))
+            return f"{whole(found)} {law.what}, {whole(wanted)} expected", float((found - wanted) / max(wanted, 1.0))
 
         return Summary(
             np.rint(law.as_poisson(law.counts)),
@@ -166,7 +167,7 @@ def _lines(recording: Recording, axis: int) -> Summary | None:
     def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
         found, wanted = (per_line * law.detections(value / per_line) for value in (measured, expected))
         share = float((found - wanted) / max(wanted, 1.0))
-        return f"{found:.7g} {law.what}, {wanted:.7g} expected ({per_cent(share)})", share
+        return f"{whole(found)} {law.what}, {whole(wanted)} expected ({per_cent(share)})", share
 
     values = law.as_poisson(law.counts).reshape(layout.shape).sum(axis=1 - axis)
     cells = np.arange(layout.shape[axis], dtype=np.float64)
@@ -181,6 +182,8 @@ class Rows(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -195,6 +198,8 @@ class Columns(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
@@ -254,6 +259,8 @@ class Surface(Statistic):
     """
 
     modalities = _ALL
+    specific = 3
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -296,6 +303,7 @@ class Outliers(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -308,7 +316,7 @@ class Outliers(Statistic):
         edges = [f"below {level:g}" for level in _BELOW] + [f"above {level:g}" for level in _ABOVE]
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            return f"{measured:g} pixels, {expected:.4g} expected", float((measured - expected) / rates.size)
+            return f"{measured:g} pixels, {whole(expected)} expected", float((measured - expected) / rates.size)
 
         return Summary(
             np.concatenate([low, high]).astype(np.float64),
@@ -329,6 +337,7 @@ class Tails(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 
@@ -363,6 +372,7 @@ class Spread(Statistic):
     """
 
     modalities = _ALL
+    pools = ("pixel_map",)
     flat = True
     unit = "1"
 

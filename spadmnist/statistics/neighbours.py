@@ -38,6 +38,8 @@ class Neighbours(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    specific = 3
+    pools = ("far_pairs",)
     among = "neighbours"
     unit = "standard deviations"
 
@@ -71,6 +73,8 @@ class FarPairs(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    specific = 2
+    pools = ("spectrum", "delays")
     among = "far"
     unit = "standard deviations"
     costly = True
@@ -99,7 +103,7 @@ class FarPairs(Statistic):
             found = float(pairs.number[cell] - pairs.chance[cell]) / part
             usual = pairs.beyond(cell, float(expected)) / part
             rate = math.sqrt(abs(found - usual))
-            text = f"coincidences {_signed(found)} beside chance, {_signed(usual)} expected"
+            text = f"coincidences {_signed(found)} relative to chance, {_signed(usual)} expected"
             if 0 < found - usual < 1:
                 text += f"; as of a light that fluctuates by {per_cent(rate)}"
             return text, math.copysign(rate, found - usual)

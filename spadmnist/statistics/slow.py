@@ -152,6 +152,8 @@ class Trend(Statistic):
     """
 
     modalities = _ALL
+    specific = 0
+    pools = ("spectrum",)
     among = "array"
     unit = "1"
 
@@ -208,6 +210,7 @@ class SlowSeries(Statistic):
     """
 
     modalities = _ALL
+    pools = ("trend", "spectrum", "autocorrelation")
     among = "pixel"
     unit = "1"
 
@@ -268,6 +271,8 @@ class HotSeries(Statistic):
     """
 
     modalities = _ALL
+    specific = 2
+    pools = ("slow_series",)
     among = "pixel"
     unit = "1"
 

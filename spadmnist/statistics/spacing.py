@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import Recording, Statistic, Summary
-from ._counting import of_detections, per_cent, span, tick_of
+from ._counting import of_detections, per_cent, span, tick_of, whole
 from ._scores import Pairs, number_at, pooled_score, shares
 from ._walk import RANKS, SIZES, crowd_edges, crowd_scatter, gaps, spacing_edges, walk
 
@@ -21,6 +21,7 @@ class Spacing(Statistic):
     """
 
     modalities = ("tr", "str")
+    pools = ("multiplicity", "array_fano", "intervals", "autocorrelation")
     among = "array"
     unit = "detections"
 
@@ -56,6 +57,7 @@ class Crowds(Statistic):
     """
 
     modalities = ("tr",)
+    pools = ("multiplicity", "array_fano", "intervals", "autocorrelation")
     among = "array"
     unit = "standard deviations"
 
@@ -98,6 +100,7 @@ class Multiplicity(Statistic):
     """
 
     modalities = ("tr", "str")
+    pools = ("neighbours", "far_pairs")
     among = "neighbours"
     unit = "clusters"
 
@@ -119,6 +122,6 @@ class Multiplicity(Statistic):
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             number = SIZES[cell % len(SIZES)][0]
             share = rate(cell, measured * number, expected * number)[1]
-            return f"{measured:.6g} clusters, {expected:.4g} expected", share
+            return f"{measured:.0f} clusters, {whole(expected)} expected", share
 
         return Summary(values.ravel().astype(np.float64), "poisson", where, size)

@@ -32,6 +32,8 @@ class Spectrum(Statistic):
     """
 
     modalities = ("tr", "str", "qis", "counts")
+    specific = 3
+    named_from = 1  # one period in the capture is a drift as well as a line
     among = "array"
     unit = "mean power"
 
