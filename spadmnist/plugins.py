@@ -320,7 +320,7 @@ def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...],
     shapes: those that a map may have; a distribution is drawn for the first of them. Maps are returned in the shape
     they have, but one value a pixel always as (pixels,). key: what a distribution is drawn from (chip seed, effect and
     parameter in one string). Drawn values outside the bounds are set to the bound. Raises InputError where a map is
-    unreadable, of another shape or out of bounds, or where a distribution has no finite values.
+    unreadable, or a map or an array is of another shape or out of bounds, or where a distribution has no finite values.
     """
     if isinstance(value, Distribution):
         digest = hashlib.sha256(key.encode()).digest()
@@ -336,7 +336,17 @@ def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...],
     if isinstance(value, MapFile):
         values = _read_map(declared, value.path, shapes)
         return values.ravel() if declared.per_pixel else values
+    if declared.per and np.ndim(value):
+        values = np.asarray(value, np.float64)
+        if not _fits(values.shape, shapes):
+            wanted = f"it needs one number for each {declared.per}: {_words(shapes)}"
+            raise InputError(f"{declared.name} is an array of shape {values.shape}; {wanted}")
+        return values.ravel() if declared.per_pixel else values
     return value
+
+
+def _words(shapes: tuple[tuple[int, ...], ...]) -> str:
+    return " or ".join(str(shape).replace("-1", "n") for shape in shapes)
 
 
 def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
@@ -351,7 +361,7 @@ def _read_map(declared: Parameter, path: Path, shapes: tuple[tuple[int, ...], ..
         raise InputError(f"{path}: is not a .npy file of plain numbers; write the map with numpy.save") from None
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or not _fits(values.shape, shapes):
         what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "an archive"
-        wanted = " or ".join(str(shape).replace("-1", "n") for shape in shapes)
+        wanted = _words(shapes)
         raise InputError(f"{path}: is {what}, but {declared.name} needs one number for each {declared.per}: {wanted}")
     if values.size > _LARGEST_MAP:
         raise InputError(f"{path}: has {values.size:,} entries; a map may have {_LARGEST_MAP:,}: take fewer")

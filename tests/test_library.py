@@ -187,6 +187,8 @@ def test_a_sensor_shows_itself_and_changes() -> None:
     assert more.without("crosstalk").effect("crosstalk") is None
     map_ = np.arange(1.0, 16.0)
     assert "per pixel: median 8 Hz, 1 Hz to 15 Hz" in repr(one.with_values({"dark_counts.rate": map_}))
+    as_image = one.with_values({"dark_counts.rate": map_.reshape(3, 5)})
+    assert np.array_equal(as_image.effect("dark_counts").rate, map_)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -202,6 +204,10 @@ def test_a_sensor_shows_itself_and_changes() -> None:
         (lambda s: s.with_values({"dark_counts.rat": 1.0}), r"dark_counts has rate. Did you mean rate\?"),
         (lambda s: s.with_values({"dark_counts.rate": -1.0}), "-1 Hz is not possible; rate is at least 0 Hz"),
         (lambda s: s.with_values({"dark_counts.rate": "5 Hz"}), "it is a number in Hz"),
+        (
+            lambda s: s.with_values({"dark_counts.rate": np.ones(3)}),
+            r"rate is an array of shape \(3,\); it needs one number",
+        ),
         (lambda s: s.with_values({"dead_time.duration": np.nan}), "is not possible"),
         (lambda s: s.with_values({"dead_time.paralyzable": 1.0}), "it is True or False"),
         (lambda s: s.with_values({"tdc.rounding": "up"}), "it is nearest or floor"),
