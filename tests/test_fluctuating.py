@@ -15,6 +15,7 @@ from spadmnist.inference.candidates import with_values
 from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
 from spadmnist.inference.gauss_newton import gauss_newton_step
+from spadmnist.inference.laws import Law
 from spadmnist.inference.model_path import _bounded, _gauss_newton, begin
 from spadmnist.inference.ranking import compare_by_squares
 from spadmnist.inference.replicates import TOTALS
@@ -83,7 +84,10 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     z, totals = np.array([3.0, -4.0, 2.0, 3.5, -2.0, 1.0]), np.array([4.0, -3.0, 2.0])
 
     def evaluation(width: float, other: float) -> Any:
-        null = {TREND: SimpleNamespace(breadth=width, law="normal"), MANY: SimpleNamespace(breadth=1.0, law="normal")}
+        null = {
+            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law()),
+            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law()),
+        }
         left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from spadmnist.inference.laws import Poisson
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.score_test import _p_values, _trials_corrected, score_test
 
@@ -120,6 +121,6 @@ def test_what_goes_together_has_the_tails_of_few() -> None:
     assert chance_of.freedom < 31
     # numbers of many events have no such tails, whatever they have in common
     for events, few in ((5.0, True), (1000.0, False)):
-        null = SimpleNamespace(law="poisson", factor=1.0, expected=lambda total, n=events: (np.full(14, n), 0.0))
+        null = SimpleNamespace(law=Poisson(), factor=1.0, expected=lambda total, n=events: (np.full(14, n), 0.0))
         evaluation.nulls = {CELL: null}
         assert (score_test(REPLICATES, evaluation, candidate(np.ones(14), "one").signature).freedom < 31) == few

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from spadmnist.inference.laws import Exponential
 from spadmnist.inference.spectral_lines import _line, _Spectrum, spectral_lines
 
 STEPS = {"dark": 10.0, "dim": 20.0, "bright": 66.7, "red": 33.3}  # Hz, from bin to bin
@@ -43,7 +44,7 @@ def beside(powers: dict[str, np.ndarray], usual: dict[str, np.ndarray] | None = 
     }
     nulls = {
         cell: SimpleNamespace(
-            law="exponential", recordings=RECORDINGS, expected=lambda total, mean=mean: (mean, RECORDINGS**-0.5)
+            law=Exponential(), recordings=RECORDINGS, expected=lambda total, mean=mean: (mean, RECORDINGS**-0.5)
         )
         for cell, mean in means.items()
     }

@@ -13,6 +13,7 @@ from scipy import stats
 from simple_sensor import grid, live, many, one_of_each, reduced, sigmas, tr, tr_of
 
 from spadmnist.recording import Recording
+from spadmnist.statistics._counting import whole
 from spadmnist.statistics._scores import pairs_law, unequal_pairs_law
 from spadmnist.statistics.intervals import (
     EarlyIntervals,
@@ -88,7 +89,7 @@ def test_early_intervals_of_pixels() -> None:
         number = np.array([(np.diff(row) * tick < (bound - 0.01) * 1e-9).sum() for row in rows])
         pairs = (number[:-1] * (number[:-1] - 1)).sum() / 2
         text, share = summary.size(cell, float(summary.values[cell]), 0.0)
-        assert text.startswith(f"{pairs:.4g} pairs in the same pixel of {number.sum()}, ")
+        assert text.startswith(f"{whole(pairs)} pairs in the same pixel of {number.sum()}, ")
         if bound <= 50:
             assert number.sum() == 0 and share == 0 and abs(summary.values[cell]) < 4
             continue
