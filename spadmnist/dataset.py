@@ -25,7 +25,7 @@ import numpy as np
 from . import config, disk, kernels, plugins, reconstruct, store, units
 from . import manifest as manifests
 from .disk import Files
-from .errors import InputError, SpadError
+from .errors import InputError, SpadError, UnknownName, did_you_mean
 from .events import Events
 from .experiment import Experiment, Level, level_of
 from .foreign import from_json, quoted, short
@@ -661,6 +661,14 @@ class Image:
         return (field.normalised if normalised else field)[self.index]
 
 
+class _ByMethod(dict[str, "Reconstruction"]):
+    """The fluxes by method. Another name raises UnknownName."""
+
+    def __missing__(self, name: str) -> Reconstruction:
+        there = ", ".join(self) or "none"
+        raise UnknownName(f"{name!r} is no method of this dataset; there are {there}.{did_you_mean(str(name), self)}")
+
+
 class Part:
     """One split at one light level. Nothing of it needs the whole split in memory.
 
@@ -688,9 +696,9 @@ class Part:
         self.stored = stored
         self.readouts = tuple(readouts)
         self.shape = shape
-        self.reconstruction: Mapping[str, Reconstruction] = {
-            name: Reconstruction(length, backend, name) for name in methods
-        }
+        self.reconstruction: Mapping[str, Reconstruction] = _ByMethod(
+            {name: Reconstruction(length, backend, name) for name in methods}
+        )
         self.images: Field[np.ndarray] = Field(length, backend.originals, _first)
 
     def __len__(self) -> int:
@@ -840,10 +848,10 @@ class Dataset:
         if split is None:
             if len(self._splits) > 1:
                 names = " and ".join(self._splits)
-                raise KeyError(f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']")
+                raise UnknownName(f"there are the splits {names}; say which, for example ds[{level_text!r}, 'train']")
             split = next(iter(self._splits))
         if split not in self._splits:
-            raise KeyError(f"{split!r} is not a split here; there are {', '.join(self._splits)}")
+            raise UnknownName(f"{split!r} is not a split here; there are {', '.join(self._splits)}")
         if (level.text, split) not in self._parts:
             self._parts[level.text, split] = self._part(level, split)
         return self._parts[level.text, split]

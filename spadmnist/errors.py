@@ -22,6 +22,13 @@ class InputError(SpadError):
     """A file that was given (images, maps, a dataset) cannot be used as it is."""
 
 
+class UnknownName(KeyError):
+    """There is nothing of that name. It is shown as its sentence, not in quotes as other KeyErrors are."""
+
+    def __str__(self) -> str:
+        return str(self.args[0]) if self.args else ""
+
+
 class EffectError(SpadError):
     """An effect's own code failed, or returned what no effect may return."""
 

@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from . import disk, units
-from .errors import EffectError, InputError, did_you_mean
+from .errors import EffectError, InputError, UnknownName, did_you_mean
 
 PLACES = ("spadmnist.effects", "spadmnist.reconstruct", "spadmnist.statistics")  # packages or modules
 ENTRY_POINTS = "spadmnist.plugins"
@@ -396,11 +396,12 @@ _registries: list[Registry] = []
 
 @dataclass
 class Registry:
-    """The classes of one kind, by name. verb: the command that lists them."""
+    """The classes of one kind, by name. verb: the command that lists them; from_files: --plugin loads more."""
 
     kind: str
     classes: dict[str, type[Plugin]] = field(default_factory=dict)
     verb: str = ""
+    from_files: bool = True
 
     def __post_init__(self) -> None:
         _registries.append(self)
@@ -413,9 +414,11 @@ class Registry:
         """Raises KeyError with a sentence where there is none of that name."""
         discover()
         if name not in self.classes:
-            raise KeyError(
+            near = did_you_mean(name, self.classes)
+            own = "; --plugin FILE.py loads one of your own" if self.from_files and not near else ""
+            raise UnknownName(
                 f"{name} is not {'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}."
-                f"{did_you_mean(name, self.classes)} (spadmnist {self.verb or self.kind + 's'} lists all)"
+                f"{near} (spadmnist {self.verb or self.kind + 's'} lists all{own})"
             )
         return self.classes[name]
 

@@ -280,3 +280,8 @@ def test_no_file_names_a_machine_or_a_registry() -> None:
             if re.search(rf"(?<![\w.~}}])(?:{PATHS})|{HOSTS}", line):
                 found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()[:100]}")
     assert not found, "\n".join(found)
+
+
+def test_types_reach_those_who_import_the_package() -> None:
+    """Without this file type checkers take everything here for untyped."""
+    assert (PACKAGE / "py.typed").is_file()

@@ -227,3 +227,19 @@ def test_gathering_reads_each_image_once(numbers: list[int]) -> None:
     assert isinstance(indices, np.ndarray)
     assert list(gather(get, indices)) == [n % 300 * 10 for n in numbers]
     assert len(read) == len(set(read)) and len(read) <= 32 * max(1, len(set(numbers)))
+
+
+def test_a_name_that_a_dataset_has_not_is_a_sentence() -> None:
+    """Shown as it is, not in the quotes of a KeyError."""
+    ds = spadmnist.open(config.shipped("quick.yaml"))
+    part = ds["2560 mlux", "train"]
+    for ask, said in (
+        (lambda: part.reconstruction["count"], "'count' is no method of this dataset; there are counts, "),
+        (lambda: ds["2560 mlux", "dev"], "'dev' is not a split here; there are train, test"),
+        (lambda: ds["7 mlux", "train"], "'7 mlux' is not a light level here."),
+    ):
+        with pytest.raises(KeyError) as caught:
+            ask()
+        assert str(caught.value).startswith(said)
+    with pytest.raises(KeyError, match="Did you mean counts"):
+        part.reconstruction["count"]

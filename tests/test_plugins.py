@@ -108,6 +108,11 @@ def test_the_registry_is_in_order_and_suggests() -> None:
         Effect.registry.find("dead_tme")
     with pytest.raises(KeyError, match=r"count is not a method\. Did you mean counts\?"):
         Method.registry.find("count")
+    with pytest.raises(KeyError) as unlike:
+        Effect.registry.find("qqqq")
+    assert str(unlike.value) == (
+        "qqqq is not an effect. (spadmnist effects lists all; --plugin FILE.py loads one of your own)"
+    )
 
 
 # --- files ---------------------------------------------------------------------------------------------------------

@@ -89,8 +89,8 @@ def crop(command: F) -> F:
     )(command)
 
 
-def beside(command: F) -> F:
-    """What every verb has that sets a model beside a measurement."""
+def model_and_measurement(command: F) -> F:
+    """The arguments and options of every verb that compares a model with a measurement."""
     path = click.Path(path_type=Path)
     for part in (
         plugin,

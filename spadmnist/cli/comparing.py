@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     metavar="X",
     help='Largest deviation that passes, as a share of the detections or of the rate: "0.5 %".',
 )
-@options.beside
+@options.model_and_measurement
 def compare(
     sensor: Path,
     measurement: Path,
@@ -115,7 +115,7 @@ def compare(
     metavar="TIME",
     help="Budget, as time on two idle cores: 3 min. none: no limit.  [default: 10 min; with --quick 3 min]",
 )
-@options.beside
+@options.model_and_measurement
 def diagnose(
     sensor: Path,
     measurement: Path,
@@ -190,7 +190,7 @@ def diagnose(
     metavar="EFFECT.PARAMETER",
     help="Fit a map. Repeatable.",
 )
-@options.beside
+@options.model_and_measurement
 def fit(
     sensor: Path,
     measurement: Path,

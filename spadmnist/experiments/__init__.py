@@ -131,7 +131,7 @@ class PaperExperiment(Plugin, abstract=True):
     An instance holds the values of the options and nothing else: it is sent to workers.
     """
 
-    registry: ClassVar[Registry] = Registry("experiment", verb="experiment")
+    registry: ClassVar[Registry] = Registry("experiment", verb="experiment", from_files=False)
     options: ClassVar[dict[str, Option]] = {}
 
     def __init_subclass__(cls, abstract: bool = False, **keywords: Any):

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..statistics import Statistic, Summary
+from .laws import law_of
 from .levels import LEAST_FALL
 
 _LIKE = 0.5  # least cosine of the residuals of two captures that look at the same place
@@ -71,7 +72,7 @@ def excess(summary: Summary, expected: np.ndarray, residuals: np.ndarray) -> flo
     if not residuals.size:
         return 0.0
     largest = float(np.max(np.abs(residuals))) ** 2
-    if summary.law == "exponential":
+    if law_of(summary.law, summary.scale is not None).spectrum:
         ratio = max(1.0, float(np.max(summary.values / np.maximum(expected, 1e-30))))
         return max(largest, 2 * (ratio - 1 - float(np.log(ratio))))
     return max(largest, float(np.sum(residuals**2)) - residuals.size)

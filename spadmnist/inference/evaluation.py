@@ -234,9 +234,7 @@ def log_likelihood_ratio(
             out += float(z @ z - there @ there)
             continue
         null, new = evaluation.nulls[cell], other.nulls[cell]
-        factors = null.factor, new.factor
-        fall = null.law.fall(z, there, factors)
-        wider = null.law.wider(z, there, (null.breadth, new.breadth), factors)
+        fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
         # a cell that never varies has no scatter: the log of its ratio is bounded
         gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
         if fluctuates and template is not None:

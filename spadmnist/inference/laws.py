@@ -21,6 +21,8 @@ _LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is
 _LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged
 _LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
 
+_Both = tuple[np.ndarray | float, np.ndarray | float]  # of this model and of the other
+
 
 class Law:
     """A normal law with a scatter of its own for each cell, which the replicates show.
@@ -102,26 +104,19 @@ class Law:
         """The rise of the normal scores that a template means, (cells,)."""
         return template
 
-    def fall(self, z: np.ndarray, other: np.ndarray, factors: tuple[float, float]) -> np.ndarray:
-        """By how much twice the negative log likelihood of the values falls from one model to the other, (cells,).
-
-        Without the term of their scatter, see `wider`.
+    def likelihood_ratio(
+        self, z: np.ndarray, other: np.ndarray, breadths: _Both, factors: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The two terms of twice the log likelihood ratio of another model to this one.
 
         Args:
-            z, other: residuals under the one and under the other.
-            factors: `Null.factor` of both.
+            z, other: residuals under this model and under the other, (cells,).
+            breadths, factors: `Null.breadth` and `Null.factor` of both.
+        Returns:
+            (fall of the squared residuals (cells,), log of the ratio of the scatters, (cells,) or a number); twice the
+                second is subtracted from the first.
         """
-        return np.asarray(z**2 - other**2)
-
-    def wider(
-        self,
-        z: np.ndarray,
-        other: np.ndarray,
-        breadth: tuple[np.ndarray | float, np.ndarray | float],
-        factors: tuple[float, float],
-    ) -> np.ndarray:
-        """The log of the scatter under the other model relative to that under the one, (cells,) or a number."""
-        return np.asarray(np.log(breadth[1] / breadth[0]))
+        return np.asarray(z**2 - other**2), np.asarray(np.log(breadths[1] / breadths[0]))
 
     def nearly_normal(self, expected: np.ndarray, factor: float) -> np.ndarray:
         """Which cells are counts of so many events that they are nearly normal, (cells,) bool."""
@@ -267,19 +262,12 @@ class Exponential(Scaled):
         """
         return _score_of_tail(-np.maximum(1.0 + template, _LEAST_POWER)) - _score_of_tail(np.array(-1.0))
 
-    def fall(self, z: np.ndarray, other: np.ndarray, factors: tuple[float, float]) -> np.ndarray:
-        """By the powers themselves, in units of their means."""
-        return 2 * (_powers_of(z * factors[0]) - _powers_of(other * factors[1]))
-
-    def wider(
-        self,
-        z: np.ndarray,
-        other: np.ndarray,
-        breadth: tuple[np.ndarray | float, np.ndarray | float],
-        factors: tuple[float, float],
-    ) -> np.ndarray:
-        """The scatter of a power is its mean."""
-        return np.asarray(np.log(_powers_of(z * factors[0]) / _powers_of(other * factors[1])))
+    def likelihood_ratio(
+        self, z: np.ndarray, other: np.ndarray, breadths: _Both, factors: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """By the powers in units of their means: the scatter of a power is its mean."""
+        power, its = _powers_of(z * factors[0]), _powers_of(other * factors[1])
+        return 2 * (power - its), np.asarray(np.log(power / its))
 
 
 class Exact(Law):
