@@ -38,6 +38,8 @@ _LEAST = 2 << 30  # bytes of it, from which on the folder is put there
 _PREFIX = "spadmnist-workers-"
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
+# joblib sets it when it is imported, and leaves it there; here it is for workers alone
+_JOBLIB = {"KMP_INIT_AT_FORK": os.environ.get("KMP_INIT_AT_FORK", "FALSE")}
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
     *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
@@ -232,16 +234,16 @@ class Loky(Executor):
     def _opened(self, number: int) -> Iterator[None]:
         from . import compiled
 
-        clear_once(os.getpid())
-        _own_place(os.getpid())
-        self._started = max(self._started, min(self.threads, number))
-        # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers warns, too
         debugging = os.environ.get("SPADMNIST_DEBUG")
         silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
-        quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
+        quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence), **_JOBLIB}
         with safe_path(), _environment({**quiet, **compiled.for_workers()}):
+            clear_once(os.getpid())
+            _own_place(os.getpid())
+            self._started = max(self._started, min(self.threads, number))
+            # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
+            warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
             yield
 
     def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
