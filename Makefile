@@ -52,7 +52,7 @@ docs: $(VENV)/installed-docs  ## build the pages with every cell executed, into 
 
 # All pages, all links; of the notebooks the first two alone are executed
 docs-two: DOCS = build/docs-two
-docs-two: DOCS_ONLY = -D nb_execution_excludepatterns=notebooks/effect.md
+docs-two: DOCS_ONLY = -t two
 docs-two: docs  ## the same with the cells of two pages alone: what a change must pass
 
 lint: $(VENV)/installed

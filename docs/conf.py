@@ -38,6 +38,8 @@ myst_heading_anchors = 3
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "build" / "docs-cells")
 nb_execution_timeout = 1200  # s, of one cell: the longest takes under a minute of two idle cores
+if tags.has("two"):  # noqa: F821  Sphinx's own name here; `make docs-two`
+    nb_execution_excludepatterns = ["notebooks/effect.md"]  # the longest of the three
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True  # what a cell writes is gone with the build
 nb_merge_streams = True
@@ -46,10 +48,9 @@ nb_output_stderr = "warn"  # a warning in a cell is one of the build
 
 def make_pages(app: Any) -> None:
     """Write what is made from the classes, before Sphinx looks for pages."""
-    if (ROOT / "docs" / "_pages" / "__init__.py").is_file():
-        import _pages
+    import _pages
 
-        _pages.make(ROOT)
+    _pages.make(ROOT)
 
 
 def setup(app: Any) -> None:
