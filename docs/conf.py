@@ -23,6 +23,8 @@ release = version = spadmnist.__version__
 extensions = ["myst_nb"]
 exclude_patterns = ["_pages"]
 
+smartquotes = False  # it makes one dash of the two that an option begins with
+
 html_theme = "furo"
 html_title = f"spadmnist {release}"
 html_static_path = ["_static"]

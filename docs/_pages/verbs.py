@@ -63,5 +63,5 @@ def _names(option: click.Option) -> str:
 
 
 def _about(option: click.Option) -> str:
-    repeated = " May be given several times." if option.multiple and "repeatable" not in (option.help or "") else ""
+    repeated = " May be given several times." if option.multiple and "repeatable" not in (option.help or "").lower() else ""
     return f"{option.help or ''}{repeated}"
