@@ -63,5 +63,6 @@ def _names(option: click.Option) -> str:
 
 
 def _about(option: click.Option) -> str:
-    repeated = " May be given several times." if option.multiple and "repeatable" not in (option.help or "").lower() else ""
-    return f"{option.help or ''}{repeated}"
+    about = option.help or ""
+    repeated = option.multiple and "repeatable" not in about.lower()
+    return f"{about} May be given several times." if repeated else about
