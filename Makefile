@@ -26,11 +26,16 @@ demo: $(VENV)/installed  ## set up, and run the main job in seconds: digits, fou
 	@echo "Then read $(DEMO)/quick/config.yaml, change configs/quick.yaml, or open the data:"
 	@echo "  $(RUN)/python -c \"import spadmnist; print(spadmnist.open('$(DEMO)/quick')['2560 mlux', 'train'].tr[0])\""
 
-test: $(VENV)/installed lint  ## set up, and run the tests (a few minutes)
-	$(RUN)/python -m pytest -m "not slow" -q -n 2 --dist loadfile
+# Neighbours stay together, for what they share, until a worker has nothing left to do. The tests start programs by the
+# hundred: compiled modules are kept for them, wherever the environment says that none be written
+test verify: export PYTHONDONTWRITEBYTECODE =
+PYTEST = $(RUN)/python -m pytest -q -n 2 --dist worksteal
+
+test: $(VENV)/installed lint  ## set up, and run the tests (a quarter of an hour)
+	$(PYTEST) -m "not slow"
 
 verify: $(VENV)/installed  ## the slow statistical and fault tests
-	$(RUN)/python -m pytest -m slow -q -n 2 --dist loadfile
+	$(PYTEST) -m slow
 
 # Tries of each class at most, drawn by lot; more classes have fewer: python scripts/faults.py list
 TRIES ?= 400
