@@ -203,11 +203,14 @@ class _Future:
         self.of.add_done_callback(lambda future: call(self))
 
     def result(self) -> Any:
-        """The result, which is fetched from its worker; where that has died meanwhile, the task is done again."""
+        """The result, which is fetched from its worker; where that has died meanwhile, the task is done again.
+
+        A connection that breaks on the way is no end: whether the scheduler is there is asked anew.
+        """
         while True:
             try:
                 result = self.of.result(timeout=_FETCH)
-            except TimeoutError:
+            except (TimeoutError, OSError):
                 if self.of.status == "error":  # it is the task's own
                     raise
                 self._look()

@@ -584,7 +584,8 @@ def load_file(path: str | Path) -> None:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        # the very text whose digest the manifest holds; and no compiled file is left beside the user's own
+        exec(compile(text.removeprefix("\ufeff"), str(file), "exec"), module.__dict__)
     except BaseException as error:
         del sys.modules[name]
         for registry in _registries:

@@ -28,7 +28,7 @@ from spadmnist.inference.comparison import canonical, compare
 from spadmnist.workers import Serial
 
 distributed = pytest.importorskip("distributed", reason="the cluster's library is not installed")
-from spadmnist.cluster import Cluster  # noqa: E402
+from spadmnist.cluster import Cluster, _Future  # noqa: E402
 
 pytestmark = pytest.mark.slow
 FREE = "tcp://127.0.0.1:9"  # the port of `discard`, where no scheduler is
@@ -300,6 +300,40 @@ def test_a_scheduler_that_dies_in_the_middle(tmp_path: Path) -> None:
         site.end()
     outcome = make(file, tmp_path / "out")
     assert outcome.kept >= 3 and outcome.made
+
+
+def test_a_connection_that_breaks_under_a_result_is_no_error_of_the_task() -> None:
+    """What is there is fetched again; where the scheduler is gone, looking for it says so."""
+
+    class Fetched:
+        status = "finished"
+
+        def __init__(self, *outcomes: Any):
+            self.outcomes = list(outcomes)
+
+        def result(self, timeout: float) -> Any:
+            outcome = self.outcomes.pop(0)
+            if isinstance(outcome, Exception):
+                raise outcome
+            return outcome
+
+        def release(self) -> None:
+            pass
+
+    looks: list[int] = []
+    broken = ConnectionResetError(104, "reset by peer")
+    assert _Future(Fetched(broken, TimeoutError(), 7), lambda: looks.append(1)).result() == 7
+    assert len(looks) == 2
+
+    def gone() -> None:
+        raise SpadError("the scheduler is gone")
+
+    with pytest.raises(SpadError, match="the scheduler is gone"):
+        _Future(Fetched(broken), gone).result()
+    own = Fetched(FileNotFoundError(2, "no such map"))
+    own.status = "error"
+    with pytest.raises(FileNotFoundError):
+        _Future(own, gone).result()
 
 
 def test_ctrl_c_ends_within_five_seconds(many: tuple[Path, Path], site: Site, tmp_path: Path) -> None:

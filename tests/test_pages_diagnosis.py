@@ -109,6 +109,8 @@ def answer_of(**options: Any) -> Diagnosis:
         "unexplained": [
             {"statistic": "multiplicity", "capture": "dark", "significance": 40.1, "where": "12 pixels within 1 ns"}
             | {"size": "31 clusters, 0 expected", "deviation": 1},
+            {"statistic": "spacing", "capture": "dark", "significance": 30.0, "where": "near", "deviation": 1},
+            {"statistic": "spacing", "capture": "flat", "significance": 20.0, "where": "near", "deviation": 1},
             {"statistic": "rate", "capture": None, "significance": 6.5, "where": "all pixels"},
         ],
         "ladder": [
@@ -215,11 +217,10 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
         "Further deviations": ("spectrum of flat",),
         "What remains": (
             "correlated between neighbouring pixels; it is in the dark captures, too",
-            "multiplicity "
+            "12 pixels within 1 ns: 31 clusters, 0 expected multiplicity of dark "
             + Statistic.registry.find("multiplicity").summary()
-            + " dark 40.1 sigma 12 pixels within 1 ns",
-            "31 clusters, 0 expected",
-            "rate The detections of the whole capture. all 6.5 sigma all pixels",
+            + " 40.1 sigma spacing of dark, flat",
+            "all pixels rate of all captures The detections of the whole capture. 6.5 sigma -",
         ),
         "What to measure next": ("To separate one from two: take dark, 100 s", "differ by 1.3 sigma now", "9.0 sigma"),
         "What is not there": (

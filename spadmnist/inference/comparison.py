@@ -28,7 +28,7 @@ from ..statistics import Summary
 from ..workers import Executor, executor
 from .candidates import with_values
 from .coordinates import Key, Values
-from .deviations import Deviation, deviations, excess
+from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
@@ -44,7 +44,6 @@ from .replicates import (
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
 _LEAST_P = 1e-300  # a p-value is never 0
-_GROUPS = 8  # deviations that a terminal lists
 
 
 @dataclass(frozen=True)
@@ -429,10 +428,7 @@ def found_in(check: Check) -> str:
 
 def others_of(group: Sequence[Check]) -> str:
     """The checks behind the first of a group as text, "multiplicity of flat and dark; spacing of flat"."""
-    by_statistic: dict[str, list[str]] = {}
-    for check in group[1:]:
-        by_statistic.setdefault(check.statistic, []).append(check.capture or "all captures")
-    return "; ".join(f"{name} of {', '.join(captures)}" for name, captures in by_statistic.items())
+    return listed((check.statistic, check.capture) for check in group[1:])
 
 
 def table(comparison: Comparison) -> str:
@@ -448,14 +444,14 @@ def table(comparison: Comparison) -> str:
             lines += textwrap.wrap(f"The same deviation is in {others_of(groups[0])}.", 100)
         elif len(groups) > 1:
             lines += [f"{len(groups)} deviations, the clearest first:", ""]
-        for k, group in enumerate(groups[:_GROUPS] if len(groups) > 1 else [], 1):
+        for k, group in enumerate(groups[:LISTED] if len(groups) > 1 else [], 1):
             first, also = group[0], others_of(group)
             text = f"{found_in(first)} ({first.statistic}, p = {first.p_value:.1g})"
             lines += textwrap.wrap(text, 100, initial_indent=f"{k:>3}. ", subsequent_indent="     ")
             if also:
                 lines += textwrap.wrap(f"also in {also}", 100, initial_indent="     ", subsequent_indent="     ")
-        if len(groups) > _GROUPS:
-            lines.append(f"... and {len(groups) - _GROUPS} more (--json FILE or -o REPORT holds all)")
+        if len(groups) > LISTED:
+            lines.append(f"... and {len(groups) - LISTED} more (--json FILE or -o REPORT holds all)")
     else:
         lines.append(f"The model is adequate: none of {number} checks fails.")
         closest = sorted(comparison.checks, key=lambda c: c.p_value)[1:3]

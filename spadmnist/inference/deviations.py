@@ -15,7 +15,7 @@ seen only when the strong one is in the model.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ from .levels import LEAST_FALL
 _LIKE = 0.5  # least cosine of the residuals of two captures that look at the same place
 # chi square, 20 standard deviations: beyond it the scales of different laws have no common measure, and all is certain
 _CERTAIN = 400.0
+LISTED = 8  # deviations that a terminal lists: what fits on a screen
 _NEAR = 0.1  # relative: the most by which two places on an axis differ that are the same
 
 
@@ -109,6 +110,14 @@ def deviations(found: Sequence[Deviation], passing: Collection[tuple[str | None,
     clear = [max(found[i].excess for i in members) for members in out]
     order = sorted(range(len(out)), key=lambda k: (-min(clear[k], _CERTAIN), -found[out[k][0]].specific, -clear[k]))
     return [out[k] for k in order]
+
+
+def listed(checks: Iterable[tuple[str, str | None]]) -> str:
+    """Checks (statistic, capture) as text, "multiplicity of flat, dark; spacing of flat"."""
+    by_statistic: dict[str, list[str]] = {}
+    for statistic, capture in checks:
+        by_statistic.setdefault(statistic, []).append(capture or "all captures")
+    return "; ".join(f"{name} of {', '.join(captures)}" for name, captures in by_statistic.items())
 
 
 def _holds(one: Deviation, other: Deviation) -> bool:

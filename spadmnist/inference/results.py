@@ -19,6 +19,7 @@ from ..statistics import Statistic, Summary
 from .candidates import Candidate
 from .comparison import Comparison, headline
 from .coordinates import Coordinate, Key
+from .deviations import LISTED, listed
 from .replicates import Cell
 
 if TYPE_CHECKING:
@@ -252,12 +253,15 @@ def table(found: Diagnosis) -> str:
     lines += columns(rows)
     if found.unexplained:
         lines += ["", "What remains, the clearest first:"]
-        lines += columns(
-            [
-                (r["statistic"], r["capture"] or "all", f"{r['significance']:.1f} sigma", r["where"], r.get("size", ""))
-                for r in found.unexplained[:8]
-            ]
-        )
+        groups = remaining(found)
+        for k, (first, *others) in enumerate(groups[:LISTED], 1):
+            text = f"{_found_in(first)} ({first['statistic']}, {first['significance']:.1f} sigma)"
+            lines += textwrap.wrap(text, 100, initial_indent=f"{k:>3}. ", subsequent_indent="     ")
+            if others:
+                also = f"also in {listed((r['statistic'], r['capture']) for r in others)}"
+                lines += textwrap.wrap(also, 100, initial_indent="     ", subsequent_indent="     ")
+        if len(groups) > LISTED:
+            lines.append(f"... and {len(groups) - LISTED} more (--json FILE or the report holds them)")
         near = [named(other) for other in found.unexplained[0].get("alternatives", [])]
         if near:
             text = f"Nearest, but it explains too little of its own cells: {', '.join(near)}."
@@ -299,8 +303,22 @@ def remains(found: Diagnosis) -> str:
     if not found.unexplained:
         return ""
     first = found.unexplained[0]
-    size = f": {first['size']}" if first.get("size") else f" ({first['significance']:.1f} sigma)"
-    return f"{first['where']}, in {first['capture'] or 'all captures'}{size} ({first['statistic']})"
+    size = "" if first.get("size") else f" ({first['significance']:.1f} sigma)"
+    return f"{_found_in(first)}{size} ({first['statistic']})"
+
+
+def _found_in(entry: Mapping[str, Any]) -> str:
+    """Where a check that fails deviates most, in which capture, and by how much, where that has a size."""
+    size = f": {entry['size']}" if entry.get("size") else ""
+    return f"{entry['where']}, in {entry['capture'] or 'all captures'}{size}"
+
+
+def remaining(found: Diagnosis) -> list[list[dict[str, Any]]]:
+    """The checks that still fail, by the deviation they show: in each group the one that names it first."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for k, entry in enumerate(found.unexplained):
+        groups.setdefault(entry.get("deviation", -k), []).append(entry)
+    return list(groups.values())
 
 
 def named(entry: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from .. import reference, units
 from ..inference import next_step, results
 from ..inference.comparison import headline
+from ..inference.deviations import listed
 from ..inference.results import Diagnosis, Step, Trace, Value
 from . import _figures as figures
 from ._figures import MEASURED, ROUGH, Cells, Picture
@@ -134,8 +135,10 @@ def _words(found: Diagnosis, maps: Mapping[int, OddPixels]) -> dict[str, Any]:
         "fallen": _fallen(found),
         "steps": steps,
         "others": [one for one in pictures if one.trace.step is None],
-        "remains": found.unexplained[:_MOST],
-        "titles": {str(r["statistic"]): title_of(str(r["statistic"])) for r in found.unexplained},
+        "remains": [
+            (first, title_of(str(first["statistic"])), listed((r["statistic"], r["capture"]) for r in others))
+            for first, *others in results.remaining(found)[:_MOST]
+        ],
         "mechanism": results.mechanism(found.unexplained, found.dark) if found.unexplained else "",
         "limits": [(e, *_limit(e)) for e in found.excluded[:_MOST]],
         "hidden": [(e["effect"], _about(e["effect"])) for e in found.invisible[:_MOST]],
@@ -371,7 +374,7 @@ main { max-width: 1160px; }
 .rungs .placebo td { color: var(--soft); }
 .rungs .floor td { border-top: 2px dashed var(--good); color: var(--good); }
 .list th { overflow-wrap: normal; }
-.list td:first-child { min-width: 9em; overflow-wrap: break-word; } .remains td:last-child { min-width: 10em; }
+.list td:first-child { min-width: 9em; overflow-wrap: break-word; }
 .list .figure { white-space: nowrap; font-variant-numeric: tabular-nums; }
 .chosen td { font-weight: 600; }
 .pair { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
@@ -475,15 +478,15 @@ that scatter (sigmas); coloured lines are the residuals before of further captur
 {% if remains %}
 <h2>What remains</h2>
 <p>{{ mechanism[:1] | upper }}{{ mechanism[1:] }}.</p>
-<div class="wide"><table class="list remains">
-<thead><tr><th>statistic</th><th>capture</th><th>significance</th><th>clearest place and size</th></tr></thead>
+<div class="wide"><table class="list">
+<thead><tr><th>deviation, its clearest place and size</th><th>significance</th><th>also in</th></tr></thead>
 <tbody>
-{% for entry in remains %}
-<tr><td><b>{{ entry.statistic }}</b>\
-{% if loop.changed(entry.statistic) %}<br><span class="small">{{ titles[entry.statistic] }}</span>{% endif %}</td>\
-<td>{{ entry.capture or "all" }}</td>\
-<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td><td>{{ entry.where }}\
-{% if entry.get('size') %}: <b>{{ entry['size'] }}</b>{% endif %}</td></tr>
+{% for entry, title, others in remains %}
+<tr><td>{{ entry.where }}{% if entry.get('size') %}: <b>{{ entry['size'] }}</b>{% endif %}<br>\
+<span class="small"><b>{{ entry.statistic }}</b> of <b>{{ entry.capture or "all captures" }}</b> &middot; {{ title }}\
+</span></td>\
+<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td>\
+<td class="small">{{ others or "-" }}</td></tr>
 {% endfor %}
 </tbody></table></div>
 {% endif %}
