@@ -219,8 +219,8 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
             "correlated between neighbouring pixels; it is in the dark captures, too",
             "12 pixels within 1 ns: 31 clusters, 0 expected multiplicity of dark "
             + Statistic.registry.find("multiplicity").summary()
-            + " 40.1 sigma spacing of dark, flat",
-            "all pixels rate of all captures The detections of the whole capture. 6.5 sigma -",
+            + " also in spacing of dark, flat 40.1 sigma",
+            "all pixels rate of all captures The detections of the whole capture. 6.5 sigma",
         ),
         "What to measure next": ("To separate one from two: take dark, 100 s", "differ by 1.3 sigma now", "9.0 sigma"),
         "What is not there": (

@@ -479,14 +479,13 @@ that scatter (sigmas); coloured lines are the residuals before of further captur
 <h2>What remains</h2>
 <p>{{ mechanism[:1] | upper }}{{ mechanism[1:] }}.</p>
 <div class="wide"><table class="list">
-<thead><tr><th>deviation, its clearest place and size</th><th>significance</th><th>also in</th></tr></thead>
+<thead><tr><th>deviation, its clearest place and size</th><th>significance</th></tr></thead>
 <tbody>
 {% for entry, title, others in remains %}
 <tr><td>{{ entry.where }}{% if entry.get('size') %}: <b>{{ entry['size'] }}</b>{% endif %}<br>\
 <span class="small"><b>{{ entry.statistic }}</b> of <b>{{ entry.capture or "all captures" }}</b> &middot; {{ title }}\
-</span></td>\
-<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td>\
-<td class="small">{{ others or "-" }}</td></tr>
+{% if others %}<br>also in {{ others }}{% endif %}</span></td>\
+<td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td></tr>
 {% endfor %}
 </tbody></table></div>
 {% endif %}
@@ -572,7 +571,8 @@ measured.</p>
 
 {% if limits %}
 <h2>What is not there</h2>
-<details><summary>95 % upper limits of {{ limits | length }} parameters</summary>
+<details><summary>95 % upper limits of {{ limits | length }} \
+{{ "parameter" if limits | length == 1 else "parameters" }}</summary>
 <div class="wide"><table class="list">
 <thead><tr><th>effect</th><th>parameter</th><th>at most</th></tr></thead>
 <tbody>
@@ -599,7 +599,7 @@ measured.</p>
 
 {% if hidden %}
 <h2>What this measurement cannot show</h2>
-<details><summary>{{ hidden | length }} effects</summary>
+<details><summary>{{ hidden | length }} {{ "effect" if hidden | length == 1 else "effects" }}</summary>
 <dl class="words">
 {% for effect, meaning in hidden %}
 <dt>{{ effect }}</dt><dd>{{ meaning }}</dd>
