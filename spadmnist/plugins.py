@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import importlib
+import importlib.abc
 import importlib.metadata
 import importlib.util
 import inspect
@@ -558,6 +559,21 @@ def import_folder(place: str) -> None:
         importlib.import_module(f"{place}.{module.name}")
 
 
+class _Read(importlib.abc.SourceLoader):
+    """Runs the very text whose digest a manifest holds, and leaves no compiled file beside the user's own."""
+
+    def __init__(self, file: str, text: str):
+        self.file, self.text = file, text
+
+    def get_filename(self, fullname: str) -> str:
+        return self.file
+
+    def get_data(self, path: str | bytes) -> bytes:
+        if path != self.file:
+            raise FileNotFoundError(path)
+        return self.text.encode()
+
+
 def load_file(path: str | Path) -> None:
     """Run a user's plug-in file (`--plugin FILE.py`), once. Raises EffectError with file and line."""
     discover()
@@ -578,14 +594,15 @@ def load_file(path: str | Path) -> None:
         raise EffectError(f"{path}: the plug-in cannot be read ({why}); name a Python file") from None
     digest = hashlib.sha256(text.encode()).hexdigest()
     name = f"{_MODULE}{file.stem}_{digest[:12]}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
+    if file.suffix != ".py":
         raise EffectError(f"{path}: a plug-in is a Python file; its name ends in .py")
+    loader = _Read(str(file), text)
+    spec = importlib.util.spec_from_file_location(name, file, loader=loader)
+    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        # the very text whose digest the manifest holds; and no compiled file is left beside the user's own
-        exec(compile(text.removeprefix("\ufeff"), str(file), "exec"), module.__dict__)
+        loader.exec_module(module)
     except BaseException as error:
         del sys.modules[name]
         for registry in _registries:

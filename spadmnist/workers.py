@@ -38,8 +38,7 @@ _LEAST = 2 << 30  # bytes of it, from which on the folder is put there
 _PREFIX = "spadmnist-workers-"
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
-# joblib sets it when it is imported, and leaves it there; here it is for workers alone
-_JOBLIB = {"KMP_INIT_AT_FORK": os.environ.get("KMP_INIT_AT_FORK", "FALSE")}
+_PLACE = "SPADMNIST_WORKERS"  # names another folder for it
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
     *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
@@ -237,7 +236,7 @@ class Loky(Executor):
         # what libraries warn programmers of is nothing for users; the tracker that cleans up behind workers warns, too
         debugging = os.environ.get("SPADMNIST_DEBUG")
         silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
-        quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence), **_JOBLIB}
+        quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
         with safe_path(), _environment({**quiet, **compiled.for_workers()}):
             clear_once(os.getpid())
             _own_place(os.getpid())
@@ -249,8 +248,8 @@ class Loky(Executor):
     def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
         import multiprocessing.resource_tracker
 
-        from joblib.externals.loky import get_reusable_executor
-        from joblib.externals.loky.backend import resource_tracker
+        from loky import get_reusable_executor
+        from loky.backend import resource_tracker
 
         for tracker in (resource_tracker, multiprocessing.resource_tracker):  # may unblock the signal as they start
             tracker.ensure_running()
@@ -274,15 +273,15 @@ class Loky(Executor):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _is_death(self, error: BaseException) -> bool:
-        from joblib.externals.loky.process_executor import TerminatedWorkerError
+        from loky.process_executor import TerminatedWorkerError
 
         return isinstance(error, TerminatedWorkerError)
 
     def _end(self) -> None:
         import multiprocessing
 
-        from joblib.externals.loky import get_reusable_executor
-        from joblib.externals.loky.backend.process import LokyProcess
+        from loky import get_reusable_executor
+        from loky.backend.process import LokyProcess
 
         with contextlib.suppress(OSError, RuntimeError):  # where no process or thread could be started
             get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
@@ -319,7 +318,7 @@ def _own_place(process: int) -> None:
     folder, handle = held
     atexit.register(_remove_own, folder, handle, process)  # loky's own come later, and so are called before it
     if _MEMORY.is_dir():
-        from joblib.externals.loky.backend.synchronize import SemLock
+        from loky.backend.synchronize import SemLock
 
         names = SemLock._rand
         SemLock._rand = _Names(folder.name, names.names if isinstance(names, _Names) else names)
@@ -356,7 +355,7 @@ def clear() -> int:
 
 def _places(all_of_them: bool = False) -> Iterator[Path]:
     """Where the folder may lie."""
-    if told := os.environ.get("JOBLIB_TEMP_FOLDER"):
+    if told := os.environ.get(_PLACE):
         yield Path(told)
     with contextlib.suppress(OSError):
         space = os.statvfs(_MEMORY)

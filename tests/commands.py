@@ -23,7 +23,7 @@ _SECONDS = 120.0
 
 _SERVER = """
 import json, os, sys
-import h5py, joblib, numpy, scipy.special, scipy.stats, yaml, zarr
+import h5py, loky, numpy, scipy.special, scipy.stats, yaml, zarr
 import spadmnist.cli, spadmnist.inference.model_selection, spadmnist.factory, spadmnist.verify
 from spadmnist import kernels
 

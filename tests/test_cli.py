@@ -79,7 +79,7 @@ def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     loaded = set(result.stdout.partition("LOADED")[2].split())
     assert "spadmnist.cli" in loaded, result.stderr
-    assert not loaded & {"numpy", "numba", "zarr", "h5py", "scipy", "joblib", "pydantic", "matplotlib", "yaml"}
+    assert not loaded & {"numpy", "numba", "zarr", "h5py", "scipy", "loky", "pydantic", "matplotlib", "yaml"}
 
 
 def test_help_is_there_at_once() -> None:

@@ -163,8 +163,8 @@ def test_no_process_is_to_be_had(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The second worker's; the first one is not left behind."""
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.backend import popen_loky_posix
+    from loky import get_reusable_executor
+    from loky.backend import popen_loky_posix
 
     get_reusable_executor(max_workers=1).shutdown(wait=True)  # idle workers of another test would do this one's work
     launch, launched = popen_loky_posix.Popen._launch, []

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ast
 import functools
+import importlib.metadata
 import re
 import subprocess
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -137,7 +140,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ("tqdm", {"cli/_terminal.py"}),
         ("pyarrow", {"image_exporters.py"}),
         ("yaml", {"document.py"}),
-        ("joblib", {"workers.py"}),
+        ("loky", {"workers.py"}),
         ("distributed", {"cluster.py"}),
         ("dask", {"cluster.py"}),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),
@@ -162,6 +165,29 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
 def test_a_library_has_its_place(package: str, owners: set[str]) -> None:
     users = {f for f in MODULES for _, name in imports(f, with_types=True) if name.split(".")[0] == package}
     assert users <= owners
+
+
+def _named(requirement: str) -> str:
+    """The name of a distribution in a requirement, as names are compared."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
+    """A distribution that another one brings counts as declared only in a module that imports that other one."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {_named(r) for r in project["dependencies"]}
+    extras = {_named(r) for name, some in project["optional-dependencies"].items() if name != "dev" for r in some}
+    owners = {name: {_named(d) for d in some} for name, some in importlib.metadata.packages_distributions().items()}
+    found: set[str] = set()
+    for file in MODULES:
+        tops = {name.split(".")[0] for _, name in imports(file)} - set(sys.stdlib_module_names) - {"spadmnist"}
+        here = {top: owners[top] for top in tops & owners.keys()}  # what is not installed cannot be looked up
+        declared = {d for some in here.values() for d in some & (needed | extras)}
+        brought = {_named(r) for d in declared for r in importlib.metadata.requires(d) or [] if "extra ==" not in r}
+        missing = {top for top, some in here.items() if not some & (declared | brought)}
+        assert not missing, f"{file} imports {missing}, which pyproject.toml does not declare"
+        found |= declared
+    assert needed <= found, f"declared and never imported: {needed - found}"
 
 
 def calls(file: str) -> Iterator[tuple[int, str]]:

@@ -110,7 +110,7 @@ def lay_decoys(watched: Watched, folder: Path, command: list[str] | None = None)
 
 def test_the_runs_that_are_watched_have_workers_and_ask_for_what_matters(watched: Watched) -> None:
     assert watched.processes >= 2 * (1 + 2)
-    assert {"numpy", "numba", "joblib", "psutil", "pickle", "h5py", "typing", "__future__"} <= watched.names
+    assert {"numpy", "numba", "loky", "psutil", "pickle", "h5py", "typing", "__future__"} <= watched.names
 
 
 def test_compare_runs_nothing_of_the_current_folder(watched: Watched, tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ MEMORY = Path("/dev/shm")
 
 def holding(place: Path, *arguments: str) -> subprocess.Popen[str]:
     """A process whose workers have done something, in a group of its own."""
-    environment = {**os.environ, "JOBLIB_TEMP_FOLDER": str(place)}
+    environment = {**os.environ, "SPADMNIST_WORKERS": str(place)}
     command = [sys.executable, "-c", HOLDING, *arguments]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
@@ -269,13 +269,13 @@ def test_the_next_run_removes_what_a_killed_one_left_and_nothing_of_a_living_one
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
-        monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+        monkeypatch.setenv("SPADMNIST_WORKERS", str(tmp_path))
         workers.clear()
 
 
 def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of another user, and one that is held; the same is removed when it is ours and nobody's."""
-    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    monkeypatch.setenv("SPADMNIST_WORKERS", str(tmp_path))
     folder = tmp_path / "spadmnist-workers-abcdefgh"
     folder.mkdir()
     with monkeypatch.context() as other:
@@ -294,7 +294,7 @@ def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.skipif(not MEMORY.is_dir(), reason="semaphores are no files here")
 def test_a_run_without_workers_removes_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the verbs work with --jobs 1."""
-    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    monkeypatch.setenv("SPADMNIST_WORKERS", str(tmp_path))
     folder = tmp_path / f"spadmnist-workers-{os.getpid()}alone"
     folder.mkdir()
     (folder / "array").write_bytes(b"left")
