@@ -9,6 +9,7 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,17 @@ from spadmnist import (
 )
 from spadmnist.dataset import Shard
 from spadmnist.disk import Files
+from spadmnist.effects import Conditions
 from spadmnist.errors import ConfigError, InputError
-from spadmnist.events import Layout
+from spadmnist.events import Events, Layout
 from spadmnist.experiment import Level
 from spadmnist.import_options import Said
 from spadmnist.importers import detections, light
 from spadmnist.importers.captures import import_files
 from spadmnist.importers.frames import Npz, Tif
+from spadmnist.inference.replicates import statistics_for
+from spadmnist.recording import Capture, Light, Recording
+from spadmnist.statistics import _order
 from spadmnist.statistics.integrity import Gaps
 
 CAPTURES = """format: spadmnist-measurement/1
@@ -190,6 +195,38 @@ def test_a_detection_costs_its_stamp(what: str, many: Path, tmp_path: Path, monk
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 4.9 * STAMPS, most / STAMPS
+
+
+@pytest.mark.parametrize("places", [None, 7])
+@pytest.mark.parametrize("bursts", [False, True])
+def test_detections_piece_by_piece_are_reduced_alike(
+    places: int | None, bursts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of every statistic that goes through them in the order of time, whatever the pieces."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    pixels, exposure, tick = 35, 4e-3, 1e-9
+    positions = None if places is None else rng.random((pixels, 2)) * 1e-4
+    layout = Layout(*((7, 5) if positions is None else (1, pixels)), 1.0, 1.0, positions)
+    stamps = rng.integers(0, 4_000_000, 6000)
+    if bursts:
+        stamps[:2000] = rng.integers(1_000_000, 1_000_300, 2000)
+    pixel = rng.integers(0, pixels, 6000)
+    order = np.lexsort((stamps, pixel))
+    rows = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))])
+    made = Events(None, rows, pixels, stamps[order].astype(np.uint32), tick, end=exposure)
+    capture = Capture("a", "tr", Light(500e-9, 1.0), Conditions(exposure, 1, exposure, exposure, 500e-9))
+    recording = Recording(capture, layout, made, None, tick, 20e-9)
+    kinds = [kind for kind in statistics_for(capture) if type(kind).__module__.startswith("spadmnist.")]
+    whole = [kind.reduce(recording) for kind in kinds]
+    monkeypatch.setattr(_order, "_MOST_HELD", 0)
+    monkeypatch.setattr(_order, "_AT_ONCE", 64)
+    for piece in (100, 1500):
+        monkeypatch.setattr(_order, "_PIECE", piece)
+        fresh = replace(recording, _kept={})
+        for kind, before in zip(kinds, whole, strict=True):
+            after = kind.reduce(fresh)
+            assert (before is None) == (after is None)
+            assert before is None or np.array_equal(before.values, after.values, equal_nan=True), kind.name
 
 
 def test_more_detections_than_can_be_held_are_refused(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,8 +89,9 @@ class ReducedCapture:
                 summaries[statistic.name] = summary.apart()
         counts = np.asarray(recording.totals, float)
         last = None
-        if recording.events is not None and len(recording.events.times):
-            last = float(recording.events.times.max())
+        if recording.events is not None and len(recording.events):
+            stamps, unit = recording.events.stamps
+            last = float(stamps.max() * unit)
         waited = None if recording.waited is None else recording.waited[0]
         shortest = ShortestIntervals.of(recording)
         capture = replace(recording.capture, tick=recording.tick)
