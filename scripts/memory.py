@@ -6,7 +6,7 @@
 
 Each file is made in a temporary folder, and is gone before the next one is made. The table goes to standard output:
 the peak resident memory of each verb's largest process, in MB (of `compare` that of all its processes together, shared
-pages counted once, as sampled). Linux only.
+pages counted once, as sampled; +: it was ended after the seconds of --compare). Linux only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ PIECE = 1 << 20  # detections, bytes of frames that are made at a time
 SIDE = 512  # pixels, of a frame
 PIXELS = 64  # of detections
 TICKS = 4_000_000_000  # of an exposure: stamps of 4 bytes
-SECONDS = 900.0  # that a verb may take: what it took until then is in the table, with a mark
 DETECTIONS = ["--exposure", "4 s", "--rows", "8", "--columns", "8", "--light", "500 nm 1 nW/cm^2"]
 CLOCK = ["--frame-time", "10 us", "--frame-period", "10 us", "--light", "500 nm 1 nW/cm^2"]
 SENSOR = """sensor:
@@ -42,6 +41,7 @@ SENSOR = """sensor:
   layout: {rows: %d, columns: %d, pixel_area: 25 um^2}
   effects:
     detection: {pdp: 0.5}
+    dead_time: {duration: 20 ns}
     tdc: {resolution: %s}
 """
 
@@ -139,7 +139,7 @@ def npz_frames(path: Path, size: int, dtype: str, most: int) -> None:
 
 def ptu(path: Path, size: int) -> None:
     """T2 records of HydraHarp 2, an overflow where the clock goes round."""
-    importfiles.ptu(path, [], declared=0)
+    importfiles.ptu(path, [], declared=0, MeasDesc_GlobalResolution=1e-9)
     at, rounds, written = path.stat().st_size, 0, 0
     with open(path, "r+b") as file:
         file.seek(at)
@@ -153,7 +153,9 @@ def ptu(path: Path, size: int) -> None:
             records = np.insert(records, at_overflow, overflows)
             file.write(records.tobytes())
             written += len(records)
-    importfiles_header = importfiles.ptu(path.with_suffix(".head"), [], declared=written)
+    importfiles_header = importfiles.ptu(
+        path.with_suffix(".head"), [], declared=written, MeasDesc_GlobalResolution=1e-9
+    )
     with open(path, "r+b") as file:
         file.write(importfiles_header.read_bytes())
     importfiles_header.unlink()
@@ -167,13 +169,13 @@ def csv(path: Path, size: int) -> None:
 
 
 def linospad2(path: Path, size: int) -> None:
-    """Cycles of 65 converters with 512 words each, nearly all of them valid, of the firmware 2212b."""
+    """Cycles of 65 converters with 512 words each, half of them valid, of the firmware 2212b."""
     rng = np.random.Generator(np.random.PCG64(1))
     with open(path, "wb") as file:
         for _ in range(size // (65 * 512 * 4)):
             codes = np.sort(rng.integers(0, 1 << 27, (65, 512), np.uint32), axis=1)
             words = (1 << 31 | rng.integers(0, 4, (65, 512), np.uint32) << 28 | codes).astype("<u4")
-            words[:, -int(rng.integers(1, 20)) :] = 0
+            words[:, 256:] = 0
             file.write(words.tobytes())
 
 
@@ -261,8 +263,11 @@ _MIDDLE = (
 )
 
 
-def peak(arguments: list[str], place: Path, ok: tuple[int, ...] = (0,)) -> str:
-    """The peak memory of a command of spadmnist in MB: of its largest process, or of all together where it has more."""
+def peak(arguments: list[str], place: Path, seconds: float = 900.0, ok: tuple[int, ...] = (0,)) -> str:
+    """The peak memory of a command of spadmnist in MB: of its largest process, or of all together where it has more.
+
+    seconds: after which it is ended; the peak until then has a mark.
+    """
     said = place / "said"
     command = [sys.executable, "-c", _MIDDLE, str(said), sys.executable, "-m", "spadmnist.cli", *arguments]
     environment = {**os.environ, "SPADMNIST_CACHE": str(place / "cache")}
@@ -271,7 +276,7 @@ def peak(arguments: list[str], place: Path, ok: tuple[int, ...] = (0,)) -> str:
         while run.poll() is None:
             together = max(together, sum(map(_pss, _below(run.pid))))
             time.sleep(0.1)
-            if time.monotonic() - begun > SECONDS:
+            if time.monotonic() - begun > seconds:
                 cut = True
                 os.killpg(run.pid, 9)
                 break
@@ -301,8 +306,8 @@ def _pss(pid: int) -> int:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:")), 0)
 
 
-def measured(name: str, kind: Kind, size: int, place: Path, compared: bool) -> dict[str, str]:
-    """Peaks by verb."""
+def measured(name: str, kind: Kind, size: int, place: Path, compare: tuple[float, int]) -> dict[str, str]:
+    """Peaks by verb. compare: how long it may take, s, and its --jobs."""
     path, lab = place / name, place / "lab"
     subprocess.run([sys.executable, __file__, "--make", name, str(path), "--size", str(size >> 20)], check=True)
     row = {"file": f"{name}, {path.stat().st_size / 1e6:,.0f} MB"}
@@ -318,8 +323,9 @@ def measured(name: str, kind: Kind, size: int, place: Path, compared: bool) -> d
         out = place / f"out-{format_}"
         row[format_] = peak(["export", str(lab), "--format", format_, "-o", str(out)], place)
         shutil.rmtree(out, ignore_errors=True)
-    if compared:
-        row["compare"] = peak(["compare", str(sensor), str(lab), "--jobs", "1"], place, (0, 1))
+    seconds, jobs = compare
+    if seconds:
+        row["compare"] = peak(["compare", str(sensor), str(lab), "--jobs", str(jobs)], place, seconds, (0, 1))
     return row
 
 
@@ -327,7 +333,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=["*"], help=f"which of {', '.join(KINDS)}")
     parser.add_argument("--size", type=int, default=380, help="MiB of a file, about")
-    parser.add_argument("--compare", action="store_true", help="compare, too, with a simple sensor")
+    parser.add_argument("--compare", type=float, default=0.0, metavar="SECONDS", help="compare, too, for so long")
+    parser.add_argument("--jobs", type=int, default=1, help="of compare")
     parser.add_argument("--make", action="store_true", help=argparse.SUPPRESS)
     said = parser.parse_args()
     if said.make:
@@ -339,7 +346,7 @@ def main() -> None:
     for name, kind in KINDS.items():
         if any(fnmatch.fnmatch(name, wanted) for wanted in said.names):
             with tempfile.TemporaryDirectory(prefix="memory-") as place:
-                row = measured(name, kind, said.size << 20, Path(place), said.compare)
+                row = measured(name, kind, said.size << 20, Path(place), (said.compare, said.jobs))
             print("| " + " | ".join(row.get(column, "") for column in columns) + " |", flush=True)
 
 
