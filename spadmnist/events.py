@@ -165,6 +165,13 @@ class Events:
             self._times = self.ticks * self.tick
         return self._times
 
+    @property
+    def stamps(self) -> tuple[np.ndarray, float]:
+        """((events,) ticks, s of one), or times and 1.0 where there is no converter; no memory is taken."""
+        if self.ticks is None or self.tick is None:
+            return self.times, 1.0
+        return self.ticks, self.tick
+
     def times_of(self, part: slice) -> np.ndarray:
         """s, of some events; nothing is kept."""
         if self.ticks is None or self.tick is None:

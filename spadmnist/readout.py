@@ -191,8 +191,9 @@ class Recorded:
 
     @staticmethod
     def joined_pixels(parts: Iterable[Recorded], pixels: int) -> Recorded:
-        """One image of its parts, whose pixels follow each other; pixels: their number. Packed bits are held once."""
+        """One image of its parts, whose pixels follow each other; pixels: their number. What is large is held once."""
         bits, row, rest = np.zeros((0, 0), np.uint8), 0, []
+        ticks, used, tick = np.zeros(0, np.uint32), 0, None
         for part in parts:
             if part.frames is not None and part.frames.cause is None:
                 found = part.frames.bits
@@ -200,9 +201,22 @@ class Recorded:
                 bits[row : row + len(found)] = found
                 row += len(found)
                 part = replace(part, frames=replace(part.frames, bits=np.zeros((len(found), 0), np.uint8)))
+            if part.tr is not None and part.tr.ticks is not None and part.tr.cause is None:
+                some, tick = part.tr.ticks, part.tr.tick
+                ticks = ticks if used else ticks.astype(some.dtype)
+                if used + len(some) > len(ticks):  # it grows where it lies
+                    ticks.resize(used + len(some) + used // 16, refcheck=False)
+                ticks[used : used + len(some)] = some
+                used += len(some)
+                part = replace(part, tr=part.tr.stamped(some[:0].copy(), float(tick or 0.0)))
             rest.append(part._regrouped(1))
         whole = Recorded.join(rest)._regrouped(pixels)
-        return whole if whole.frames is None or not row else replace(whole, frames=replace(whole.frames, bits=bits))
+        if whole.frames is not None and row:
+            whole = replace(whole, frames=replace(whole.frames, bits=bits))
+        if whole.tr is not None and tick is not None:
+            ticks.resize(used, refcheck=False)
+            whole = replace(whole, tr=whole.tr.stamped(ticks, tick))
+        return whole
 
     @staticmethod
     def join(parts: list[Recorded]) -> Recorded:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import struct
 import subprocess
 import sys
 import tracemalloc
+import weakref
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +37,18 @@ from spadmnist import (
 )
 from spadmnist.dataset import Shard
 from spadmnist.disk import Files
+from spadmnist.effects import Conditions
 from spadmnist.errors import ConfigError, InputError
-from spadmnist.events import Layout
+from spadmnist.events import Events, Layout
 from spadmnist.experiment import Level
 from spadmnist.import_options import Said
 from spadmnist.importers import detections, light
 from spadmnist.importers.captures import import_files
 from spadmnist.importers.frames import Npz, Tif
+from spadmnist.inference.replicates import statistics_for
+from spadmnist.readout import Recorded
+from spadmnist.recording import Capture, Light, Recording
+from spadmnist.statistics import _order
 from spadmnist.statistics.integrity import Gaps
 
 CAPTURES = """format: spadmnist-measurement/1
@@ -190,6 +198,68 @@ def test_a_detection_costs_its_stamp(what: str, many: Path, tmp_path: Path, monk
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 4.9 * STAMPS, most / STAMPS
+
+
+def stamped(bursts: bool = False, positions: bool = False) -> Recording:
+    """6,000 detections of 35 pixels in 4 ms, a third of them in 300 ns."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    pixels, exposure, tick = 35, 4e-3, 1e-9
+    places = rng.random((pixels, 2)) * 1e-4 if positions else None
+    layout = Layout(1, pixels, 1.0, 1.0, places) if positions else Layout(7, 5, 1.0, 1.0)
+    stamps, pixel = rng.integers(0, 4_000_000, 6000), rng.integers(0, pixels, 6000)
+    if bursts:
+        stamps[:2000] = rng.integers(1_000_000, 1_000_300, 2000)
+    rows = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=pixels))])
+    ticks = stamps[np.lexsort((stamps, pixel))].astype(np.uint32)
+    capture = Capture("a", "tr", Light(500e-9, 1.0), Conditions(exposure, 1, exposure, exposure, 500e-9))
+    return Recording(capture, layout, Events(None, rows, pixels, ticks, tick, end=exposure), None, tick, 20e-9)
+
+
+@pytest.mark.parametrize("positions", [False, True])
+@pytest.mark.parametrize("bursts", [False, True])
+def test_detections_piece_by_piece_are_reduced_alike(
+    bursts: bool, positions: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By every statistic, whatever the pieces."""
+    recording = stamped(bursts, positions)
+    kinds = [kind for kind in statistics_for(recording.capture) if type(kind).__module__.startswith("spadmnist.")]
+    whole = [kind.reduce(recording) for kind in kinds]
+    monkeypatch.setattr(_order, "_MOST_HELD", 0)
+    monkeypatch.setattr(_order, "_AT_ONCE", 64)
+    for piece in (100, 1500):
+        monkeypatch.setattr(_order, "_PIECE", piece)
+        fresh = replace(recording, _kept={})
+        for kind, before in zip(kinds, whole, strict=True):
+            after = kind.reduce(fresh)
+            assert (before is None) == (after is None), kind.name
+            assert before is None or np.array_equal(before.values, after.values, equal_nan=True), kind.name
+
+
+def test_a_summary_holds_no_recording() -> None:
+    recording = stamped()
+    held = [kind.reduce(recording) for kind in statistics_for(recording.capture)]
+    there = weakref.ref(recording)
+    del recording
+    gc.collect()
+    assert there() is None and len(held) > 10
+
+
+def test_the_stamps_of_an_image_in_parts_are_held_once() -> None:
+    pixels, each = 32, 1 << 15
+
+    def parts() -> Iterator[Recorded]:
+        for k in range(pixels):
+            ticks = np.arange(k, k + each, dtype=np.uint32)
+            yield Recorded(1, Events(None, np.array([0, each]), 1, ticks, 1e-9), np.array([each]), np.array([1.0]))
+
+    Recorded.joined_pixels(parts(), pixels)
+    tracemalloc.start()
+    made = Recorded.joined_pixels(parts(), pixels).tr
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert made is not None and made.ticks is not None and len(made) == made.ticks.size == pixels * each
+    assert (made.ticks.reshape(pixels, each)[:, 0] == np.arange(pixels)).all() and made.ticks.dtype == np.uint32
+    assert most < 1.2 * made.ticks.nbytes, most / made.ticks.nbytes
 
 
 def test_more_detections_than_can_be_held_are_refused(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special
 
+from .. import kernels
 from ..recording import Recording
 
 # of the dead time, in ticks, and in s: the delay after the shortest interval beyond which no blur is left and other
@@ -50,21 +51,16 @@ class ShortestIntervals:
         """The shortest intervals of a recording; None without time stamps or without dead time."""
         if recording.modality != "tr" or recording.events is None or not recording.dead_time > 0:
             return None
-        times, offsets = recording.events.times, recording.events.offsets.astype(np.int64)
-        events = np.diff(offsets)
-        number = np.maximum(events - 1, 0)
+        offsets = recording.events.offsets.astype(np.int64)
+        number = np.maximum(np.diff(offsets) - 1, 0)
         found, soon = np.full(len(number), math.inf), np.zeros(len(number))
         tick = recording.tick or 0.0
         behind = max(_BEHIND * recording.dead_time, _TICKS * tick, _BLURRED)
         reach = _LONG * behind
-        some = np.flatnonzero(number)
-        if not some.size:
+        if not number.any():
             return cls(found, soon, tick)
-        gaps = np.append(np.diff(times), math.inf)
-        gaps[offsets[1:][events > 0] - 1] = math.inf  # no interval spans two pixels
-        found[some] = np.minimum.reduceat(gaps, offsets[some])
-        late = gaps - np.repeat(np.where(number > 0, found, 0.0), events) - behind
-        soon[some] = np.add.reduceat((late > -0.5 * tick) & (late < reach - 0.5 * tick), offsets[some])
+        edges = behind, -0.5 * tick, reach - 0.5 * tick
+        _shortest(*recording.events.stamps, offsets, *edges, found, soon)
         # afterpulses are proportional to the pixel's rate, all else to its square
         scale = 1 / np.sqrt(np.maximum(number, 1.0))
         design = np.stack([number, number.astype(np.float64) ** 2], axis=1)
@@ -78,6 +74,21 @@ class ShortestIntervals:
             listed: the dead time about which the edge lies, s.
         """
         return np.isfinite(self.intervals) & (self.density * listed * _NEARLY > 1)
+
+
+@kernels.jit
+def _shortest(stamps, unit, offsets, behind, low, high, shortest, soon):  # type: ignore[no-untyped-def]
+    """Find the shortest interval of each row, s, and how many are longer than it by `behind` and by low to high, s.
+
+    unit: s of a stamp. shortest: (rows,), infinite; soon: (rows,), 0.
+    """
+    for row in range(offsets.size - 1):
+        first, last = offsets[row], offsets[row + 1]
+        for i in range(first + 1, last):
+            shortest[row] = min(shortest[row], stamps[i] * unit - stamps[i - 1] * unit)
+        for i in range(first + 1, last):
+            late = stamps[i] * unit - stamps[i - 1] * unit - shortest[row] - behind
+            soon[row] += low < late and late < high
 
 
 def likelihoods(

@@ -89,8 +89,9 @@ class ReducedCapture:
                 summaries[statistic.name] = summary.apart()
         counts = np.asarray(recording.totals, float)
         last = None
-        if recording.events is not None and len(recording.events.times):
-            last = float(recording.events.times.max())
+        if recording.events is not None and len(recording.events):
+            stamps, unit = recording.events.stamps
+            last = float(stamps.max() * unit)
         waited = None if recording.waited is None else recording.waited[0]
         shortest = ShortestIntervals.of(recording)
         capture = replace(recording.capture, tick=recording.tick)
@@ -236,6 +237,7 @@ def _simulate(task: _Task) -> CaptureReplicates | str:
                 sensor = InTheDark.of(sensor)
             for recording in simulated(sensor, capture, photons[some], numbers[some], task.seed):
                 take(recording)
+                del recording  # before the next one is made
     except UNABLE as error:
         return why_not(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
@@ -421,8 +423,9 @@ def simulated(
     for start in range(0, len(numbers), step):
         some = slice(start, start + step)
         streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])
-        for one in twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True):
-            yield one if capture.tick is None else one.on_ticks(capture.tick)
+        made = twin.model_recordings(sensor, capture, photons[some], streams, numbers[some], direct=True)
+        while made:
+            yield made.pop(0) if capture.tick is None else made.pop(0).on_ticks(capture.tick)
 
 
 def swinging(sensor: Sensor) -> list[Key]:

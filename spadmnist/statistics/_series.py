@@ -23,8 +23,5 @@ def slots_of_frame(recording: Recording) -> float:
 
 def stamps(recording: Recording) -> tuple[np.ndarray, float]:
     """(stamps of all events, their unit in s): whole ticks where there is a converter."""
-    events = recording.events
-    assert events is not None
-    if events.ticks is not None and events.tick is not None:
-        return events.ticks, events.tick
-    return events.times, 1.0
+    assert recording.events is not None
+    return recording.events.stamps

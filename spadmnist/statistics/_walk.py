@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ..kernels import jit
 from ..recording import Recording
 from ._counting import exposure_in, guide, logarithmic, place, sort_ticks, tick_of, whole_ticks
 from ._frames import first_stamps
-from ._order import time_order
+from ._order import in_time_order
 
 REACH = 3  # pitches
 SIZES = ((2, 2), (3, 3), (4, 4), (5, 8), (9, 16), (17, 0))  # detections in a cluster; 0: any number
@@ -233,11 +234,14 @@ def _through(recording: Recording) -> Walk:
         stamps, _ = whole_ticks(recording)
         offsets, end = recording.events.offsets, exposure_in(recording, tick)
         spot, stride, first, step, kind, second = around(recording.layout, near_by)
-        _through_exposure(
-            *time_order(recording), stamps, offsets, end, edges, start, np.array(RANKS), crowd_edges(recording)[0],
-            gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
-            spacings, crowds, clusters, found, later,
-        )  # fmt: skip
+        ranks, passed = np.array(RANKS), _Passed.none(spot, stride, offsets)
+        for words, bits, new in in_time_order(recording, int(lags[-1]), int(ranks[-1])):
+            _through_exposure(
+                words, new, bits, stamps, offsets, end, edges, start, ranks, crowd_edges(recording)[0],
+                gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
+                passed, spacings, crowds, clusters, found, later,
+            )  # fmt: skip
+        _finish(kinds, passed.runs, clusters)
     own, every = found[-2:]
     return Walk(spacings, crowds, clusters, every, found[:-2], own, later[:-2])
 
@@ -270,31 +274,44 @@ def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, 
     return spot, 0, first, b[order].astype(np.int64), classes[order], np.zeros(order.size, bool)
 
 
+class _Passed(NamedTuple):
+    """What is known of the detections that were passed.
+
+    row_of: (spots,) the row at each spot; recent: (deep, spots) the last stamps; latest_at: (deep + 1,) the latest of
+    all those that ever stood at each depth, of which the last is held no longer; place: (spots,) of the last one;
+    runs: (gaps,) how long the cluster is to which the last one belongs.
+    """
+
+    row_of: np.ndarray
+    recent: np.ndarray
+    latest_at: np.ndarray
+    place: np.ndarray
+    runs: np.ndarray
+
+    @staticmethod
+    def none(spot: np.ndarray, stride: int, offsets: np.ndarray) -> _Passed:
+        """Before the first one. spot, stride: see `around`; offsets: of the rows."""
+        spots = int(spot.max(initial=-1)) + 1 + REACH * (stride + 1)
+        row_of, place = np.full(spots, -1), np.zeros(spots, np.int64)
+        row_of[spot], place[spot] = np.arange(len(spot)), offsets[:-1] - 1
+        recent, latest_at = np.full((_DEEP, spots), _NEVER), np.full(_DEEP + 1, _NEVER)
+        return _Passed(row_of, recent, latest_at, place, np.ones(len(_GAPS), np.int64))
+
+
 @jit
 def _through_exposure(
-    words, bits, stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
-    spot, stride, first, step, kind, second, spacings, crowds, clusters, found, later,
+    words, new, bits, stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
+    spot, stride, first, step, kind, second, passed, spacings, crowds, clusters, found, later,
 ):  # fmt: skip
-    """Walk through the detections in the order of time, some after the others.
+    """Walk through some detections in the order of time, from the first new one on, some after the others.
 
-    words, bits: see `TimeOrder`; stamps, offsets: the same by rows; edges, start: of spacings, see `guide`; ranks,
+    words, bits: see `TimeOrder`; stamps, offsets: all of them, by rows; edges, start: of spacings, see `guide`; ranks,
     crowded: of crowds, with their edges; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
-    `around`.
+    `around`; passed: those before, to which these are added.
     Adds to spacings, crowds, clusters, found (classes, bins) pairs of near pixels, and of all in the last one, later
     (classes,).
     """
-    total = words.size
-    rows = offsets.size - 1
-    spots = np.int64(0)
-    for row in range(rows):
-        spots = max(spots, spot[row] + 1 + REACH * (stride + 1))
-    row_of = np.full(spots, -1)
-    recent = np.full((_DEEP, spots), _NEVER)  # the last stamps that were passed
-    latest_at = np.full(_DEEP + 1, _NEVER)  # of all those that ever stood at each depth; the last is held no longer
-    passed = np.zeros(spots, np.int64)  # the place of the last one
-    for row in range(rows):
-        row_of[spot[row]] = row
-        passed[spot[row]] = offsets[row] - 1
+    total = offsets[offsets.size - 1]
     longest = lags[lags.size - 1]
     usual = np.float64(total) / end
     back = stride > 0 and usual * longest < _FEW_BACK and longest <= _LONG
@@ -306,9 +323,8 @@ def _through_exposure(
     most = ranks[ranks.size - 1]
     times = np.empty(2 * _BLOCK, np.int64)
     some = np.empty(_BLOCK, np.int64)
-    runs = np.ones(gaps.size, np.int64)
-    for begin in range(0, total, _BLOCK):
-        stop = min(begin + _BLOCK, total)
+    for begin in range(new, words.size, _BLOCK):
+        stop = min(begin + _BLOCK, words.size)
         # with those before that are near enough to matter
         oldest = begin
         if not back:
@@ -326,7 +342,7 @@ def _through_exposure(
         else:
             _near_pairs(
                 words[begin:stop], bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
-                row_of, recent, latest_at, passed, found, later,
+                passed.row_of, passed.recent, passed.latest_at, passed.place, found, later,
             )  # fmt: skip
             before = np.int64(0)
             for k in range(lags.size):
@@ -334,7 +350,7 @@ def _through_exposure(
                 found[found.shape[0] - 1, k] += nearer - before
                 before = nearer
         _spacings(times, max(held, 1), count, edges, start, spacings)
-        _clusters(times, max(held, 1), count, gaps, kinds, runs, some, clusters)
+        _clusters(times, max(held, 1), count, gaps, kinds, passed.runs, some, clusters)
         for r in range(ranks.size):
             i = max(held, ranks[r])
             before = np.int64(0)
@@ -342,7 +358,6 @@ def _through_exposure(
                 closer = _nearer(times[i:count], times[i - ranks[r] : count - ranks[r]], crowded[r, bin])
                 crowds[r, bin] += closer - before
                 before = closer
-    _finish(kinds, runs, clusters)
 
 
 @jit

@@ -91,7 +91,7 @@ class CodePeriods(Statistic):
         periods = _allowed(recording)
         if not periods:
             return None
-        folded = _folds(recording)
+        folded, tick = _folds(recording), recording.tick or 0.0
         total = float(folded[periods[0]].sum())
         axis = np.array(periods, np.float64)
         freedom, part = axis - 1, 2 / (9 * (axis - 1))
@@ -103,7 +103,7 @@ class CodePeriods(Statistic):
 
         def where(cell: int) -> str:
             period = periods[cell]
-            return f"codes in a period of {period} ticks ({units.show(period * (recording.tick or 0.0), 's')})"
+            return f"codes in a period of {period} ticks ({units.show(period * tick, 's')})"
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             wide = float(np.sqrt(max(uneven[cell], 0.0)))

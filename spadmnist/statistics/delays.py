@@ -14,7 +14,7 @@ from ..kernels import jit
 from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import exposure_in, span, tick_of, whole
-from ._order import time_order
+from ._order import in_time_order
 from ._scores import largest_score, shares
 from ._walk import REACH
 
@@ -53,19 +53,22 @@ class Delays(Statistic):
         tick = tick_of(recording)
         step = max(1, round(_STEP / tick))
         delays = max(1, round(_LONGEST / tick) // step)
-        words, bits = time_order(recording)
-        exposure = exposure_in(recording, tick)
+        exposure, detections = exposure_in(recording, tick), len(recording.events)
         looked_at = exposure
-        if len(words):
-            by_chance = len(words) ** 2 * step * delays / exposure
+        if detections:
+            by_chance = detections**2 * step * delays / exposure
             looked_at = math.ceil(exposure * min(1.0, _PAIRS / max(by_chance, 1.0)))
-        some = words[: np.searchsorted(words, looked_at << bits)]
-        detections = len(some)
         counts = np.zeros((steps.number, delays), np.int32)
-        _count(some, bits, steps.place, step, counts)
+        n, detections = np.zeros(recording.pixels), 0
+        for words, bits, new in in_time_order(recording, step * delays):
+            some = words[: np.searchsorted(words, looked_at << bits)]
+            if len(some) <= new and len(words):
+                break
+            _count(some, new, bits, steps.place, step, counts)
+            n += np.bincount(some[new:] & ((1 << bits) - 1), minlength=recording.pixels)
+            detections += len(some) - new
         counts = steps.joined(counts)
         most = counts.max(axis=1)
-        n = np.bincount(some & ((1 << bits) - 1), minlength=recording.pixels).astype(np.float64)
         chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
         scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
 
@@ -123,14 +126,17 @@ _ENDS = ("up", "down")
 
 
 @jit
-def _count(words, bits, place, step, counts):
-    """Add pairs to counts (steps over the grid, delays). words, bits: see `TimeOrder`; place: (pixels,) of each."""
+def _count(words, new, bits, place, step, counts):
+    """Add the pairs whose later one is new to counts (steps over the grid, delays).
+
+    words, bits: see `TimeOrder`; new: the first of the new ones; place: (pixels,) of each.
+    """
     mask = (np.int64(1) << bits) - 1
     of_lag = np.arange(step * counts.shape[1]) // step
     zero = counts.shape[0] // 2  # no way at all
     for i in range(words.size):
         at, here = words[i] >> bits, place[words[i] & mask] - zero
-        for j in range(i + 1, words.size):
+        for j in range(max(i + 1, new), words.size):
             lag = (words[j] >> bits) - at
             if lag >= of_lag.size:
                 break

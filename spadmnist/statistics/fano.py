@@ -12,7 +12,7 @@ from ..units import show
 from . import Recording, Statistic, Summary
 from ._counting import tick_of
 from ._frames import as_words, bits, count_ones, frame_sums
-from ._order import time_order
+from ._order import in_time_order, is_held
 from ._scores import Pairs, minority, nested, number_at, pair_scores, pairs_law, pooled_score, shares
 from ._series import has_data, slots_of_frame, stamps
 
@@ -35,45 +35,39 @@ def event_pairs(stamps, offsets, factor, levels):
     end = np.int64(20) << np.int64(levels - 1)
     pairs = np.zeros(levels, np.int64)
     inside = np.zeros(offsets.size - 1, np.int64)
-    most = 0
-    for row in range(offsets.size - 1):
-        most = max(most, offsets[row + 1] - offsets[row])
-    windows = np.empty(most, np.int64)
     sums = np.empty(0, np.int32)
     for row in range(offsets.size - 1):
-        n = 0
-        for i in range(offsets[row], offsets[row + 1]):
-            window = np.int64(stamps[i] * factor)
-            if window < end:
-                windows[n] = window
-                n += 1
-        inside[row] = n
+        some = stamps[offsets[row] : offsets[row + 1]]
+        while some.size > 0 and np.int64(some[some.size - 1] * factor) >= end:
+            some = some[: some.size - 1]
+        n = inside[row] = some.size
         if n < 2:
             continue
         sparse = 0
         while sparse < levels - 1 and end >> sparse > 4 * n:
             sparse += 1
-        if sparse > 0 and not _few(windows[:n], sparse, pairs):
-            sparse = 0
+        if sparse > 0 and not _few(some, factor, sparse, pairs):
+            _many(some, factor, sparse, pairs)
         size = end >> sparse
         if sums.size < size:
             sums = np.empty(size, np.int32)
         sums[:size] = 0
         for i in range(n):
-            sums[windows[i] >> sparse] += np.int32(1)
+            sums[np.int64(some[i] * factor) >> sparse] += np.int32(1)
         pairs[sparse:] += pairs_in_windows(sums[:size], levels - sparse)
     return pairs, inside
 
 
 @jit
-def _few(windows, levels, pairs):
+def _few(stamps, factor, levels, pairs):
     """Add the pairs of the first levels, one by one; false, and nothing is added, where they turn out to be many."""
     lowest = np.zeros(levels, np.int64)  # the pairs that share a window from this level on
-    left = 16 * windows.size
-    for i in range(1, windows.size):
+    left = 16 * stamps.size
+    for i in range(1, stamps.size):
+        window = np.int64(stamps[i] * factor)
         k = i - 1
         while k >= 0:
-            apart = windows[i] ^ windows[k]
+            apart = window ^ np.int64(stamps[k] * factor)
             if apart >> (levels - 1):
                 break
             # so many bits are different
@@ -87,6 +81,30 @@ def _few(windows, levels, pairs):
         so_far += lowest[level]
         pairs[level] += so_far
     return True
+
+
+@jit
+def _many(stamps, factor, levels, pairs):
+    """Add the pairs of the first levels: of each window those of the detections in it, which follow each other."""
+    for level in range(levels):
+        window, number = np.int64(-1), np.int64(0)
+        for i in range(stamps.size):
+            here = np.int64(stamps[i] * factor) >> level
+            number = number + 1 if here == window else 0
+            window = here
+            pairs[level] += number
+
+
+@jit
+def _fill(words, bits, factor, sums):
+    """Add detections to the windows (windows,) that they lie in; how many lie in one. words, bits: see `TimeOrder`."""
+    inside = 0
+    for i in range(words.size):
+        window = np.int64((words[i] >> bits) * factor)
+        if window < sums.size:
+            sums[window] += np.int32(1)
+            inside += 1
+    return inside
 
 
 @jit
@@ -351,11 +369,17 @@ class ArrayFano(Statistic):
         conditions = recording.conditions
         if recording.events is not None:
             levels, shortest = _exact_lengths(conditions.exposure, _MOST)
-            words, bits_of_pixel = time_order(recording)
             # as if all were of one pixel
-            one_row = words >> bits_of_pixel, np.array([0, len(words)])
-            pairs, inside = event_pairs(*one_row, tick_of(recording) / shortest, levels)
-            slots, total, scatter = np.inf, int(inside[0]), 0.0
+            factor, pairs, total = tick_of(recording) / shortest, np.zeros(levels, np.int64), 0
+            sums = np.zeros(0 if is_held(recording) else _WINDOWS << (levels - 1), np.int32)
+            for words, bits, new in in_time_order(recording):
+                if len(sums):
+                    total += _fill(words[new:], bits, factor, sums)
+                else:
+                    pairs, (total,) = event_pairs(words >> bits, np.array([0, len(words)]), factor, levels)
+            if len(sums):
+                pairs = pairs_in_windows(sums, levels)
+            slots, total, scatter = np.inf, int(total), 0.0
             detections, windows = float(total), _WINDOWS << (levels - 1)
             lengths = shortest * 2.0 ** np.arange(levels)
         else:
