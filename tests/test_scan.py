@@ -497,6 +497,23 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     assert asked[:2] == [1e-3, 0.05]  # maps beside what chance makes of pixels are tried where they would not be alone
 
 
+def test_a_faint_template_of_another_shape_is_looked_at_beside_a_strong_one(lab, monkeypatch) -> None:
+    """Noise hides a part of what it would show at its best strength, so that the two are not comparable yet."""
+    replicates = bench_of(lab())
+    evaluation, look = evaluate(replicates, {}), quiet(replicates)
+    candidate, delay = change_of(replicates, "add crosstalk"), ("crosstalk", "delay")
+    nothing = Signature({}, {}, {"flat": 1.0})
+    strong, faint, near = (
+        Trial(candidate, {CROSSTALK: p, delay: t}, nothing, gain, times)
+        for p, t, gain, times in ((0.0085, 3e-7, 74.0, 1.7), (7e-4, 8e-11, 50.0, 7.2), (7e-4, 2e-8, 49.0, 1.5))
+    )
+    seen: list[Trial] = []
+    monkeypatch.setattr(Scan, "_simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr("spadmnist.inference.scan.map_trials_of", lambda scan, evaluation, values, least: [])
+    look.again(evaluation, {}, [strong, faint, near])
+    assert [one.values[delay] for one in seen] == [3e-7, 8e-11]
+
+
 def test_only_edges_are_followed_close_by(lab) -> None:
     """A slope of a drift that is known to 0.003 was told by what 0.02 do, of which chance hides nearly all."""
     replicates = bench_of(lab())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from . import held_out, map_fits, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .error_budget import HeldMaps, Rung, physical_errors
-from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, square
+from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, square, stacked
 from .exact_likelihood import maximise, not_in_likelihood
 from .gauss_newton import Fit, error_scale, gauss_newton_step
 from .phases import evaluate_start
@@ -27,12 +27,14 @@ from .signature import captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 from .trial_fits import EXCLUDED, IGNORED
 
-_AGAIN = 2  # further fits of all coordinates at the model with the step
+_AGAIN = 4  # further fits of all coordinates at the model with the step
 _SAME = 0.35  # of a coordinate: how far a Jacobian holds
 _WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
 _MOVED = 0.5  # standard deviations: a larger move of a coordinate needs another evaluation
+_RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
+_FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
 _LOST = 30.0  # in chi square: a rise beyond which a fitted step is not taken
 
 
@@ -203,17 +205,51 @@ def _gauss_newton(
         fit = closer
         if turn == _AGAIN or square(evaluation.residuals) - closer.square < _WORTH:
             break
-        near = closer if np.all(np.abs(closer.point - point_of(coordinates, here)) < _SAME) else None
         before = path.values, maps, evaluation
-        path.values = {**path.values, **closer.values}
-        sensors, maps = _model(path)
-        evaluation = evaluate(replicates, path.values, sensors)
-        if square(evaluation.residuals) > square(before[2].residuals):
-            # a line or an edge: the gradient leads no further
+        for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
+            path.values = {**before[0], **step.values}
+            sensors, maps = _model(path)
+            evaluation = evaluate(replicates, path.values, sensors)
+            risen = square(evaluation.residuals) - square(before[2].residuals)
+            if risen <= _RISEN * _noise_of_square(before[2]):
+                break
+        else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
             fit = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             break
+        near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < _SAME) else None
     return fit, evaluation, maps
+
+
+def _strengths_alone(path: ModelPath, fit: Fit, evaluation: Evaluation, here: Mapping[Key, float]) -> Iterator[Fit]:
+    """The step of a fit with its shapes and edges held, to which no gradient leads from afar; none where it is alike.
+
+    Args:
+        fit: of a Gauss-Newton step from the evaluation; here: the values of the evaluation, SI.
+    """
+    shapes = {d.key for step in path.steps for d in step.candidate.shapes}
+    moves = [i for i, d in enumerate(fit.coordinates) if d.key not in shapes and not is_edge(d)]
+    if not 0 < len(moves) < len(fit.coordinates):
+        return
+    keys = list(fit.jacobian)
+    z, slope = stacked(evaluation.residuals, keys), np.concatenate([fit.jacobian[k][:, moves] for k in keys])
+    move = np.clip(-np.linalg.pinv(slope) @ z, -_FARTHEST, _FARTHEST)
+    held = dict(here)
+    for i, change in zip(moves, move, strict=True):
+        coordinate = fit.coordinates[i]
+        held[coordinate.key] = coordinate.value(coordinate.coordinate(here[coordinate.key]) + float(change))
+    yield replace(fit, point=point_of(fit.coordinates, held), values={**fit.values, **held})
+
+
+def _noise_of_square(evaluation: Evaluation) -> float:
+    """The standard deviation of the sum of squared residuals by the noise of the replicates, between two evaluations.
+
+    Each expectation has the noise of the mean of its replicates, e, which moves the sum by 2 z e.
+    """
+    keys = [k for k in evaluation.residuals if k in evaluation.replicate_residuals]
+    own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
+    along = own @ stacked(evaluation.residuals, keys)
+    return 2 * math.sqrt(2 / len(own)) * float(np.std(along))
 
 
 def _recordings(evaluation: Evaluation) -> int:

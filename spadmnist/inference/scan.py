@@ -386,15 +386,19 @@ class Scan:
                 square of the score.
         """
         best: list[Trial] = []
+        further: list[Trial] = []
         if faint:
             tried = sorted((self._marked(evaluation, t) for t in tried), key=lambda t: -t.gain)
         for one in tried:
             if one.gain > 9 and all(b.candidate.name != one.candidate.name for b in best):
                 # of those with nearly the largest gain, the one simulated nearest to its best strength
-                alike = [t for t in tried if t.candidate.name == one.candidate.name and t.gain > _NEARLY * one.gain]
+                same = [t for t in tried if t.candidate.name == one.candidate.name]
+                alike = [t for t in same if t.gain > _NEARLY * one.gain]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
+                further += _faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
                 break
+        best += further
         out: list[Trial] = []
         kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
         for one in best:
@@ -454,6 +458,19 @@ class Scan:
         significance, found, times = best_direction(self.replicates, evaluation, one)
         suits = times * found.data / found.size if significance > 0 else one.times
         return replace(one, gain=significance**2, times=one.times if one.gain > 0 and one.times * suits > 0 else suits)
+
+
+def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
+    """The best trial of another shape that was simulated far below its best strength; none where there is no such.
+
+    Noise hides a part of a faint signature, so that its gain is too small beside that of a strong one.
+
+    Args:
+        best: the best trial of a candidate.
+        tried: all trials of that candidate, by gain.
+    """
+    others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > _BOLDER and t.gain > PROMISING)
+    return list(others)[:1]
 
 
 def _among(tried: Sequence[Trial], candidate: Candidate, values: Mapping[Key, Any]) -> bool:
