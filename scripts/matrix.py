@@ -27,6 +27,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 PATIENCE = 1800  # s, for one installation or one pair of datasets
+STOPS = "stops"
 PARTS = ("tr", "str", "qis", "counts", "reconstructions", "zarr", "hdf5")
 SHOWN = ("numpy", "numba", "zarr", "numcodecs", "h5py")
 
@@ -60,6 +61,7 @@ def digests() -> dict[str, str]:
     """Of what is read of the dataset, by readout, and the seals of the dataset, by format."""
     import spadmnist
     from spadmnist import config, factory
+    from spadmnist.errors import SpadError
 
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -67,8 +69,11 @@ def digests() -> dict[str, str]:
         file.write_text(CONFIG)
         for format in ("zarr", "hdf5"):
             experiment = config.read(file, format=format)
-            made = factory.generate(experiment, experiment.load_images(), Path(folder, format), 1)
-            found[format] = made.manifest["sha256"]
+            try:
+                made = factory.generate(experiment, experiment.load_images(), Path(folder, format), 1)
+                found[format] = made.manifest["sha256"]
+            except SpadError:  # its golden shard is another one, and so no dataset is made
+                found[format] = STOPS
         sums = {part: hashlib.sha256() for part in PARTS[:5]}
         stored = spadmnist.open(Path(folder, "zarr"))
         for part in (stored[level, split] for level in stored.levels for split in stored.splits):
@@ -200,8 +205,8 @@ def main() -> None:
                 noted.write_text(json.dumps(rows, indent=1))
     print("\n".join(table(rows)))
     made = [one["digests"] for one in rows.values() if "digests" in one]
-    others = [part for part in PARTS if len({one[part] for one in made}) > 1]
-    said = f"other bytes of {', '.join(others)}" if others else "the same bytes in all"
+    others = [part for part in PARTS if len({one[part] for one in made} - {STOPS}) > 1]
+    said = f"other bytes of {', '.join(others)}" if others else "the same bytes wherever a dataset was made"
     print(f"\n{datetime.now(UTC):%Y-%m-%d}: {len(made)} of {len(rows)} environments ran; {said}.")
     sys.exit(1 if others or not made else 0)
 
