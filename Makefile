@@ -5,7 +5,7 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify docs docs-two faults bench challenge lint clean
+.PHONY: help demo test verify docs docs-two faults bench matrix challenge lint clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -67,6 +67,9 @@ lint: $(VENV)/installed
 
 bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
+
+matrix: $(VENV)/installed  ## the same bytes under each Python, oldest and newest libraries? (minutes for each)
+	$(RUN)/python scripts/matrix.py -o build/matrix
 
 # So many cases of the list, drawn by lot; QUICK= for all simulations. What is there is not made again, and only missing
 # answers are asked for, no new ones after so many minutes: run it again to go on. The score is of what has been asked

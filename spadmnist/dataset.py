@@ -30,13 +30,13 @@ from .events import Events
 from .experiment import Experiment, Level, level_of
 from .foreign import from_json, quoted, short
 from .gather import gather, indices_of, join
+from .identity import FORMAT
 from .images import Images
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
 from .store import Column, Expected, ShardReader
 from .tiles import Tiles, of_facts
 
-FORMAT = "spadmnist-dataset/1"
 _LARGEST_MANIFEST = 1 << 30  # bytes
 _LONGEST_SENTENCE = 600  # characters of one mistake in a manifest, which may quote endless names
 MANIFEST = "manifest.json"
@@ -473,10 +473,23 @@ def canonical(value: Any) -> bytes:
     return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=True, allow_nan=False) + "\n").encode()
 
 
-def seal(manifest: dict[str, Any]) -> bytes:
-    """The manifest as bytes, with the digest of everything else in it under `sha256`."""
-    body = {key: value for key, value in manifest.items() if key != "sha256"}
-    return canonical({**body, "sha256": hashlib.sha256(canonical(body)).hexdigest()})
+def seal(manifest: Mapping[str, Any]) -> bytes:
+    """The manifest as bytes, with the digest of what the dataset is under `sha256`.
+
+    Under `provenance` stands by what it was finished. It does not belong to what the dataset is, and has a digest of
+    its own, `provenance_sha256`.
+    """
+    apart = ("sha256", "provenance", "provenance_sha256")
+    body = {key: value for key, value in manifest.items() if key not in apart}
+    sealed = {**body, "sha256": _digest(body)}
+    if "provenance" in manifest:
+        made_by = manifest["provenance"]
+        sealed |= {"provenance": made_by, "provenance_sha256": _digest(made_by)}
+    return canonical(sealed)
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:

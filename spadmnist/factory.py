@@ -2,7 +2,8 @@
 
 Each shard is simulated, encoded and committed by one task; what is committed is complete. The state of an
 unfinished run lies in `.spadmnist/` inside the dataset and is removed at the end: a finished dataset is a function
-of config, images and versions alone.
+of what stands in `identity` alone. Shards that other versions or another machine made are gone on with where the same
+bytes are made here.
 """
 
 from __future__ import annotations
@@ -11,10 +12,9 @@ import contextlib
 import errno
 import fcntl
 import functools
-import hashlib
-import io
 import json
 import os
+import platform
 import re
 import resource
 import secrets
@@ -22,7 +22,7 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,18 +31,17 @@ import numpy as np
 
 from . import config, dataset, disk, document, golden, plugins, reconstruct, store
 from .compiled import compiling
-from .dataset import CONFIG, FORMAT, MANIFEST, STATE, Likeness, Shard
+from .dataset import CONFIG, MANIFEST, STATE, Likeness, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .foreign import from_json
 from .golden import versions
+from .identity import ENCODING, FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other
 from .images import Images
-from .positions import positions_text
 from .reconstruct import median_of_nonzero
 from .workers import Executor, Serial, executor
 
-POSITIONS = "maps/layout.positions.csv"
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
 _PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
@@ -155,13 +154,16 @@ def encode_shard(task: Task) -> dict[str, bytes]:
     """Simulate and encode one shard; its files, for `store.put_shard`."""
     experiment = _experiment(task.job)
     columns, attributes = shard_content(experiment, task)
-    files = store.encoded(task.shard.path, columns, attributes, experiment.format)
+    return _joined(store.encoded(task.shard.path, columns, attributes, experiment.format))
+
+
+def _joined(files: Mapping[str, Iterable[bytes]]) -> dict[str, bytes]:
     return {name: b"".join(pieces) for name, pieces in files.items()}
 
 
 def golden_of(job: Job) -> tuple[str, str]:
     """(digest of a config's golden shard, by what it was made), for `Executor.greet`."""
-    return golden.digest(_experiment(job)), golden.made_by()
+    return golden.digest(_experiment(job)), golden.words(golden.made_by())
 
 
 def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.Column], dict[str, Any]]:
@@ -190,8 +192,9 @@ def _record_path(root: Path, shard: Shard) -> Path:
 
 
 def note(root: Path, shard: Shard, files: Files) -> None:
-    """Remember the digests of a shard's files until the manifest lists them."""
-    disk.commit_file(_record_path(root, shard), dataset.canonical(files), disk.temporary(root))
+    """Remember the digests of a shard's files until the manifest lists them, and by what they were made."""
+    record = {"files": files, "made_by": golden.made_by()}
+    disk.commit_file(_record_path(root, shard), dataset.canonical(record), disk.temporary(root))
 
 
 # --- the state of a run -------------------------------------------------------------------------------------------
@@ -296,97 +299,6 @@ def _writable(place: Path) -> Iterator[None]:
         raise SpadError(f"{place}: cannot be written ({reason}); choose another place with -o") from None
 
 
-def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, Any]:
-    """What a dataset is a function of, as a manifest holds it."""
-    any_split = next(iter(splits.values()))
-    return {
-        "format": FORMAT,
-        "config": portable(experiment)[0],
-        "images": {
-            "shape": list(any_split.pixels.shape[1:]),
-            "dtype": any_split.pixels.dtype.name,
-            "white": float(any_split.white),
-            "splits": {
-                split: {
-                    "images": experiment.wanted(images),
-                    "sha256": images.head(experiment.wanted(images)).sha256,
-                    **({} if images.tiles is None else {"tiles": images.tiles.facts()}),
-                }
-                for split, images in splits.items()
-            },
-        },
-        "maps": {name: _known_by(name, data) for name, data in portable(experiment)[1].items()},
-        "plugins": plugin_sources(experiment),
-        "versions": versions(),
-    }
-
-
-def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:
-    """The files that define the user's own effects and methods of an experiment, whole."""
-    classes = [type(e) for e in experiment.sensor.effects] + [type(reconstruct.find(m)) for m in experiment.methods]
-    used = {plugins.source_file(cls) for cls in classes}
-    return sorted(
-        (
-            {"file": path.name, "sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
-            for path, text in plugins.loaded_files().items()
-            if str(path) in used
-        ),
-        key=lambda found: (found["file"], found["sha256"]),
-    )
-
-
-def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """(config, map files) that stand on their own: maps and positions from files become files of the dataset."""
-    resolved = json.loads(json.dumps(experiment.resolved))
-    layout = experiment.sensor.layout
-    maps: dict[str, bytes] = {}
-    if layout.positions is not None:
-        maps[POSITIONS] = positions_text(layout.positions).encode()
-        resolved["sensor"]["layout"]["positions"] = POSITIONS
-    for name, values in resolved["sensor"]["effects"].items():
-        for key, raw in values.items():
-            if isinstance(raw, dict) and set(raw) == {"file"}:
-                effect = experiment.sensor.effect(name)
-                array = np.asarray(getattr(effect, key))
-                if effect is not None and effect.parameters[key].per_pixel:
-                    array = array.reshape(layout.shape)
-                buffer = io.BytesIO()
-                np.save(buffer, array)
-                maps[f"maps/{name}.{key}.npy"] = buffer.getvalue()
-                values[key] = {"file": f"maps/{name}.{key}.npy"}
-    return resolved, maps
-
-
-def _known_by(name: str, data: bytes) -> dict[str, str] | str:
-    """What a manifest keeps of a map: its digest; of the positions, which are small, also the text itself."""
-    digest = hashlib.sha256(data).hexdigest()
-    return {"sha256": digest, "text": data.decode()} if name == POSITIONS else digest
-
-
-def _difference(ours: Any, theirs: Any, path: str = "") -> list[str]:
-    if isinstance(ours, dict) and isinstance(theirs, dict):
-        out = []
-        for key in sorted(set(ours) | set(theirs)):
-            out += _difference(ours.get(key), theirs.get(key), f"{path}.{key}" if path else str(key))
-        return out
-    return [] if ours == theirs else [f"{path}: {_short(theirs)} there, {_short(ours)} asked for"]
-
-
-def _short(value: Any) -> str:
-    text = "nothing" if value is None else json.dumps(value)
-    return text if len(text) <= 70 else text[:67] + "..."
-
-
-def _refuse_other(root: Path, wanted: dict[str, Any], there: Mapping[str, Any]) -> None:
-    known = {key: there.get(key) for key in wanted}
-    lines = _difference(wanted, known)
-    if lines:
-        more = f" (and {len(lines) - 4} more)" if len(lines) > 4 else ""
-        raise SpadError(
-            f"{root} holds another dataset: {'; '.join(lines[:4])}{more}; choose another folder with -o, or remove it"
-        )
-
-
 # --- generate -----------------------------------------------------------------------------------------------------
 
 
@@ -430,14 +342,56 @@ def generate(
         greet(workers, experiment)
         _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
+        made = {s.path: s for s in shards if _is_made(root, s, experiment.format, like)}
+
+        def again(shard: Shard) -> dict[str, bytes]:
+            return encode_shard(task_of(experiment, job_of(experiment), root, shard, splits[shard.split]))
+
+        check_bytes(root, experiment, {s: _noted(root, s)[1] for s in made.values()}, again, progress)
         if part:
             shards = shards[part.number - 1 :: part.of]
-        missing = [s for s in shards if not _is_made(root, s, experiment.format, like)]
+        missing = [s for s in shards if s.path not in made]
         _make(experiment, splits, root, shards, missing, workers, progress)
         if part:
             return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})
         manifest = finish(experiment, root, wanted, shards, workers, progress)
     return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
+
+
+def check_bytes(
+    root: Path,
+    experiment: Experiment,
+    made: Mapping[Shard, Mapping[str, str] | None],
+    again: Callable[[Shard], dict[str, bytes]],
+    progress: Progress,
+) -> None:
+    """Raise SpadError where this machine makes other bytes than what is there, or than its libraries once made.
+
+    made: the shards that are there and by what each was made, as far as that is known. Where one was made by something
+    else than is here, the config's golden shard must be the known one; where none is known, the first shard of each
+    other maker is made again and compared. again: makes the files of a shard, by their names for `store.put_shard`.
+    """
+    here = golden.made_by()
+    others: dict[str, tuple[Shard, Mapping[str, str] | None]] = {}
+    for shard in sorted(made, key=lambda one: one.level is None):  # the originals, in which nothing is drawn, last
+        maker = made[shard]
+        if maker is None or any(here.get(name) != version for name, version in maker.items()):
+            others.setdefault(json.dumps(maker, sort_keys=True), (shard, maker))
+    if not others and golden.known()["versions"].items() <= versions().items():
+        return
+    _warm(experiment, progress)
+    if golden.check(experiment):
+        return
+    for shard, maker in others.values():
+        progress.notice("Other versions or another machine made what is there: one shard is made again to compare.")
+        place = store.location(shard.path, experiment.format)
+        for name, data in again(shard).items():
+            path = root / (place + name.removeprefix("shard"))
+            there = b""
+            with contextlib.suppress(OSError):  # there is no such file, or a larger one
+                there = disk.read_file(path, len(data))
+            if there != data:
+                raise golden.other_bytes(path, maker)
 
 
 def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
@@ -502,7 +456,7 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
         if not root.is_dir():
             raise SpadError(f"{root} is a file; choose another place with -o")
         if (root / MANIFEST).exists():
-            _refuse_other(root, wanted, dataset.read_manifest(root)[0])
+            refuse_other(root, wanted, dataset.read_manifest(root)[0])
             return True
         content = set(os.listdir(root))
         plan = root / STATE / "plan.json"
@@ -513,7 +467,7 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
                     "choose another folder with -o"
                 )
             return False
-    _refuse_other(root, wanted, _plan(root))
+    refuse_other(root, wanted, _plan(root))
     return False
 
 
@@ -544,7 +498,7 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
                 # records without a plan are those of a run that has finished
                 shutil.rmtree(root / STATE / "shards", ignore_errors=True)
             elif part:
-                _refuse_other(root, wanted, _plan(root))
+                refuse_other(root, wanted, _plan(root))
             disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
@@ -585,11 +539,21 @@ def _is_made(root: Path, shard: Shard, format: str, like: Likeness) -> bool:
 
 def _record(root: Path, shard: Shard) -> Files | None:
     """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
+    return _noted(root, shard)[0]
+
+
+def _noted(root: Path, shard: Shard) -> tuple[Files | None, dict[str, str] | None]:
+    """(the digests of a shard's files, by what they were made) as they were noted; None where that is not known."""
     try:
         found = from_json(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
     except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
+        return None, None
+    if not isinstance(found, dict):
+        return None, None
+    if not {"files", "made_by"} <= set(found):  # spadmnist 0.1.0 noted the files alone
+        return found, None
+    files, made_by = found["files"], found["made_by"]
+    return (files if isinstance(files, dict) else None), (made_by if isinstance(made_by, dict) else None)
 
 
 def _make(
@@ -737,6 +701,17 @@ def add_methods(addition: Addition) -> tuple[str, Files]:
     return shard.path, files
 
 
+def _as_read(root: Path, shard: Shard, experiment: Experiment, like: Likeness) -> dict[str, bytes]:
+    """The files of a shard, made again from its own streams; see `check_bytes`."""
+    reader = shard.reader(root, experiment.format, like)
+    columns = {name: reader.column(name) for name in reader.names}
+    if shard.level is not None:
+        recorded, shape = dataset.read_shard(reader, experiment)
+        methods = [method for method in experiment.methods if reader.has(f"reconstruction/{method}")]
+        columns |= dataset.reconstruction_columns(experiment, recorded, shape, methods)
+    return _joined(store.encoded(shard.path, columns, reader.attributes, experiment.format))
+
+
 def add_reconstructions(
     root: Path,
     names: Sequence[str],
@@ -761,21 +736,23 @@ def add_reconstructions(
         tidy(root)
         return [], manifest
     after = before.with_methods((*before.methods, *new))
-    kept = ("format", "images", "maps", "versions")
-    wanted = {**{k: manifest[k] for k in kept}, "config": portable(after)[0], "plugins": plugin_sources(after)}
+    refuse_other(root, {**held(manifest), "stream": STREAM, "encoding": ENCODING}, manifest)
+    wanted = {**held(manifest), "config": portable(after)[0], "plugins": plugin_sources(after)}
     shards = dataset.shards_in(manifest)
     with locked(root):
         plan = root / STATE / "plan.json"
         if plan.exists():
             there = _plan(root)
-            if all(there.get(key) == manifest.get(key) for key in wanted):
+            if held(there) == held(manifest):
                 clear_records(root)  # of the run that made what is here, and was killed at its very end
             else:
-                _refuse_other(root, wanted, there)
+                refuse_other(root, wanted, there)
         begin(root, wanted)
         by_path = {s.path: s for s in shards if _record(root, s) is None}
         job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
+        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s)[1] for s in shards}
+        check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
         def files_of(shard: Shard) -> dict[str, Files]:
@@ -871,7 +848,7 @@ def finish(
         ),
         "files": files,
     }
-    sealed = dataset.seal(manifest)
+    sealed = dataset.seal({**manifest, "provenance": {**versions(), "python": platform.python_version()}})
     disk.commit_file(root / MANIFEST, sealed, temporary)
     clear_state(root)
     return json.loads(sealed)

@@ -106,10 +106,14 @@ class _Statistics(Section):
 
 _KINDS: dict[str, Any] = {
     "format": str,
+    "stream": Annotated[int, Field(ge=1)],
+    "encoding": Annotated[int, Field(ge=1)],
     "config": dict[str, Any],
     "images": _Images,
     "maps": dict[FileName, Digest | dict[str, str]],
     "plugins": list[dict[str, str]],
+    "provenance": dict[Text, str],
+    "provenance_sha256": Digest,
     "versions": dict[str, str],
     "seed": Whole,
     "levels": Annotated[list[_Level], Field(min_length=1)],
@@ -121,6 +125,9 @@ _KINDS: dict[str, Any] = {
     "files": dict[FileName, _File],
     "sha256": Digest,
 }
+# what spadmnist 0.1.0 sealed, and what stands in its place
+_ONCE = {"versions"}
+_TODAY = {"stream", "encoding", "provenance", "provenance_sha256"}
 
 
 def problems(manifest: Mapping[str, Any], name: str) -> list[str]:
@@ -130,7 +137,9 @@ def problems(manifest: Mapping[str, Any], name: str) -> list[str]:
     config, shards cover the images of each once, and statistics add them up.
     """
     reader = Reader(Document(name, manifest), Path())
-    reader.sections(manifest, {key: kind for key, kind in _KINDS.items() if key != "causes" or key in manifest}, {})
+    other = _TODAY if "versions" in manifest else _ONCE
+    absent = other if "causes" in manifest else other | {"causes"}
+    reader.sections(manifest, {key: kind for key, kind in _KINDS.items() if key not in absent}, {})
     if not reader.problems:
         _compare(manifest, reader)
     return reader.problems

@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, factory, store
+from . import config, dataset, disk, document, factory, golden, store
 from .dataset import CONFIG, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
-from .factory import POSITIONS, Progress
+from .factory import Progress
+from .identity import POSITIONS, held, identity
 from .images import Images
 from .tiles import of_facts
 from .workers import Executor, executor
@@ -152,13 +153,10 @@ def repair(
         )
     did: list[str] = []
     experiment = _experiment(root, manifest, damage, did)
-    if manifest is not None and manifest["versions"] != factory.versions():
-        wanted = ", ".join(f"{k} {v}" for k, v in manifest["versions"].items() if factory.versions().get(k) != v)
-        raise SpadError(f"{root}: was made with {wanted}; install these versions to make the same bytes again")
     splits = _images(root, manifest, experiment, damage, images_dir)
-    identity = factory.identity(experiment, splits)
+    wanted = identity(experiment, splits)
     if manifest is not None:
-        lines = [key for key in identity if manifest.get(key) != identity[key]]
+        lines = [key for key, value in held(manifest).items() if value != wanted[key]]
         if lines:
             raise SpadError(
                 f"{root}: cannot be made again from what is here: {', '.join(lines)} differ from the manifest's; "
@@ -180,12 +178,12 @@ def repair(
         remade, lines = _remake(experiment, splits, root, again, manifest, workers, progress)
         did += lines
         if manifest is None:
-            factory.begin(root, identity)
+            factory.begin(root, wanted)
             for shard in shards:
                 factory.note(root, shard, remade[shard.path])
             for name in (*factory.small_files(experiment, shards, {})[0], MANIFEST):
                 did += _clear_way(root, name)
-            factory.finish(experiment, root, identity, shards, workers, progress)
+            factory.finish(experiment, root, wanted, shards, workers, progress)
             did.append(f"made again: {MANIFEST}")
         else:
             for name, data in factory.small_files(experiment, shards, manifest["normalisation"])[0].items():
@@ -317,9 +315,7 @@ def _remake(
         progress.advance(1, path)
         for name, facts in files.items():
             if manifest is not None and manifest["files"].get(name) != facts:
-                raise SpadError(
-                    f"{root / name}: what is made now is not what the manifest lists; generate the dataset anew"
-                )
+                raise golden.other_bytes(root / name, golden.maker(manifest))
             did.extend(_clear_way(root, name))
             if not _same(root / name, facts):
                 os.replace(apart / name, root / name)
@@ -328,6 +324,8 @@ def _remake(
 
     progress.start("making again", len(shards), 0)
     if shards:
+        if manifest is None:
+            golden.check(experiment)  # else the manifest tells whether the same bytes are made
         factory.greet(workers, experiment)
         factory.make_shards(experiment, splits, apart, shards, workers, done)
     progress.stop()

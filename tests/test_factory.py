@@ -22,9 +22,10 @@ import numpy as np
 import psutil
 import pytest
 from commands import COMMAND, run, run_anew
+from test_guard import LOSSY_BUS
 
 import spadmnist
-from spadmnist import config, dataset, factory, plugins
+from spadmnist import config, dataset, factory, golden, plugins
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.workers import Serial
@@ -254,8 +255,11 @@ def test_cuts_and_numbers_of_frames(frames: int, format: str, tmp_path: Path, mo
         assert_same_images(a, b, piece)
 
 
-def test_a_part_of_the_levels_and_images_holds_the_same_values(made: tuple[Path, Path], tmp_path: Path) -> None:
-    make(made[0], tmp_path / "out", lux=("2560 mlux",), limit=7)
+@pytest.mark.parametrize("causes", [False, True])
+def test_a_part_of_the_levels_and_images_holds_the_same_values(
+    causes: bool, made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    make(made[0], tmp_path / "out", lux=("2560 mlux",), limit=7, causes=causes)
     few, all_ = spadmnist.open(tmp_path / "out"), spadmnist.open(made[1])
     assert few.levels == ("2560 mlux",)
     for split in ("train", "test"):
@@ -357,11 +361,74 @@ def test_an_edited_config_is_refused_by_the_command(made: tuple[Path, Path], tmp
     assert_same(made[1], before)
 
 
-def test_other_versions_do_not_go_on(made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    interrupted(made[0], tmp_path / "out", 2)
-    monkeypatch.setattr(factory, "versions", lambda: {"spadmnist": "9.9.9"})
-    with pytest.raises(SpadError, match="versions"):
-        make(made[0], tmp_path / "out")
+# --- under other versions -----------------------------------------------------------------------------------------
+
+
+def made_elsewhere(root: Path, plant: bool) -> None:
+    """Let all shards of an unfinished run be those of another machine, which may have made other bytes."""
+    for record in (root / ".spadmnist" / "shards").rglob("*.json"):
+        noted = json.loads(record.read_text())
+        assert noted["made_by"] == golden.made_by()
+        noted["made_by"] |= {"numpy": "1.0", "processor": "an abacus"}
+        record.write_text(json.dumps(noted))
+        if plant and "images" not in record.parts:
+            path = root / next(name for name in noted["files"] if not name.endswith("zarr.json"))
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 1
+            path.write_bytes(content)
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_other_versions_that_make_the_same_bytes_go_on(shards: int, made: tuple[Path, Path], tmp_path: Path) -> None:
+    """One of the shards that are there is made again, one with light in it where there is one."""
+    said: list[str] = []
+    interrupted(made[0], tmp_path / "out", shards)
+    made_elsewhere(tmp_path / "out", plant=False)
+    outcome = make(made[0], tmp_path / "out", progress=Progress(notice=said.append))
+    assert outcome.kept == shards + 1 and [text for text in said if "one shard is made again" in text]
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_other_versions_that_make_other_bytes_stop(made: tuple[Path, Path], tmp_path: Path) -> None:
+    interrupted(made[0], tmp_path / "out", 3)
+    made_elsewhere(tmp_path / "out", plant=True)
+    before = tree(tmp_path / "out")
+    there = f"numpy {golden.versions()['numpy']}"
+    assert_sentence(
+        run("generate", made[0], "-o", tmp_path / "out"),
+        "other bytes",
+        there,
+        golden.processor(),
+        "numpy 1.0",
+        "abacus",
+    )
+    assert_same(tmp_path / "out", before)
+
+
+def test_a_users_effect_is_made_again_too(tmp_path: Path) -> None:
+    """It has no golden shard, and draws for whole blocks of images."""
+    (tmp_path / "lossy_bus.py").write_text(LOSSY_BUS)
+    plugins.load_file(tmp_path / "lossy_bus.py")
+    file = write_config(tmp_path / "c.yaml", levels=LEVELS[::4], train=40, test=4, more="    lossy_bus: {loss: 20 %}\n")
+    for name, plant in (("same", False), ("other", True)):
+        interrupted(file, tmp_path / name, 2)
+        made_elsewhere(tmp_path / name, plant)
+    assert make(file, tmp_path / "same").kept == 3
+    with pytest.raises(SpadError, match=r"this machine makes other bytes .*there .*numpy 1\.0"):
+        make(file, tmp_path / "other")
+
+
+def test_a_new_run_under_other_versions_makes_a_golden_shard_first(
+    made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = golden.known()
+    monkeypatch.setattr(golden, "known", lambda: {**known, "versions": {"numpy": "1.0"}})
+    make(made[0], tmp_path / "out", limit=4)
+    planted = dict.fromkeys(known["digests"], "0" * 64)
+    monkeypatch.setattr(golden, "known", lambda: {"digests": planted, "versions": {"numpy": "1.0"}})
+    with pytest.raises(SpadError, match=r"the golden shard of stream 1, encoding 1: .*there numpy 1\.0"):
+        make(made[0], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 # --- killed from outside ------------------------------------------------------------------------------------------

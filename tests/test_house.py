@@ -34,7 +34,7 @@ LAYERS = [
     {"standing"},
     {"experiment", "signatures"},
     {"config"},
-    {"manifest", "sensor_file"},
+    {"identity", "manifest", "sensor_file"},
     {"dataset"},
     {"golden", "measurement"},
     {"factory", "look", "reference", "schema", "template", "twin"},

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import run
 from test_factory import (
@@ -24,7 +25,7 @@ from test_factory import (
 )
 
 import spadmnist
-from spadmnist import factory, verify
+from spadmnist import dataset, factory, store, verify
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 
@@ -187,7 +188,9 @@ def test_only_the_damaged_files_are_written(root: Path, made: Path) -> None:
     assert_same(root, tree(made))
 
 
-@pytest.mark.parametrize("key", ["files", "shards", "config", "bytes", "sha256", "normalisation", "images", "versions"])
+@pytest.mark.parametrize(
+    "key", ["files", "shards", "config", "bytes", "sha256", "normalisation", "images", "stream", "provenance"]
+)
 def test_every_entry_of_the_manifest_may_be_damaged(key: str, root: Path, made: Path) -> None:
     """It is still JSON, and an entry has another name."""
     text = (root / "manifest.json").read_text()
@@ -381,12 +384,69 @@ def test_a_lost_tree(root: Path, made: Path) -> None:
     assert_same(root, tree(made))
 
 
-def test_other_versions_are_said(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (root / "config.yaml").write_text("x")
-    here = factory.versions()
-    monkeypatch.setattr(factory, "versions", lambda: {**here, "numpy": "1.0"})
-    with pytest.raises(SpadError, match="numpy"):
+PLANTED = "5_mlux/train/00000"
+
+
+def made_elsewhere(root: Path, plant: bool = False) -> None:
+    """Let a dataset be that of other versions, which may have made another flux image."""
+    manifest = json.loads((root / "manifest.json").read_text())
+    manifest["provenance"]["numpy"] = "1.0"
+    if plant:
+        format = manifest["config"]["output"]["format"]
+        column = store.ShardReader(root, PLANTED, format).column("reconstruction/counts")
+        other = replace(column, data=column.data + np.float32(1))
+        manifest["files"] |= store.append_columns(root, PLANTED, {"reconstruction/counts": other}, format)
+        shutil.rmtree(root / ".spadmnist")
+    (root / "manifest.json").write_bytes(dataset.seal(manifest))
+
+
+def a_file(root: Path) -> str:
+    """One of the planted shard, in which flux images are."""
+    names = sorted(name for name in tree(root) if PLANTED in name)
+    return next(name for name in names if name.endswith(".h5") or "reconstruction/counts/c" in name)
+
+
+def test_other_versions_repair(root: Path, made: Path) -> None:
+    made_elsewhere(root)
+    before, name = tree(root), a_file(root)
+    (root / name).unlink()
+    verify.repair(root, verify.verify(root), 1)
+    assert_same(root, before)
+
+
+def test_other_versions_that_make_other_bytes_do_not_repair(root: Path) -> None:
+    name = a_file(root)
+    made_elsewhere(root, plant=True)
+    (root / name).unlink()
+    with pytest.raises(SpadError, match=rf"{name}: this machine makes other bytes .*here .*python.*there .*numpy 1\.0"):
         verify.repair(root, verify.verify(root), 1)
+    assert not (root / name).exists()
+
+
+def test_other_versions_that_make_other_bytes_do_not_reconstruct(few: dict[int, Path], tmp_path: Path) -> None:
+    for plant in (False, True):
+        root = tmp_path / f"out-{plant}"
+        shutil.copytree(few[2], root)
+        made_elsewhere(root, plant)
+        before = tree(root)
+        if plant:
+            with pytest.raises(SpadError, match=r"this machine makes other bytes .*there .*numpy 1\.0"):
+                factory.add_reconstructions(root, METHODS[2:3], 1)
+            assert {name: content for name, content in tree(root).items() if ".spadmnist" not in name} == before
+        else:
+            factory.add_reconstructions(root, METHODS[2:3], 1)
+
+
+def test_versions_are_no_part_of_what_a_dataset_is(root: Path) -> None:
+    """They stand beside the seal, and a changed one is still found."""
+    manifest = json.loads((root / "manifest.json").read_text())
+    assert (manifest["stream"], manifest["encoding"]) == (1, 1) and "versions" not in manifest
+    assert manifest["provenance"].items() > factory.versions().items()
+    made_elsewhere(root)
+    assert json.loads((root / "manifest.json").read_text())["sha256"] == manifest["sha256"]
+    assert not verify.verify(root)
+    (root / "manifest.json").write_text((root / "manifest.json").read_text().replace('"1.0"', '"1.1"'))
+    assert verify.verify(root).changed == ("manifest.json",)
 
 
 def test_data_of_another_dataset_are_not_put_in(root: Path, tmp_path: Path) -> None:

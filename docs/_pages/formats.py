@@ -100,7 +100,10 @@ def page() -> str:
         "Formats",
         "## A dataset",
         "A dataset is a folder. Each light level and split is cut into shards. A shard is a Zarr group, or one HDF5 "
-        "file with the same arrays. `manifest.json` lists every file with its size and SHA-256.",
+        "file with the same arrays. `manifest.json` lists every file with its size and SHA-256. Its own `sha256` is "
+        "the identity of the dataset. `stream` and `encoding` number what draws and what writes the bytes. "
+        "`provenance` holds the versions by which the dataset was finished. It is no part of the identity, and has "
+        "its own digest.",
         dataset,
         "## A measurement",
         "A measurement is a folder with `measurement.yaml` ([its keys](measurement.md)) and one HDF5 file a capture.",

@@ -79,7 +79,7 @@ class Captures(PaperExperiment):
         )
         made = [(one, one.load_images(setting.images_dir)) for one in (bench.training, bench.chart)]
         common = {
-            "digest": _digest([_identity(*one) for one in made]),
+            "digest": _digest([factory.identity(*one) for one in made]),
             "captures": _digest([shot.digest for shot in bench.shots(REAL)]) if self.captures else None,
             "seed": SEED,
             "train": bench.training.wanted(made[0][1]["train"]),
@@ -390,11 +390,6 @@ def _by_light(shots: Sequence[_Shot]) -> list[list[_Shot]]:
             groups.append([])
         groups[-1].append(shot)
     return groups
-
-
-def _identity(experiment: Experiment, images: Mapping[str, Images]) -> dict[str, Any]:
-    found = factory.identity(experiment, images)
-    return {name: value for name, value in found.items() if name != "versions"}
 
 
 def _digest(of: Any) -> str:

@@ -1,0 +1,127 @@
+"""What a dataset is a function of: config, images, maps, plug-ins, and the numbers of what draws and writes it.
+
+No version of a library is among them. Two programs that know the same numbers make the same bytes, or say that they
+cannot (`golden`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import plugins, reconstruct
+from .errors import SpadError
+from .experiment import Experiment
+from .images import Images
+from .positions import positions_text
+
+FORMAT = "spadmnist-dataset/1"
+STREAM = 1  # raised when any number is drawn otherwise
+ENCODING = 1  # raised when the same numbers are written as other bytes
+POSITIONS = "maps/layout.positions.csv"
+
+
+def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, Any]:
+    """What a dataset is a function of, as a manifest holds it."""
+    any_split = next(iter(splits.values()))
+    resolved, maps = portable(experiment)
+    return {
+        "format": FORMAT,
+        "stream": STREAM,
+        "encoding": ENCODING,
+        "config": resolved,
+        "images": {
+            "shape": list(any_split.pixels.shape[1:]),
+            "dtype": any_split.pixels.dtype.name,
+            "white": float(any_split.white),
+            "splits": {
+                split: {
+                    "images": experiment.wanted(images),
+                    "sha256": images.head(experiment.wanted(images)).sha256,
+                    **({} if images.tiles is None else {"tiles": images.tiles.facts()}),
+                }
+                for split, images in splits.items()
+            },
+        },
+        "maps": {name: _known_by(name, data) for name, data in maps.items()},
+        "plugins": plugin_sources(experiment),
+    }
+
+
+def held(kept: Mapping[str, Any]) -> dict[str, Any]:
+    """The identity that a manifest, or the plan of a run, holds; what came before the numbers has the first ones."""
+    keys = ("format", "stream", "encoding", "config", "images", "maps", "plugins")
+    kept = {"stream": 1, "encoding": 1, **kept}
+    return {key: kept.get(key) for key in keys}
+
+
+def refuse_other(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any]) -> None:
+    """Raise SpadError where what a manifest or a plan holds is another identity than the wanted one."""
+    lines = _difference(wanted, held(kept))
+    if lines:
+        more = f" (and {len(lines) - 4} more)" if len(lines) > 4 else ""
+        raise SpadError(
+            f"{root} holds another dataset: {'; '.join(lines[:4])}{more}; choose another folder with -o, or remove it"
+        )
+
+
+def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:
+    """The files that define the user's own effects and methods of an experiment, whole."""
+    classes = [type(e) for e in experiment.sensor.effects] + [type(reconstruct.find(m)) for m in experiment.methods]
+    used = {plugins.source_file(cls) for cls in classes}
+    return sorted(
+        (
+            {"file": path.name, "sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
+            for path, text in plugins.loaded_files().items()
+            if str(path) in used
+        ),
+        key=lambda found: (found["file"], found["sha256"]),
+    )
+
+
+def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """(config, map files) that stand on their own: maps and positions from files become files of the dataset."""
+    resolved = json.loads(json.dumps(experiment.resolved))
+    layout = experiment.sensor.layout
+    maps: dict[str, bytes] = {}
+    if layout.positions is not None:
+        maps[POSITIONS] = positions_text(layout.positions).encode()
+        resolved["sensor"]["layout"]["positions"] = POSITIONS
+    for name, values in resolved["sensor"]["effects"].items():
+        for key, raw in values.items():
+            if isinstance(raw, dict) and set(raw) == {"file"}:
+                effect = experiment.sensor.effect(name)
+                array = np.asarray(getattr(effect, key))
+                if effect is not None and effect.parameters[key].per_pixel:
+                    array = array.reshape(layout.shape)
+                buffer = io.BytesIO()
+                np.save(buffer, array)
+                maps[f"maps/{name}.{key}.npy"] = buffer.getvalue()
+                values[key] = {"file": f"maps/{name}.{key}.npy"}
+    return resolved, maps
+
+
+def _known_by(name: str, data: bytes) -> dict[str, str] | str:
+    """What a manifest keeps of a map: its digest; of the positions, which are small, also the text itself."""
+    digest = hashlib.sha256(data).hexdigest()
+    return {"sha256": digest, "text": data.decode()} if name == POSITIONS else digest
+
+
+def _difference(ours: Any, theirs: Any, path: str = "") -> list[str]:
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        out = []
+        for key in sorted(set(ours) | set(theirs)):
+            out += _difference(ours.get(key), theirs.get(key), f"{path}.{key}" if path else str(key))
+        return out
+    return [] if ours == theirs else [f"{path}: {_short(theirs)} there, {_short(ours)} asked for"]
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) <= 70 else text[:67] + "..."
