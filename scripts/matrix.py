@@ -29,7 +29,7 @@ PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 PATIENCE = 1800  # s, for one installation or one pair of datasets
 STOPS = "stops"
 PARTS = ("tr", "str", "qis", "counts", "reconstructions", "zarr", "hdf5")
-SHOWN = ("numpy", "numba", "zarr", "numcodecs", "h5py")
+SHOWN = ("numpy", "numba", "numcodecs", "h5py")
 
 # every stage of the sensor, distributions and all readouts
 CONFIG = """\

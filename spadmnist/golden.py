@@ -31,7 +31,7 @@ IMAGES = 16
 _EVENTS = 1e6  # detections that all of them have at most: a tenth of a second
 _BYTES = 1 << 26  # bytes of their streams at most, as of a shard; a large array has fewer images
 _LIGHT = Level("golden", "irradiance", 1e-3)  # W/m^2; the images are dimmed or brightened, so that it decides nothing
-_LIBRARIES = ("numpy", "numba", "zarr", "numcodecs", "h5py")
+_LIBRARIES = ("numpy", "numba", "numcodecs", "h5py")
 
 
 def versions() -> dict[str, str]:
