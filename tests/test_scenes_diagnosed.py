@@ -152,7 +152,7 @@ def test_what_numbers_take_from_residuals_is_beyond_what_they_leave() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "modality"),
-    [*((one, "qis") for one in (*PRINTS, *OTHERS)), *((one, "tr") for one in (*PRINTS, OTHERS[1]))],
+    [(one, modality) for modality in ("qis", "tr") for one in (*PRINTS, *OTHERS)],
 )
 def test_what_is_hidden_in_a_scene_is_named(hidden: Any, modality: str) -> None:
     """By its own name; of a print with an interval of 95 % that holds its value, with this seed."""

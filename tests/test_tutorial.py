@@ -56,4 +56,11 @@ def test_the_loop_of_the_docs(tmp_path):
     placebo = next(row for row in second["ladder"] if row["placebo"])
     assert placebo["misfit"] > 0.8 * second["misfit"]["before"]  # adding just anything does not help
     assert "The model is adequate" in run(folder, check)
+    # the fit that is asked for agrees with the diagnosis
+    run(folder, "spadmnist fit sensor.yaml lab --plugin echo.py --add echo -o fitted --json fit.json")
+    asked = json.loads((folder / "fit.json").read_text())
+    assert asked["verdict"] == "explained"
+    values = asked["steps"][0]["values"]
+    assert values["share"]["low"] < 0.008 < values["share"]["high"] < 0.0095
+    assert values["delay"]["low"] < 150e-9 < values["delay"]["high"] < 155e-9
     assert "from bench" in (folder / "next" / "sensor.yaml").read_text()
