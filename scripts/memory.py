@@ -22,12 +22,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import importfiles
 
 PIECE = 1 << 20  # detections, bytes of frames that are made at a time
 SIDE = 512  # pixels, of a frame
@@ -47,6 +45,14 @@ SENSOR = """sensor:
 
 
 # --- files --------------------------------------------------------------------------------------------------------
+
+
+def _small_files() -> Any:
+    """The module of the tests that writes small files of each kind."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    import importfiles
+
+    return importfiles
 
 
 def detections(count: int, ticks: int = TICKS) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -139,7 +145,7 @@ def npz_frames(path: Path, size: int, dtype: str, most: int) -> None:
 
 def ptu(path: Path, size: int) -> None:
     """T2 records of HydraHarp 2, an overflow where the clock goes round."""
-    importfiles.ptu(path, [], declared=0, MeasDesc_GlobalResolution=1e-9)
+    _small_files().ptu(path, [], declared=0, MeasDesc_GlobalResolution=1e-9)
     at, rounds, written = path.stat().st_size, 0, 0
     with open(path, "r+b") as file:
         file.seek(at)
@@ -153,7 +159,7 @@ def ptu(path: Path, size: int) -> None:
             records = np.insert(records, at_overflow, overflows)
             file.write(records.tobytes())
             written += len(records)
-    importfiles_header = importfiles.ptu(
+    importfiles_header = _small_files().ptu(
         path.with_suffix(".head"), [], declared=written, MeasDesc_GlobalResolution=1e-9
     )
     with open(path, "r+b") as file:

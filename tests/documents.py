@@ -44,6 +44,7 @@ RULES = {
     "make verify": ("make -n -o .venv/installed verify", "these tests would run themselves"),
     "make docs": ("make -n -o .venv/installed -o .venv/installed-docs docs", "the build executes all cells"),
     "make bench": ("make -n -o .venv/installed bench", "it takes minutes of an idle machine"),
+    "python scripts/memory.py": ("python scripts/memory.py --help", "it makes and reads gigabytes"),
     "make faults": ("make -n -o .venv/installed faults", "it takes up to an hour; test_faults.py runs the script"),
     "make challenge": (
         "make -n -o .venv/installed challenge",

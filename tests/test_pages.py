@@ -492,6 +492,16 @@ def test_it_is_one_small_file_and_always_the_same(tmp_path: Path, failing_page: 
     assert len(Parts(before).images) == 1 + 8  # the light, and the clearest deviations
 
 
+def test_the_names_in_a_drawing_are_counted() -> None:
+    """The last digit of a layout, of which matplotlib makes them, is not the same in every run."""
+    one, other = (
+        f'<path id="{m}"/><clipPath id="{p}"/><use xlink:href="#{m}" clip-path="url(#{p})"/>'.encode()
+        for m, p in (("m0123456789", "p65bda3e1a1"), ("mabcdef0123", "pe87669e245"))
+    )
+    assert _figures._numbered(one) == _figures._numbered(other)
+    assert b'<clipPath id="p1"/><use xlink:href="#m0" clip-path="url(#p1)"/>' in _figures._numbered(one)
+
+
 def test_twelve_large_maps_are_still_a_small_page() -> None:
     picture = _comparison._picture(check_of("large map", 1e-9, factor=4.0))
     assert picture is not None and _comparison._PICTURES * len(picture.source) < 2_200_000

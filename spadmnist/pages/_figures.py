@@ -130,7 +130,18 @@ def drawn(draw: Any, *arguments: Any, raster: bool = False) -> str:
         else:
             FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     kind = "png" if raster else "svg+xml"
-    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    data = buffer.getvalue() if raster else _numbered(buffer.getvalue())
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _numbered(svg: bytes) -> bytes:
+    """The drawing with its names counted: as matplotlib gives them they depend on the last digit of a layout."""
+    numbers: dict[bytes, bytes] = {}
+
+    def number(name: re.Match[bytes]) -> bytes:
+        return name[1] + numbers.setdefault(name[2], b"%b%d" % (name[2][:1], len(numbers)))
+
+    return re.sub(rb'(\bid="|"url\(#|"#)([a-z][0-9a-f]{10})(?=["\)])', number, svg)
 
 
 def picture(cells: Cells, words: str) -> Picture:
