@@ -151,7 +151,7 @@ def effects(rounds: int) -> list[Row]:
 
     def shot(settings: dict[str, dict[str, object]], rules: str) -> Callable[[], int]:
         made = [Effect.registry.find(name)(**values) for name, values in settings.items()]
-        sensor = Sensor(layout, made, rules).settled()
+        sensor = Sensor(layout, made, rules).resolved()
         readouts = ("tr", "qis", "counts")
         return lambda: len(sensor.expose(photons, conditions, streams, readouts, staged=True).tr or ())
 

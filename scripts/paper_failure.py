@@ -273,7 +273,7 @@ def table(chip: Chip, answer: dict[str, Any]) -> str:
 
 
 def twins(folder: Path, answer: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
-    """Counts per pixel as measured, of the uniform model, and of the model found at the light that was settled."""
+    """Counts per pixel as measured, of the uniform model, and of the model found at the light that was fitted."""
     if not (folder / "uniform").exists():
         spadmnist("simulate", folder / "sensor.yaml", folder / "lab", "-o", folder / "uniform")
     if not (folder / "found").exists():
@@ -284,9 +284,9 @@ def twins(folder: Path, answer: dict[str, Any]) -> dict[str, dict[str, np.ndarra
                 if of_this and "irradiance" in capture["light"]:
                     level = float(capture["light"]["irradiance"].split()[0]) * nuisance["value"]
                     capture["light"]["irradiance"] = f"{level:.6g} nW/cm^2"
-        (folder / "settled").mkdir(exist_ok=True)
-        (folder / "settled" / "measurement.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
-        spadmnist("simulate", folder / "next" / "sensor.yaml", folder / "settled", "-o", folder / "found")
+        (folder / "fitted").mkdir(exist_ok=True)
+        (folder / "fitted" / "measurement.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
+        spadmnist("simulate", folder / "next" / "sensor.yaml", folder / "fitted", "-o", folder / "found")
     return {which: counts_of(folder / which) for which in ("lab", "uniform", "found")}
 
 

@@ -127,7 +127,7 @@ def of_measurement(
         raise InputError(f"{measurement.source}: of its captures only means are known, of which no image can be made")
     chosen, notes = _chosen(measurement, with_data, tuple(dict.fromkeys(methods)))
     if sensor is not None:
-        sensor = sensor.settled()
+        sensor = sensor.resolved()
         measurement.check_sensor(sensor)
     told = {capture.id: _pdp(measurement, capture, sensor) for capture, _ in chosen}
     progress = progress or Progress()

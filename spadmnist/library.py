@@ -378,7 +378,7 @@ def _model(sensor: Sensor | PathLike, files: Sequence[PathLike]) -> Sensor:
     if isinstance(sensor, Sensor):
         for effect in sensor.effects:
             check_values(effect)
-        return sensor.settled()
+        return sensor.resolved()
     return read_sensor(sensor)
 
 

@@ -315,7 +315,7 @@ def _read_mixture(declared: Parameter, body: Any, path: tuple[Any, ...], problem
     return Distribution("mixture", (), tuple(parts))
 
 
-def settle(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...], key: str) -> Any:
+def resolve(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...], key: str) -> Any:
     """The value an effect computes with: a float, a bool, a word, a `ByWavelength`, or a float64 array.
 
     shapes: those that a map may have; a distribution is drawn for the first of them. Maps are returned in the shape

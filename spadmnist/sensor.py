@@ -22,7 +22,7 @@ from .effects.tdc import Tdc
 from .errors import EffectError, InputError, SpadError, did_you_mean
 from .events import Children, Events, Layout
 from .foreign import html_table, visible
-from .plugins import blame, check_values, described, settle, source_file
+from .plugins import blame, check_values, described, resolve, source_file
 from .readout import Frames, Recorded, counts_type, no_detection, summarised, unsigned_for
 from .streams import BLOCK, Draws, Streams
 from .window import Window
@@ -40,10 +40,10 @@ _HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more
 
 @dataclass(repr=False)
 class Sensor:
-    """Layout, effects and chip seed. The effects' values may still be distributions and files; see `settled`.
+    """Layout, effects and chip seed. The effects' values may still be distributions and files; see `resolved`.
 
     rules: `paper` or `device` (physics of the readouts: what fills traps, and what a frame sees).
-    chip, window: where this is a part of a chip (`cropped`), the whole of it, settled, and the part.
+    chip, window: where this is a part of a chip (`cropped`), the whole of it, resolved, and the part.
     """
 
     layout: Layout
@@ -51,33 +51,33 @@ class Sensor:
     rules: str = "paper"
     chip_seed: int = 0
     name: str = ""
-    _settled: bool = field(default=False, repr=False)
+    _resolved: bool = field(default=False, repr=False)
     chip: Sensor | None = field(default=None, repr=False)
     window: Window | None = None
 
-    def settled(self) -> Sensor:
+    def resolved(self) -> Sensor:
         """The same sensor with every map read and every distribution drawn. Raises InputError for a bad map."""
-        if self._settled:
+        if self._resolved:
             return self
         if self.chip is not None and self.window is not None:
             own = {"rules": self.rules, "chip_seed": self.chip_seed, "name": self.name}
             return self.chip.changed(effects=[self._on_chip(e) for e in self.effects], **own)._seen_in(self.window)
         effects = [
-            type(effect)(**{name: self.settle(effect, name) for name in effect.parameters})
+            type(effect)(**{name: self.resolve(effect, name) for name in effect.parameters})
             for effect in in_order(self.effects)
         ]
-        sensor = replace(self, effects=effects, _settled=True)
+        sensor = replace(self, effects=effects, _resolved=True)
         for effect in effects:
             tick, origin = sensor._converter or (0.0, 0.0)
             self._call(effect, "made", Chip(self.layout, self.chip_seed, effect.name, tick, origin))
         return sensor
 
     def changed(self, **fields: Any) -> Sensor:
-        """The same sensor, or the same part of it, with other `effects` or another `chip_seed`, settled."""
-        return replace(self, **fields, _settled=False).settled()
+        """The same sensor, or the same part of it, with other `effects` or another `chip_seed`, resolved."""
+        return replace(self, **fields, _resolved=False).resolved()
 
     def with_effect(self, effect: Effect) -> Sensor:
-        """The same sensor with one effect more, settled. Raises InputError where it lists it, or for a wrong value."""
+        """The same sensor with one effect more, resolved. Raises InputError where it lists it, or for a wrong value."""
         if self.effect(effect.name) is not None:
             named = next(iter(effect.parameters), "parameter")
             raise InputError(
@@ -88,12 +88,12 @@ class Sensor:
         return self.changed(effects=[*self.effects, effect])
 
     def without(self, effect: str) -> Sensor:
-        """The same sensor without an effect, settled. Raises InputError where it does not list it."""
+        """The same sensor without an effect, resolved. Raises InputError where it does not list it."""
         self._listed(effect)
         return self.changed(effects=[e for e in self.effects if e.name != effect])
 
     def with_values(self, values: Mapping[str, Any]) -> Sensor:
-        """The same sensor with other values, settled.
+        """The same sensor with other values, resolved.
 
         values: `"effect.parameter"` -> a number in SI, or a map, (pixels,) or (rows, columns). Raises InputError for
         what the sensor does not list, or a value that is not possible.
@@ -147,7 +147,7 @@ class Sensor:
         return html_table(self._title(), ("stage", "effect", "parameter", "value"), self.rows())
 
     def cropped(self, rows: slice, columns: slice) -> Sensor:
-        """The part of the chip in these rows and columns, settled; of pixels that are listed one by one, of one row.
+        """The part of the chip in these rows and columns, resolved; of pixels that are listed one by one, of one row.
 
         Its maps and what is drawn from `chip_seed` are the whole chip's, cut, and all its physics is that of the chip:
         each effect is made for the whole array, sees the rates and events of the whole array, and knows of no window.
@@ -161,14 +161,14 @@ class Sensor:
         """
         window = Window.of(self.layout.shape, rows, columns)
         if window.shape == window.whole:
-            return self.settled()
-        chip = self.settled()
+            return self.resolved()
+        chip = self.resolved()
         if chip.chip is not None and chip.window is not None:
             return chip.chip._seen_in(window.within(chip.window))
         return chip._seen_in(window)
 
     def _seen_in(self, window: Window) -> Sensor:
-        """A part of this chip, which is settled."""
+        """A part of this chip, which is resolved."""
         effects = [window.effect(effect) for effect in self.effects]
         return replace(self, layout=window.layout(self.layout), effects=effects, chip=self, window=window)
 
@@ -182,7 +182,7 @@ class Sensor:
         }
         return type(effect)(**values)
 
-    def settle(self, effect: Effect, name: str) -> Any:
+    def resolve(self, effect: Effect, name: str) -> Any:
         """The value of one parameter: a map is read, a distribution is drawn. Raises InputError for a bad map."""
         key = f"chip/{self.chip_seed}/{effect.name}/{name}"
         rows, columns = self.layout.shape
@@ -196,7 +196,7 @@ class Sensor:
             "": (),
         }
         declared = effect.parameters[name]
-        return settle(declared, getattr(effect, name), shapes[declared.per], key)
+        return resolve(declared, getattr(effect, name), shapes[declared.per], key)
 
     def at(self, stage: str) -> list[Effect]:
         """The effects of one stage, in order."""
@@ -411,8 +411,8 @@ class Sensor:
 
         Raises EffectError where an effect's own code fails or returns what it must not.
         """
-        if not self._settled:
-            return self.settled().expose(photons, conditions, streams, readouts, staged, causes, most)
+        if not self._resolved:
+            return self.resolved().expose(photons, conditions, streams, readouts, staged, causes, most)
         if photons.ndim != 2 or photons.shape[1] != self.layout.pixels or len(photons) != len(streams.images):
             raise ValueError(
                 f"photons of shape {photons.shape} for {len(streams.images)} images of {self.layout.pixels} pixels"
@@ -747,7 +747,7 @@ class Sensor:
         """The events with all that they may cause, and the parent of each (empty where there is none to look at).
 
         By the paper's rules every event has its children, whether or not it will be recorded, and they have none. By
-        a device's, children have children; which of them happen is settled later, when it is known what fires.
+        a device's, children have children; which of them happen is resolved later, when it is known what fires.
         """
         cascade = self.rules == "device"
         correlated = self.at("correlated")

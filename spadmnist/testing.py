@@ -212,7 +212,7 @@ def _sensor(
     base = _base().sensor
     out = without or getattr(effect, "name", "")
     effects = [e for e in base.effects if e.name != out and e.stage not in lacking]
-    return Sensor(layout or base.layout, [*effects, *([effect] if effect else [])], rules, base.chip_seed).settled()
+    return Sensor(layout or base.layout, [*effects, *([effect] if effect else [])], rules, base.chip_seed).resolved()
 
 
 @lru_cache

@@ -58,7 +58,7 @@ def model_recordings(
     the bits of frames that stand alone without their events, which is faster. told: which share of an image is made,
     each time.
     """
-    sensor = sensor.settled()
+    sensor = sensor.resolved()
     pixels, wanted = sensor.layout.pixels, len(images)
     flux = np.asarray(photons, np.float64)
     flux = np.broadcast_to(flux[:, None] if flux.ndim == 1 else flux, (wanted, pixels))
@@ -143,7 +143,7 @@ def twin(
     Every capture draws numbers of its own, named by its id: it is the same whichever others there are. Raises
     InputError before the first one where the sensor has other pixels or a light level is free.
     """
-    sensor = sensor.settled()
+    sensor = sensor.resolved()
     measurement.check_sensor(sensor)
     fluxes = []
     for capture in measurement.captures:

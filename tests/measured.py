@@ -76,7 +76,7 @@ def device(*more: Any, rows: int = 4, columns: int = 10, resolution: float = 1e-
     effects = [Detection(pdp=0.4), DarkCounts(rate=1000.0), DeadTime(duration=50e-9), *more]
     if resolution:
         effects.append(Tdc(resolution=resolution))
-    return Sensor(Layout(rows, columns, 25e-12, 1.0), effects, "device", name="test").settled()
+    return Sensor(Layout(rows, columns, 25e-12, 1.0), effects, "device", name="test").resolved()
 
 
 def one(modality: str, frames: int = 300, level: float | None = 0.01, **more: Any) -> Capture:

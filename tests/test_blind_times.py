@@ -163,7 +163,7 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> dict[float, tuple[Repli
     folder: Path = tmp_path_factory.mktemp("edges")
     (folder / "plan.yaml").write_text(CAPTURES)
     (folder / "sensor.yaml").write_text(SENSOR)
-    sensor = config.read_sensor(folder / "sensor.yaml").settled()
+    sensor = config.read_sensor(folder / "sensor.yaml").resolved()
     plan = measurements.open(folder / "plan.yaml", planned=True)
     out = {}
     for spread in (0.0, 0.03):
@@ -221,6 +221,6 @@ def test_which_times_are_the_dead_time(benches: dict[float, tuple[Replicates, np
             return np.asarray(self.hold)
 
     # the longer of two blindnesses is the one that is seen
-    both = Sensor(sensor.layout, [*sensor.effects, HoldOff()], sensor.rules, 0, "two").settled()
+    both = Sensor(sensor.layout, [*sensor.effects, HoldOff()], sensor.rules, 0, "two").resolved()
     per_pixel = [c for c in candidates(both) if c.per == "pixel" and c.effect in ("dead_time", "hold_off")]
     assert {c.parameter: c.blinds for c in per_pixel} == {"duration": True, "hold": False, "slope": False}

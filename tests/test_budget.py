@@ -125,4 +125,4 @@ def test_misfit_in_sample_is_the_same_in_both_verbs(lab, few):
 
 def test_all_that_a_sensor_may_lack_is_tried_by_default(lab):
     sensor, _ = lab()
-    assert {"add afterpulsing", "add crosstalk"} <= {c.name for c in candidates(sensor.settled())}
+    assert {"add afterpulsing", "add crosstalk"} <= {c.name for c in candidates(sensor.resolved())}

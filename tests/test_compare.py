@@ -56,7 +56,7 @@ USUAL: dict[str, dict[str, Any]] = {
 def sensor(**changed: dict[str, Any] | None) -> Sensor:
     effects = {**USUAL, **changed}
     made = [Effect.registry.find(name)(**values) for name, values in effects.items() if values is not None]
-    return Sensor(Layout(8, 8, 25e-12, 1.0), made, "device", name="small").settled()
+    return Sensor(Layout(8, 8, 25e-12, 1.0), made, "device", name="small").resolved()
 
 
 def captures(modality: str) -> list[Capture]:

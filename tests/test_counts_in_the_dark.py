@@ -48,7 +48,7 @@ def lab(folder: Path, captures: str = TR, dead: int = 200, **hidden: Any) -> tup
     """(the sensor as it is listed, what one with such rates has recorded)."""
     (folder / "sensor.yaml").write_text(SENSOR.replace("DEAD", str(dead)))
     (folder / "plan.yaml").write_text(PLAN + captures)
-    sensor = config.read_sensor(folder / "sensor.yaml").settled()
+    sensor = config.read_sensor(folder / "sensor.yaml").resolved()
     truth = with_values(sensor, {RATE: RATES, **{tuple(key.split("__")): v for key, v in hidden.items()}})  # type: ignore[misc]
     plan = measurement.open(folder / "plan.yaml", planned=True)
     return sensor, measurement.open(twin.simulate(truth, plan, folder / "lab", 3))

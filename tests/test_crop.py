@@ -53,7 +53,7 @@ def chip_with(effect: Effect | None = None, layout: Layout = GRID, rules: str = 
         of("tdc", resolution=100e-12),
     ]
     known = [e for e in usual if effect is None or e.name != effect.name]
-    return Sensor(layout, [*known, *([effect] if effect else []), *more], rules, CHIP, "chip").settled()
+    return Sensor(layout, [*known, *([effect] if effect else []), *more], rules, CHIP, "chip").resolved()
 
 
 def strongly(name: str) -> Effect:
@@ -135,7 +135,7 @@ def test_widths_of_codes_are_cut_by_pixel_and_shared_ones_stay(tmp_path: Path) -
 
 def test_what_is_drawn_is_the_same_whether_the_sensor_was_settled_before_or_not() -> None:
     unsettled = Sensor(GRID, [of("dark_counts", rate=Distribution("lognormal", (5e3, 1.0)))], "device", CHIP)
-    one, other = unsettled.cropped(*FEW), unsettled.settled().cropped(*FEW)
+    one, other = unsettled.cropped(*FEW), unsettled.resolved().cropped(*FEW)
     assert np.array_equal(one.rates(lit(one), CLOCK), other.rates(lit(other), CLOCK))
 
 
@@ -194,7 +194,7 @@ def test_each_pixel_has_the_mean_of_its_place_on_the_chip() -> None:
     patterns = [of(f"{line}_pattern", gain=Distribution("normal", (1.0, 0.3))) for line in ("row", "column")]
     gradient = of("illumination_gradient", x=1.0, y=-0.6, vignette=0.2)
     dark = of("dark_counts", rate=Distribution("lognormal", (2e4, 1.0)))
-    whole = Sensor(GRID, [of("detection"), dark, gradient, *patterns], "device", CHIP).settled()
+    whole = Sensor(GRID, [of("detection"), dark, gradient, *patterns], "device", CHIP).resolved()
     part = whole.cropped(*FEW)
     expected = inside(whole.rates(lit(whole), CLOCK)[0][0], whole, *FEW) * CLOCK.exposure * 400
     counts = part.expose(lit(part, 400), CLOCK, streams(400), ("tr",)).counts
@@ -220,7 +220,7 @@ def test_a_hot_pixel_beside_the_window_causes_crosstalk_in_it(layout: Layout, ru
     assert apart[hot, target] < 1.5 and hot not in window
     rate = np.full(layout.pixels, 1e3)
     rate[hot] = 1e6
-    whole = Sensor(layout, [of("dark_counts", rate=rate), crosstalk], rules).settled()
+    whole = Sensor(layout, [of("dark_counts", rate=rate), crosstalk], rules).resolved()
     part = whole.cropped(rows, columns)
     dark = Conditions(1e-3, 100, 1e-5, 1e-5, None)
     seen, there = (
@@ -262,8 +262,8 @@ def test_pixels_around_the_window_load_the_bus() -> None:
     """The bus is overloaded by the whole chip, not by the window: it loses there as much as on the whole chip."""
     bus = of("readout_loss", service_time=20e-9, queue=4.0)
     effects = [of("detection"), bus]
-    whole = Sensor(GRID, effects, "device").settled()
-    part, alone = whole.cropped(*FEW), Sensor(Layout(5, 4, 25e-12, 1.0), effects, "device").settled()
+    whole = Sensor(GRID, effects, "device").resolved()
+    part, alone = whole.cropped(*FEW), Sensor(Layout(5, 4, 25e-12, 1.0), effects, "device").resolved()
     totals = []
     for number, one in enumerate((part, whole, alone)):
         counts = one.expose(lit(one, 200, 2e6), CLOCK, streams(200, str(number)), ("tr",)).counts
@@ -329,7 +329,7 @@ def strangers() -> list[Effect]:
 
 def test_an_effect_that_knows_nothing_of_windows_sees_the_whole_chip() -> None:
     stain, lag, numbers, rungs, odd = strangers()
-    whole = Sensor(GRID, [of("dark_counts", rate=5e4), stain, lag, numbers, rungs, odd], "device", CHIP).settled()
+    whole = Sensor(GRID, [of("dark_counts", rate=5e4), stain, lag, numbers, rungs, odd], "device", CHIP).resolved()
     part = whole.cropped(*FEW)
     number = np.arange(120).reshape(12, 10)[FEW].ravel()
     assert np.array_equal(part.rates(lit(part), CLOCK)[1], inside(whole.rates(lit(whole), CLOCK)[1], whole, *FEW))
@@ -341,7 +341,7 @@ def test_an_effect_that_knows_nothing_of_windows_sees_the_whole_chip() -> None:
     first = made.frames.first
     assert np.allclose(first.times, 1e-8 * np.tile(number, BLOCK)[first.rows])
     assert made.tally is not None and np.array_equal(made.tally[:, 0], np.tile(number, BLOCK))
-    dark = Sensor(GRID, [of("dark_counts", rate=5e4), odd], "device").settled().cropped(*FEW)
+    dark = Sensor(GRID, [of("dark_counts", rate=5e4), odd], "device").resolved().cropped(*FEW)
     counts = dark.expose(lit(dark, BLOCK, 0.0), CLOCK, streams(BLOCK), ("tr",)).counts
     assert counts is not None and np.array_equal(counts.reshape(BLOCK, 20).sum(axis=0) > 0, number % 2 == 1)
 
@@ -378,7 +378,7 @@ def test_correlated_events_of_others_come_from_everywhere_unless_they_say_how_fa
     rate = np.zeros(120)
     rate[0] = 1e5
     for name, comes in (("across", True), ("denied", False)):
-        whole = Sensor(GRID, [of("dark_counts", rate=rate), of(name)], "device").settled()
+        whole = Sensor(GRID, [of("dark_counts", rate=rate), of(name)], "device").resolved()
         last = whole.cropped(slice(11, 12), slice(9, 10))
         counts = last.expose(lit(last, BLOCK, 0.0), CLOCK, streams(BLOCK), ("tr",)).counts
         assert counts is not None and bool(counts.sum()) is comes
@@ -399,7 +399,7 @@ def test_how_much_stamps_scatter_is_asked_of_the_whole_chip() -> None:
         def apply(self, events: Events, rng: object) -> Events:
             return events.moved(events.times + np.repeat(self._delay, events.counts))
 
-    whole = Sensor(GRID, [of("dark_counts"), Late()], "device").settled()
+    whole = Sensor(GRID, [of("dark_counts"), Late()], "device").resolved()
     assert blur_of(whole.cropped(*FEW)) == blur_of(whole)
 
 
@@ -440,7 +440,7 @@ def test_a_map_of_the_window_leaves_the_rest_of_the_chip_as_it_is() -> None:
 
 
 def test_where_the_chip_has_nothing_else_the_median_of_the_window_stands() -> None:
-    part = Sensor(GRID, [of("detection")], "device").settled().cropped(*FEW)
+    part = Sensor(GRID, [of("detection")], "device").resolved().cropped(*FEW)
     found = np.append(np.full(19, 300.0), 1e5)
     new = with_values(part, {("dark_counts", "rate"): found, ("detection", "pdp"): np.full(20, 0.3)})
     assert new.chip is not None
@@ -459,7 +459,7 @@ def test_rates_in_the_dark_are_scaled_in_the_pixels_around_too() -> None:
     rate = np.full(120, 1e3)
     rate[35] = 1e6  # row 3, column 5
     effects = [of("dark_counts", rate=rate), of("crosstalk", probability=0.05)]
-    part = InTheDark.of(Sensor(GRID, effects, "device").settled().cropped(*FEW))
+    part = InTheDark.of(Sensor(GRID, effects, "device").resolved().cropped(*FEW))
     now = Conditions(1e-3, 100, 1e-5, 1e-5, None)
     assert np.array_equal(part.rates(lit(part, 1, 3.0), now)[0], np.full((1, 20), 3e3))
     few, many = (part.expose(lit(part, 300, factor), now, streams(300), ("tr",)).counts for factor in (1.0, 3.0))
@@ -672,7 +672,7 @@ def test_a_part_whose_chip_would_not_fit_into_the_memory_is_refused() -> None:
     layout = Layout(1000, 1000, 25e-12, 1.0)
     part = (
         Sensor(layout, [of("dark_counts", rate=1e3), of("readout_loss")], "device")
-        .settled()
+        .resolved()
         .cropped(slice(0, 2), slice(0, 2))
     )
     capture = Capture("long", "tr", Light(), Conditions(1.0, 1, 1.0, 1.0, None))

@@ -84,14 +84,14 @@ def test_what_the_printed_light_levels_give(key: str, mean: float, digit: float)
     panel = bench(key).panel
     one = config.read(config.shipped(panel.file))
     scale = 1 / one.conditions.exposure if one.readouts[0] == "tr" else 1
-    found = sensors.closed_form(one.sensor.settled(), one.readouts[0], one.conditions, panel.irradiance).mean() * scale
+    found = sensors.closed_form(one.sensor.resolved(), one.readouts[0], one.conditions, panel.irradiance).mean() * scale
     assert abs(found - mean) < digit
 
 
 @pytest.mark.parametrize("key", ["spad23-700nm", "spad512-700nm-high"])
 def test_light_and_dark_count_rates_come_back(small: Path, key: str) -> None:
     one = config.read(config.shipped(bench(key).panel.file))
-    sensor, modality, c = one.sensor.settled(), one.readouts[0], one.conditions
+    sensor, modality, c = one.sensor.resolved(), one.readouts[0], one.conditions
     mean = float(sensors.closed_form(sensor, modality, c, 3.5).mean())
     assert sensors.solved(sensor, modality, c, mean, "here") == pytest.approx(3.5, rel=1e-6)
     dark = replace(c, wavelength=None)
@@ -121,7 +121,7 @@ def test_merged_bins_hold_the_same_pixels() -> None:
 
 def test_a_twin_has_what_the_paper_names() -> None:
     one = config.read(config.shipped("spad512.yaml"))
-    plain = one.sensor.settled()
+    plain = one.sensor.resolved()
     chip = sensors.twin_of(plain, 500e-9)
     b, rate, other = chip.effect("detection"), plain.effect("dark_counts"), chip.effect("dark_counts")
     # of 262,144 pixels; the false-alarm rate of each is below 1e-6

@@ -200,7 +200,7 @@ def test_what_is_unseen_is_what_numbers_settled_without_it_leave():
 
 
 def test_numbers_that_are_not_where_the_squares_are_least_gain_nothing_by_that() -> None:
-    """At a bound, or settled half way: what they lack there they lack on captures that are not seen, too."""
+    """At a bound, or resolved half way: what they lack there they lack on captures that are not seen, too."""
     rng = np.random.default_rng(14)
     jacobian = {(id, "x"): rng.standard_normal((50, 2)) for id in "abc"}
     noise = {cell: rng.standard_normal(50) for cell in jacobian}
@@ -379,7 +379,7 @@ def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     found = fit_named(sensor, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0 and not found.values
     assert found.steps[0].significance == 0
-    # nothing was wrong, and nothing explained: it was settled
+    # nothing was wrong, and nothing explained: it was resolved
     assert found.verdict == "adequate" and sentence(found).endswith("No check failed before, and none fails now.")
     blind = with_values(sensor, {("dead_time", "paralyzable"): True})
     found = fit_named(blind, data, free=["dead_time.paralyzable"], jobs=1)
@@ -391,9 +391,9 @@ def test_beside_maps_no_number_that_changes_rates_is_settled_by_likelihood(made)
     """Which takes the pixels' rates for known; of a dead time it need not know them."""
     sensor, captures, _ = made
     data = [recording for _, _, recording in captures]
-    every = {candidate.name: candidate for candidate in candidates(sensor.settled())}
+    every = {candidate.name: candidate for candidate in candidates(sensor.resolved())}
     for name, able in (("set dead_time.duration", True), ("set dark_counts.rate", False)):
-        found = maximise(sensor.settled(), data, [every[name]], mapped=True)
+        found = maximise(sensor.resolved(), data, [every[name]], mapped=True)
         assert isinstance(found, MaximumLikelihood) == able, found
 
 
@@ -428,7 +428,7 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after(monkeypatch):
 
 def test_what_cannot_be_settled_is_told_with_what_can(made):
     sensor, *_ = made
-    known = candidates(sensor.settled()), {e.name for e in sensor.effects}
+    known = candidates(sensor.resolved()), {e.name for e in sensor.effects}
     with pytest.raises(
         InputError, match=r"dead_time\.durations cannot be fitted here; .*Did you mean dead_time\.duration\?"
     ):

@@ -159,7 +159,7 @@ def test_the_numbers_of_the_table_are_those_of_the_images(lab: measurement.Measu
 def twin_of(modality: str, photons: float, **more: Any) -> tuple[Sensor, Recording]:
     """400 pixels with a PDP of 0.4, a dead time of 50 ns and a tick of 100 ps, no dark counts."""
     effects = [Detection(pdp=0.4), DeadTime(duration=50e-9), Tdc(resolution=100e-12)]
-    sensor = Sensor(Layout(20, 20, 25e-12, 1.0), effects, "device").settled()
+    sensor = Sensor(Layout(20, 20, 25e-12, 1.0), effects, "device").resolved()
     frames = 1 if modality == "tr" else 3000
     each = 10e-3 if modality == "tr" else 5e-6
     capture = Capture(modality, modality, LIT, Conditions(frames * each, frames, each, each, 500e-9, **more))

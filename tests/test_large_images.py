@@ -103,7 +103,7 @@ def test_parts_are_the_uncut_image_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch, name: str, rules: str, causes: bool
 ) -> None:
     """By rows, and by less than a row; where an effect ties the pixels together, there is one part."""
-    sensor = Sensor(GRID, SENSORS[name], rules, 5).settled()
+    sensor = Sensor(GRID, SENSORS[name], rules, 5).resolved()
     for conditions in (SUMMED, COUNTER):
         whole = exposed(sensor, conditions, ALL, causes=causes)
         for most, least in ((2500.0, 2), (150.0, 20)):
@@ -116,8 +116,8 @@ def test_parts_are_the_uncut_image_bit_for_bit(
 
 @pytest.mark.parametrize("rules", ["paper", "device"])
 def test_parts_of_pixels_one_by_one_and_of_a_part_of_a_chip(monkeypatch: pytest.MonkeyPatch, rules: str) -> None:
-    placed = Sensor(PLACED, SENSORS["all but what ties"], rules, 5).settled()
-    part = Sensor(GRID, SENSORS["all but what ties"], rules, 5).settled().cropped(slice(3, 8), slice(6, None))
+    placed = Sensor(PLACED, SENSORS["all but what ties"], rules, 5).resolved()
+    part = Sensor(GRID, SENSORS["all but what ties"], rules, 5).resolved().cropped(slice(3, 8), slice(6, None))
     for sensor in (placed, part):
         whole = exposed(sensor, SUMMED, ALL)
         made, goes = parts_of(monkeypatch, lambda s=sensor: exposed(s, SUMMED, ALL, most=150.0))
@@ -127,7 +127,7 @@ def test_parts_of_pixels_one_by_one_and_of_a_part_of_a_chip(monkeypatch: pytest.
 
 @pytest.mark.parametrize("lost", ["before", "place"])
 def test_a_stream_that_begins_anew_in_each_part_is_noticed(monkeypatch: pytest.MonkeyPatch, lost: str) -> None:
-    sensor = Sensor(GRID, SENSORS["all but what ties"], "device", 5).settled()
+    sensor = Sensor(GRID, SENSORS["all but what ties"], "device", 5).resolved()
     whole = exposed(sensor, SUMMED, ALL)
     original = Streams.draws
 
@@ -188,7 +188,7 @@ def test_what_ties_pixels_together_is_what_an_effect_declares() -> None:
             return 0.0
 
     def tying(effect: Effect, *readouts: str) -> str | None:
-        return Sensor(GRID, [of("detection"), effect], "device").settled().tying(readouts)
+        return Sensor(GRID, [of("detection"), effect], "device").resolved().tying(readouts)
 
     assert tying(of("crosstalk"), "qis") == tying(of("crosstalk"), "tr") == "crosstalk"
     assert tying(of("crosstalk", probability=0.0), "tr") is None
@@ -198,7 +198,7 @@ def test_what_ties_pixels_together_is_what_an_effect_declares() -> None:
     assert tying(of("count_saturation"), *ALL) is None
     assert tying(of("source_noise"), *ALL) is None  # the same light for all pixels, whatever they detect
     assert tying(Stranger(), "tr") == "stranger"
-    said = Sensor(GRID, [Stranger()], "device").settled().excess(np.full((1, 120), 1e9), SUMMED, ("tr",))
+    said = Sensor(GRID, [Stranger()], "device").resolved().excess(np.full((1, 120), 1e9), SUMMED, ("tr",))
     assert said is not None and said.endswith("as they must: stranger draws for all pixels in one go")
 
 
@@ -286,7 +286,7 @@ def test_causes_of_the_papers_bright_capture_are_refused_in_one_sentence(tmp_pat
 
 def test_a_capture_of_many_detections_is_simulated_where_nothing_ties_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """The limits made small: TR of more events than are simulated at once, the same as before."""
-    sensor = Sensor(GRID, SENSORS["traps"], "device", 5).settled()
+    sensor = Sensor(GRID, SENSORS["traps"], "device", 5).resolved()
     capture = Capture("long", "tr", Light(), SUMMED)
     images = np.zeros(1, np.uint64)
     (whole,) = twin.model_recordings(sensor, capture, 2e5, drawn(1), images)
@@ -295,7 +295,7 @@ def test_a_capture_of_many_detections_is_simulated_where_nothing_ties_pixels(mon
     parts, goes = parts_of(monkeypatch, lambda: twin.model_recordings(sensor, capture, 2e5, drawn(1), images)[0])
     assert goes > 10
     assert len(whole.events) > 5000 and np.array_equal(whole.events.times, parts.events.times)
-    tied = Sensor(GRID, SENSORS["crosstalk"], "device", 5).settled()
+    tied = Sensor(GRID, SENSORS["crosstalk"], "device", 5).resolved()
     with pytest.raises(InputError, match=r"long: would hold 1\.\d+e\+04 events.*crosstalk ties all pixels; shorten it"):
         twin.model_recordings(tied, capture, 2e5, drawn(1), images)
 

@@ -238,11 +238,11 @@ def test_a_sensor_is_saved_and_read_again(tmp_path: Path) -> None:
         sp.effects.Tdc(resolution=1e-10 / 3),
     ]
     one = sp.Sensor(layout, effects, rules="device", chip_seed=7, name="a: b # c")
-    for made in (one, one.settled()):
-        again = sp.read_sensor(sensor_file.save(made, tmp_path / f"{made._settled}" / "s.yaml"))
+    for made in (one, one.resolved()):
+        again = sp.read_sensor(sensor_file.save(made, tmp_path / f"{made._resolved}" / "s.yaml"))
         assert (again.rules, again.chip_seed, again.name) == ("device", 7, "a: b # c")
         assert np.allclose(again.layout.positions, places, rtol=1e-12)
-        for effect in one.settled().effects:
+        for effect in one.resolved().effects:
             for name in effect.parameters:
                 assert np.all(getattr(again.effect(effect.name), name) == getattr(effect, name)), (effect.name, name)
     with pytest.raises(InputError, match="no sensor file that a fit"):

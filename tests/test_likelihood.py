@@ -47,7 +47,7 @@ MOST = int(stats.binom.isf(0.005, SETS, 0.05))
 def sensor(tmp_path: Path) -> Sensor:
     file = tmp_path / "sensor.yaml"
     file.write_text(SENSOR)
-    return config.read_sensor(file).settled()
+    return config.read_sensor(file).resolved()
 
 
 def lit(sensor: Sensor, modality: str, photons: float, conditions: Conditions, uncertainty: float = 0.0) -> Capture:
@@ -293,7 +293,7 @@ def test_what_it_does_not_know(sensor: Sensor, values: dict[Key, float], modalit
 def test_neither_the_traps_of_the_papers_rules_nor_a_mean(sensor: Sensor) -> None:
     capture = lit(sensor, "tr", 1e5, Conditions(1e-3, 100, 1e-5, 1e-5, 500e-9))
     paper = Sensor(sensor.layout, sensor.effects, "paper", sensor.chip_seed, sensor.name)
-    assert not_in_likelihood(paper.settled(), capture) == "afterpulsing"
+    assert not_in_likelihood(paper.resolved(), capture) == "afterpulsing"
     assert not_in_likelihood(sensor, replace(capture, mean=3.0)) == "the mean of lit"
 
 

@@ -41,7 +41,7 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     """The sensor lists the mean of pixels of which nearly all are quiet, or what most of them have."""
     (tmp_path / "plan.yaml").write_text(CAPTURES)
     (tmp_path / "sensor.yaml").write_text(SENSOR)
-    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     rates = np.full(SIDE * SIDE, usual)
     rates[[3, 77, 150, 256, 300]] = [200.0, 400.0, 2000.0, 9000.0, 60_000.0]
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
@@ -64,7 +64,7 @@ def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     """2 counts a pixel, of one in ten 12: drawn maps have as many of each kind as the data, whatever the law is."""
     (tmp_path / "plan.yaml").write_text(CAPTURES.replace(str(FRAMES), "10000"))
     (tmp_path / "sensor.yaml").write_text(SENSOR)
-    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     rates = np.full(SIDE * SIDE, 200.0)
     rates[::10] = 1200.0
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
@@ -94,7 +94,7 @@ def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> N
     plan = plan.replace("1 us", "10 us").replace(str(FRAMES), "1500")
     light = "kind: flat, wavelength: 500 nm, irradiance: 378 nW/cm^2, relative_uncertainty: 0.05"
     (tmp_path / "plan.yaml").write_text(plan.replace("kind: dark", light))
-    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     relative = 1 + 0.1 * np.random.default_rng(3).standard_normal(SIDE * SIDE)
     truth = with_values(sensor, {("detection", "relative"): relative / relative.mean()})
     wanted = measurements.open(tmp_path / "plan.yaml", planned=True)
@@ -129,7 +129,7 @@ def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_pat
 def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     """Draws of a map are as wide as the pixels may be: of 256 that say little each, that is uncertain.
 
-    Against maps settled to data made anew, which scatter by what `_DOUBT` says; a ratio beyond 0.7 to 1.4 is a chance
+    Against maps resolved to data made anew, which scatter by what `_DOUBT` says; a ratio beyond 0.7 to 1.4 is a chance
     of less than 1e-6 for 400 draws.
     """
     rng, n, sigma, noise = np.random.default_rng(3), 256, 0.012, 0.015

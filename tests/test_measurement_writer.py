@@ -312,7 +312,7 @@ def test_what_is_computed_of_a_recording_is_kept() -> None:
 def test_a_measurement_with_positions_comes_back(tmp_path: Path) -> None:
     places = np.array([[0.0, 0.0], [2.3e-5, 0.0], [1.15e-5, 1.9916e-5]])
     effects = [Detection(pdp=0.4), DarkCounts(rate=1e5), Tdc(resolution=1e-9)]
-    sensor = Sensor(Layout(1, 3, 25e-12, 1.0, places), effects, "device").settled()
+    sensor = Sensor(Layout(1, 3, 25e-12, 1.0, places), effects, "device").resolved()
     measurement.write(tmp_path / "out", "lab", sensor.layout, recordings(sensor, CAPTURES[:2]))
     opened = measurement.open(tmp_path / "out")
     assert np.array_equal(opened.layout.positions, places)  # type: ignore[arg-type]

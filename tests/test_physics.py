@@ -75,7 +75,7 @@ class Case:
         if self.dead_time:
             effects.append(DeadTime(duration=self.dead_time))
         effects.append(Tdc(resolution=self.resolution))
-        return Sensor(Layout(28, 28, 25e-12, 1.0), effects, self.rules).settled()
+        return Sensor(Layout(28, 28, 25e-12, 1.0), effects, self.rules).resolved()
 
     def expose(self, first: int, images: int, seed: int, readouts: tuple[str, ...]) -> Recorded:
         streams = Streams(seed, "lux", "train", np.arange(first, first + images, dtype=np.uint64))

@@ -324,11 +324,11 @@ def test_a_map_fits_what_it_is_per(per: str, wrong: int, shape: tuple[int, ...],
     found = read(gain, {"file": "gain.npy"}, tmp_path)
     shapes = SHAPES[per][0]
     if not wrong:
-        settled = plugins.settle(gain, found, shapes, "k")
-        assert np.array_equal(settled, values.ravel() if per == "pixel" else values) and settled.dtype == np.float64
+        resolved = plugins.resolve(gain, found, shapes, "k")
+        assert np.array_equal(resolved, values.ravel() if per == "pixel" else values) and resolved.dtype == np.float64
         return
     with pytest.raises(InputError) as caught:
-        plugins.settle(gain, found, shapes, "k")
+        plugins.resolve(gain, found, shapes, "k")
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'gain.npy'}: is float64 of shape {shape}, but gain needs one number for")
     wanted = message.partition("one number for ")[2]
@@ -344,14 +344,14 @@ def test_a_map_with_a_value_that_cannot_be(per: str, tmp_path: Path) -> None:
         values[3] = value
         np.save(tmp_path / "gain.npy", values.reshape(shape))
         with pytest.raises(InputError, match=f"entry 3 of the map.*{says}"):
-            plugins.settle(gain, MapFile(tmp_path / "gain.npy"), SHAPES[per][0], "k")
+            plugins.resolve(gain, MapFile(tmp_path / "gain.npy"), SHAPES[per][0], "k")
 
 
 @pytest.mark.parametrize("per", SHAPES)
 def test_a_distribution_has_a_value_for_each(per: str) -> None:
     gain = Parameter(1.0, "", "", name="gain", per=per)
     found = read(gain, {"normal": {"mean": 1, "sigma": 0.1}})
-    drawn = plugins.settle(gain, found, SHAPES[per][0], "k")
+    drawn = plugins.resolve(gain, found, SHAPES[per][0], "k")
     assert drawn.shape == (int(np.prod(SHAPES[per][0][0])),) and len(np.unique(drawn)) == drawn.size
 
 
@@ -373,18 +373,18 @@ def test_a_table_ends_at_its_ends() -> None:
 def test_a_distribution_is_drawn_by_its_law() -> None:
     """Means and spreads of 100,000 draws, 5 standard errors wide (false-alarm rate 1e-6)."""
     n = 100_000
-    normal = plugins.settle(BOUNDED, Distribution("normal", (5e-7, 1e-8)), ((1, n),), "k")
+    normal = plugins.resolve(BOUNDED, Distribution("normal", (5e-7, 1e-8)), ((1, n),), "k")
     assert abs(normal.mean() - 5e-7) < 5 * 1e-8 / np.sqrt(n) and abs(normal.std() / 1e-8 - 1) < 5 / np.sqrt(2 * n)
     wide = Parameter(1.0, "Hz", "", bounds=(0, None), per="pixel")
-    logs = np.log(plugins.settle(wide, Distribution("lognormal", (20.0, 2.27)), ((1, n),), "k") / 20.0)
+    logs = np.log(plugins.resolve(wide, Distribution("lognormal", (20.0, 2.27)), ((1, n),), "k") / 20.0)
     assert abs(logs.mean()) < 5 * 2.27 / np.sqrt(n) and abs(logs.std() / 2.27 - 1) < 5 / np.sqrt(2 * n)
     few = Distribution(
         "mixture", (), ((0.97, Distribution("normal", (1.0, 0.0))), (0.03, Distribution("normal", (9.0, 0.0))))
     )
-    mixed = plugins.settle(wide, few, ((1, n),), "k")
+    mixed = plugins.resolve(wide, few, ((1, n),), "k")
     assert set(np.unique(mixed)) == {1.0, 9.0}
     assert abs((mixed == 9).mean() - 0.03) < 5 * np.sqrt(0.03 * 0.97 / n)
-    assert not np.array_equal(plugins.settle(wide, few, ((1, n),), "other"), mixed)
+    assert not np.array_equal(plugins.resolve(wide, few, ((1, n),), "other"), mixed)
 
 
 # --- entry points --------------------------------------------------------------------------------------------------

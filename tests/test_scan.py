@@ -1,4 +1,4 @@
-"""Search: what candidates are compared by, and how faint ones and those of either sign are settled."""
+"""Search: what candidates are compared by, and how faint ones and those of either sign are resolved."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
     evaluation.residuals[ramp], evaluation.residuals[power] = 0.0 * told[ramp], -told[power]
     assert quiet(replicates)._marked(evaluation, one).gain == 0
     evaluation.residuals.update(told)
-    # settled as strong as it is seen, it helps, and the opposite does not
+    # resolved as strong as it is seen, it helps, and the opposite does not
     strong = min(
         (0.02 * k for k in range(1, 50)),
         key=lambda x: abs(score_test(replicates, evaluation, one.signature.at(x)).size - 5.0),
@@ -179,7 +179,7 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
 
 
 def test_of_directions_side_by_side_all_together_are_asked(lab) -> None:
-    """Two of 6.4 standard deviations each are together 9: what is settled has both, though each was tried alone."""
+    """Two of 6.4 standard deviations each are together 9: what is resolved has both, though each was tried alone."""
     replicates = bench_of(lab())
     evaluation = evaluate(replicates, {})
     cell, candidate = ("flat", "pixel_map"), change_of(replicates, "add illumination_gradient")
@@ -242,7 +242,7 @@ def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab, mo
     """Of a shape; a strength's ends are seen by its slope."""
     delay = ("crosstalk", "delay")
     path = begin(bench_of(lab()))
-    taken(path, "add crosstalk", {CROSSTALK: 0.02, delay: 1e-9}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.02, delay: 1e-9}, resolve=False)
     step, replicates = path.steps[0], path.replicates
     step.coordinates = tuple(d for d in step.candidate.coordinates if d.key in path.values)
     told = {"probability": Value(0.02, 0.019, 0.021), "delay": Value(1e-9, 0.9e-9, 1.1e-9, "s")}
@@ -453,7 +453,7 @@ def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> Non
     clear = replace(map_, gain=1000.0)
     assert worth_fitting(look, [clear, other, chance]) == [clear, chance]
     assert worth_fitting(look, [clear, replace(chance, gain=20.0, fell=20.0)]) == [clear]
-    # as the squares say: until its number is settled, how it scatters may tell against it
+    # as the squares say: until its number is resolved, how it scatters may tell against it
     assert [t.chips for t in worth_fitting(look, [clear, replace(chance, gain=-50.0)])] == [False, True]
 
 
@@ -574,7 +574,7 @@ def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> 
 def test_a_whole_number_that_was_settled_from_afar_is_settled_again(
     dependent: float, reach: float, alone: bool
 ) -> None:
-    """The time that suits 4 places is far from the one that suits 8; what is settled in one go does not get there.
+    """The time that suits 4 places is far from the one that suits 8; what is resolved in one go does not get there.
 
     Then 4 is known to be it, and the time with it; or where cells depend on each other 3 and 5 are not excluded, and
     what the time is with these is not either.
@@ -671,7 +671,7 @@ def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(la
     sensor, data = lab("    slow_recovery: {time_constant: 5 ns}\n", light=900, side=4)
     path = begin(bench_of((sensor, data)))
     key = ("slow_recovery", "time_constant")
-    seen = given(path, "add slow_recovery", {key: 5e-9}, settle=False)
+    seen = given(path, "add slow_recovery", {key: 5e-9}, resolve=False)
     far = replace(seen, gain=1000.0, times=30.0)
     (found,) = path.scan.again(path.evaluation, {}, [far])
     assert found.values[key] == pytest.approx(5e-9) and found.gain > 25

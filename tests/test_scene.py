@@ -63,7 +63,7 @@ def test_the_light_of_a_pixel_is_its_share_of_white(tmp_path: Path) -> None:
     assert capture.light.scene is not None and capture.light.scene == capture.conditions.scene
     assert (capture.light.wavelength, capture.light.level, capture.light.kind_of_level) == (555e-9, 2.0, "lux")
     assert capture.light.relative_uncertainty == 0.1
-    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)]).settled()
+    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)]).resolved()
     white = twin.photons_at(capture, sensor.layout)
     rates, _ = sensor.rates(np.full((2, 12), white), capture.conditions)
     assert white is not None and np.allclose(rates, 0.5 * white * SEEN.ravel() / 255, rtol=1e-15)
@@ -136,7 +136,7 @@ def test_what_a_light_of_an_image_cannot_say(light: str, part: str, tmp_path: Pa
 def large() -> tuple[Sensor, np.ndarray]:
     """A sensor of 12 x 10 pixels and a scene of it with every share."""
     seen = np.random.Generator(np.random.PCG64(5)).permutation(np.linspace(0, 1, 120)).reshape(12, 10)
-    return Sensor(Layout(12, 10, 25e-12, 1.0), [Detection(pdp=0.5), *device().effects[1:]], "device").settled(), seen
+    return Sensor(Layout(12, 10, 25e-12, 1.0), [Detection(pdp=0.5), *device().effects[1:]], "device").resolved(), seen
 
 
 @pytest.mark.parametrize("modality", ["tr", "str", "qis", "counts"])
@@ -168,7 +168,7 @@ def test_a_twin_of_a_scene_follows_it(modality: str) -> None:
 
 def test_a_twin_is_written_with_its_scene_and_read_again(tmp_path: Path) -> None:
     plan = opened(lab(tmp_path / "plan"))
-    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)], "device").settled()
+    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)], "device").resolved()
     twin.simulate(sensor, plan, tmp_path / "twin", seed=1)
     made = measurement.open(tmp_path / "twin")
     assert made.captures == plan.captures and sorted(p.name for p in (tmp_path / "twin").iterdir()) == [
@@ -183,7 +183,7 @@ def test_a_twin_is_written_with_its_scene_and_read_again(tmp_path: Path) -> None
 
 
 def test_scenes_of_the_same_name_lie_side_by_side(tmp_path: Path) -> None:
-    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)], "device").settled()
+    sensor = Sensor(Layout(3, 4, 25e-12, 1.0), [Detection(pdp=0.5)], "device").resolved()
     base = opened(lab(tmp_path / "plan")).captures[0]
     shown = [Scene("chart.npy", SEEN), Scene("Chart.npy", SEEN[::-1]), Scene("chart.npy", SEEN)]
     captures = [

@@ -74,7 +74,7 @@ def lab(*hidden: Any, seed: int = 1, modality: str = "qis", frames: int = 4000, 
 
     def sensor(*effects: Any) -> Sensor:
         own = {effect.name: effect for effect in (*stated, *effects)}
-        return Sensor(layout, list(own.values()), "device", name="lab").settled()
+        return Sensor(layout, list(own.values()), "device", name="lab").resolved()
 
     captures = measurement.in_memory("lab", layout, list(plan(modality, frames, black)))
     made = measurement.in_memory("lab", layout, list(twin.twin(sensor(*hidden), captures, seed)))
@@ -82,7 +82,7 @@ def lab(*hidden: Any, seed: int = 1, modality: str = "qis", frames: int = 4000, 
 
 
 def looked_at(made: Lab, effects: Sequence[str]) -> list[Trial]:
-    """Candidates, maps beside them, in the order in which they are settled."""
+    """Candidates, maps beside them, in the order in which they are resolved."""
     replicates = bench_of(made)
     scan, evaluation = quiet(replicates), evaluate(replicates, {})
     tried: list[Trial] = []

@@ -39,7 +39,7 @@ def streams(images: Any, seed: int = 1, level: str = "lux/1", split: str = "trai
 
 
 def sensor(pixels: int, *effects: Effect, rules: str = "paper") -> Sensor:
-    return Sensor(Layout(1, pixels, 25e-12, 1.0), list(effects), rules).settled()
+    return Sensor(Layout(1, pixels, 25e-12, 1.0), list(effects), rules).resolved()
 
 
 def paper_effects(**without: bool) -> list[Effect]:

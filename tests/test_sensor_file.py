@@ -50,7 +50,7 @@ def test_a_value_is_written_along_what_it_runs(per: str, rows: int, columns: int
     size = {"": 0, "pixel": rows * columns, "row": rows, "column": columns, "code": codes}[per]
     value: Any = 0.005 if size == 0 else np.linspace(0.9, 1.1, size)
     key = OF_KIND[per]
-    again = config.read_sensor(sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: value}, {})).settled()
+    again = config.read_sensor(sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: value}, {})).resolved()
     found = getattr(again.effect(key[0]), key[1])
     assert np.shape(found) == np.shape(value)
     assert np.array_equal(found, value)
@@ -68,7 +68,7 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
     with pytest.raises(InputError, match="is the sensor file itself"):
         sensor_file.check_place(lab, file)
     out = sensor_file.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
-    found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).settled().effects}
+    found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).resolved().effects}
     assert found["crosstalk"].probability == 0.005
     assert np.array_equal(found["dark_counts"].rate, np.arange(1.0, 7.0))
     assert "# measured" in out.read_text() and "scene" not in out.read_text()
@@ -77,7 +77,7 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
 def test_codes_of_each_pixel_are_written_as_they_are(tmp_path: Path) -> None:
     file, widths = sensor_in(tmp_path, 2, 2), np.linspace(0.9, 1.1, 16).reshape(4, 4)
     key = OF_KIND["code"]
-    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {key: widths}, {})).settled()
+    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {key: widths}, {})).resolved()
     assert np.array_equal(again.effect(key[0]).widths, widths)
 
 
@@ -126,7 +126,7 @@ def test_as_many_codes_as_pixels_are_a_next_sensor(tmp_path: Path, monkeypatch: 
     assert done.exit_code == 0, done.output
     told = json.loads((tmp_path / "answer.json").read_text())
     assert "not_written" not in told
-    again = config.read_sensor(Path(told["sensor"])).settled()
+    again = config.read_sensor(Path(told["sensor"])).resolved()
     assert np.array_equal(again.effect("tdc_nonlinearity").widths, widths)
 
 

@@ -1,4 +1,4 @@
-"""Halves of a capture by alternating blocks of time: what one settles judges the other."""
+"""Halves of a capture by alternating blocks of time: what one resolves judges the other."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def mapped(tmp_path: Path) -> tuple[ModelPath, Rung]:
     """A map of dark count rates, of the one dark capture that there is; (the course, its last rung)."""
     (tmp_path / "plan.yaml").write_text(CAPTURES)
     (tmp_path / "sensor.yaml").write_text(SENSOR.replace("200 Hz", "2 kHz"))
-    sensor = config.read_sensor(tmp_path / "sensor.yaml").settled()
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     rates = 2000 * np.exp(0.3 * np.random.default_rng(4).standard_normal(SIDE**2))
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)

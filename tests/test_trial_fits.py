@@ -164,7 +164,7 @@ def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) ->
     made = lab("    crosstalk: {probability: 3 %}\n")
     courses = [begin(bench_of(made)) for _ in range(2)]
     for path, weighed in zip(courses, (False, True), strict=True):
-        one = given(path, "add crosstalk", {CROSSTALK: 0.03}, settle=True)
+        one = given(path, "add crosstalk", {CROSSTALK: 0.03}, resolve=True)
         before = path.replicates.simulations
         if weighed:
             evaluation_of(path.replicates, one)
@@ -256,7 +256,7 @@ def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow
 
 
 def test_what_is_settled_is_looked_at_everywhere(lab, monkeypatch) -> None:
-    """Also where its first values did nothing, so that nobody looked there while it was settled."""
+    """Also where its first values did nothing, so that nobody looked there while it was resolved."""
     path = begin(bench_of(lab(dead=55)))
     replicates, evaluation = path.replicates, path.evaluation
     monkeypatch.setattr("spadmnist.inference.trial_fits.captures_showing", lambda *_: ["dark"])
@@ -287,7 +287,7 @@ def test_a_stated_queue_that_is_another_one_is_found(lab) -> None:
     sensor, data = lab("    readout_loss: {service_time: 100 ns, queue: 2}\n", light=1000)
     stated = with_values(sensor, {("readout_loss", "service_time"): 1e-7, ("readout_loss", "queue"): 4})
     path = begin(bench_of((stated, data)))
-    one = given(path, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, settle=True)
+    one = given(path, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, resolve=True)
     assert one.values == {("readout_loss", "queue"): 2.0}
     assert one.gain > 100
     accept(path, one, 10.0)

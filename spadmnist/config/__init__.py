@@ -99,9 +99,9 @@ def read_sensor(path: str | Path) -> Sensor:
     elif not isinstance(raw, Mapping) or not {"layout", "effects"} & set(raw):
         raise ConfigError([f"{source.name}: describes no sensor; it begins with sensor: and has layout and effects"])
     described = reader.sensor(raw, ()) if isinstance(raw, str) else reader.described(raw, place, ())
-    if reader.problems or described is None or described.settled is None:
+    if reader.problems or described is None or described.resolved is None:
         raise ConfigError(reader.problems)
-    return described.settled
+    return described.resolved
 
 
 def build(
@@ -139,7 +139,7 @@ def build(
     described = reader.sensor(raw["sensor"], wavelengths) if "sensor" in raw else None
     if described and conditions and scene and recording:
         described.check_clock(conditions, recording.readouts, wavelengths)
-    if reader.problems or not (described and described.settled and conditions and scene and recording):
+    if reader.problems or not (described and described.resolved and conditions and scene and recording):
         raise ConfigError(reader.problems)
     return Experiment(
         name=source.name,
@@ -151,7 +151,7 @@ def build(
         conditions=conditions,
         readouts=tuple(r for r in READOUTS if r in recording.readouts),
         methods=methods,
-        sensor=described.settled,
+        sensor=described.resolved,
         format=parts["output"].format,
         limit=parts["limit"],
         causes=parts["causes"],

@@ -139,7 +139,7 @@ class _Reader(Reader):
         return inner.described(found.value["sensor"], ("sensor",), wavelengths)
 
     def described(self, raw: Any, path: Path_, wavelengths: Sequence[float]) -> _Described | None:
-        """The sensor at `path` with all maps and distributions settled; None after its mistakes were noted.
+        """The sensor at `path` with all maps and distributions resolved; None after its mistakes were noted.
 
         wavelengths: of the scene, m, where they are known: tables are looked up there.
         """
@@ -159,8 +159,8 @@ class _Reader(Reader):
         if model is None or layout is None:
             return None
         sensor = Sensor(layout, in_order(effects), model.rules, model.chip_seed, model.name)
-        settled = self.settled(sensor, path)
-        return _Described(sensor, settled, model, dict(listed or {}), self, path)
+        resolved = self.resolved(sensor, path)
+        return _Described(sensor, resolved, model, dict(listed or {}), self, path)
 
     def check_array(self, raw: Any, path: Path_) -> bool:
         """Does a layout say once where its pixels are: by rows and columns, or by positions?"""
@@ -235,19 +235,19 @@ class _Reader(Reader):
                 except InputError as error:
                     self.say((*path, key), str(error))
 
-    def settled(self, sensor: Sensor, path: Path_) -> Sensor | None:
+    def resolved(self, sensor: Sensor, path: Path_) -> Sensor | None:
         """Every map read and every distribution drawn."""
         before = len(self.problems)
         for effect in sensor.effects:
             for key in effect.parameters:
                 try:
-                    sensor.settle(effect, key)
+                    sensor.resolve(effect, key)
                 except InputError as error:
                     self.say((*path, "effects", effect.name, key), str(error))
         if len(self.problems) > before:
             return None
         try:
-            made = sensor.settled()
+            made = sensor.resolved()
             self.check_cascade(made, path)
         except SpadError as error:  # of an effect that looks at what it was given, as its chip is made
             self.say((*path, "effects"), str(error))
@@ -268,12 +268,12 @@ class _Reader(Reader):
 
 @dataclass
 class _Described:
-    """A sensor (settled: where that went well) and what its file says: the model, the effects as written, and where
+    """A sensor (resolved: where that went well) and what its file says: the model, the effects as written, and where
     to report mistakes.
     """
 
     sensor: Sensor
-    settled: Sensor | None
+    resolved: Sensor | None
     model: _Sensor
     written: dict[str, Any]
     reader: _Reader
@@ -283,15 +283,15 @@ class _Described:
         """What can only be said of sensor and recording together."""
         # a table that does not reach the wavelength has been told already
         with contextlib.suppress(InputError):
-            if self.settled and min(map(self.settled.nominal_pdp, wavelengths)) <= 0:
+            if self.resolved and min(map(self.resolved.nominal_pdp, wavelengths)) <= 0:
                 pdp = (*self.path, "effects", "detection", "pdp")
                 self.reader.say(pdp, "is 0, so that no flux can be estimated; it must be more than 0")
         try:
-            tick = (self.settled or self.sensor).tick
+            tick = (self.resolved or self.sensor).tick
         except SpadError:
-            if self.settled:
+            if self.resolved:
                 raise
-            return  # what keeps the sensor from being settled has been told
+            return  # what keeps the sensor from being resolved has been told
         if tick <= 0:
             return
         converter = self.sensor.at("timing")[-1]

@@ -25,7 +25,7 @@ def _resolved(
     """
     recording, model, folder = parts["recording"], described.model, described.reader.base
     time = recording.frame_time.text if recording.frame_time else f"{conditions.frame_time!r} s"
-    settled = {
+    resolved = {
         "frames": conditions.frames,
         "frame_time": time,
         "frame_period": recording.frame_period.text if recording.frame_period else time,
@@ -41,7 +41,7 @@ def _resolved(
     whole = {
         **parts,
         "scene": parts["scene"].written(),
-        "recording": recording.model_copy(update=settled).written(),
+        "recording": recording.model_copy(update=resolved).written(),
         "reconstruct": list(methods),
         "sensor": model.model_copy(update={"layout": layout, "effects": effects}).written(),
         "output": parts["output"].written(),

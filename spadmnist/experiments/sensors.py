@@ -225,7 +225,7 @@ class _Bench:
     def compare(self) -> dict[str, Any]:
         """The numbers of the panel, in JSON."""
         one = config.read(config.shipped(self.panel.file))
-        c, modality, sensor = one.conditions, one.readouts[0], one.sensor.settled()
+        c, modality, sensor = one.conditions, one.readouts[0], one.sensor.resolved()
         assert c.wavelength is not None
         positions = sensor.layout.positions
         most = QUICK_SIDE if self.quick and positions is None else max(sensor.layout.shape)

@@ -59,7 +59,7 @@ def fit_named(
         InputError: where there is no such effect or parameter.
     """
     say = progress or (lambda what: None)
-    every, listed = candidates(sensor.settled(), measurement.captures), {e.name for e in sensor.effects}
+    every, listed = candidates(sensor.resolved(), measurement.captures), {e.name for e in sensor.effects}
     wanted = [
         *(_named(every, listed, "add", name, None) for name in add),
         *(_named(every, listed, "set", *_halves(name)) for name in free),
@@ -69,7 +69,7 @@ def fit_named(
         raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
-        if counts_in_the_dark.may_fit(sensor.settled(), wanted):
+        if counts_in_the_dark.may_fit(sensor.resolved(), wanted):
             replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
             answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
             if not isinstance(answer, str):

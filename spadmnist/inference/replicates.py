@@ -280,7 +280,7 @@ class Replicates:
             budget: of work; without it there is no end to it.
         """
         measurement.check_sensor(sensor)
-        self.start = sensor.settled()
+        self.start = sensor.resolved()
         self.seed, self.workers, self.number, self.say, self.progress = seed, workers, number, say, progress
         self.dead = self.start.nominal_dead_time
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced

@@ -94,10 +94,10 @@ def fails() -> Iterator[None]:
 
 def light_map(effect: Effect, layout: Layout) -> np.ndarray:
     """(pixels,) what the effect multiplies the light by."""
-    settled = Sensor(layout, [effect], chip_seed=5).settled().effects[0]
+    resolved = Sensor(layout, [effect], chip_seed=5).resolved().effects[0]
     rate = np.full((2, layout.pixels), 3.0)
-    after = settled.apply(rate, LIT)  # type: ignore[attr-defined]
-    assert after.shape == rate.shape and np.array_equal(after, settled.expected_rate(rate, LIT))
+    after = resolved.apply(rate, LIT)  # type: ignore[attr-defined]
+    assert after.shape == rate.shape and np.array_equal(after, resolved.expected_rate(rate, LIT))
     assert np.array_equal(after[0], after[1])
     return after[0] / 3.0
 
@@ -269,8 +269,8 @@ def test_flicker_has_its_amplitude_frequency_and_phase() -> None:
 def mean_rate(effect: Effect, planned: Effect | None = None, images: int = 20) -> None:
     """As many events as `expected_rate` says, but for what is no constant of an image."""
     layout = grid(4, 6)
-    settled = Sensor(layout, [planned or effect], chip_seed=5).settled().effects[0]
-    expected = settled.expected_rate(np.full((1, 24), 5e5), LIT).sum() * T * images
+    resolved = Sensor(layout, [planned or effect], chip_seed=5).resolved().effects[0]
+    expected = resolved.expected_rate(np.full((1, 24), 5e5), LIT).sum() * T * images
     laws.poisson_mean(len(exposed(layout, [effect], 5e5, images)), expected)
 
 
@@ -464,7 +464,7 @@ def test_bunching_that_is_wrong_is_seen() -> None:
 
 
 def blinking(layout: Layout, **values: float) -> BlinkingDarkCounts:
-    effect = Sensor(layout, [BlinkingDarkCounts(**values)], chip_seed=5).settled().effects[0]
+    effect = Sensor(layout, [BlinkingDarkCounts(**values)], chip_seed=5).resolved().effects[0]
     assert isinstance(effect, BlinkingDarkCounts)
     return effect
 
@@ -614,9 +614,9 @@ def test_off_is_not_there(effect: Effect) -> None:
     without = exposed(layout, [DarkCounts(rate=1e4)], 5e4, 5)
     switched_off = exposed(layout, [DarkCounts(rate=1e4), effect], 5e4, 5)
     assert np.array_equal(without.times, switched_off.times) and np.array_equal(without.offsets, switched_off.offsets)
-    settled = Sensor(layout, [effect]).settled().effects[0]
+    resolved = Sensor(layout, [effect]).resolved().effects[0]
     rate = np.full((1, 12), 7.0)
-    assert np.array_equal(settled.expected_rate(rate, LIT), rate)
+    assert np.array_equal(resolved.expected_rate(rate, LIT), rate)
 
 
 @pytest.mark.parametrize("rules", ["paper", "device"])

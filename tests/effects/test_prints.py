@@ -37,7 +37,7 @@ PRINTS: list[Effect] = [PrintBlur(radius=1.3), PrintContrast(black=0.2), PrintTi
 def seen(effect: Effect, image: np.ndarray, layout: Layout | None = None) -> np.ndarray:
     """(rows, columns) light behind an effect, of an image of it."""
     layout = layout or Layout(*image.shape, 25e-12, 1.0)
-    light, _ = Sensor(layout, [effect]).settled().rates(image.reshape(1, -1).astype(float), LIT)
+    light, _ = Sensor(layout, [effect]).resolved().rates(image.reshape(1, -1).astype(float), LIT)
     return light.reshape(image.shape)
 
 
@@ -115,7 +115,7 @@ def test_the_print_comes_before_the_sensor() -> None:
     effects: list[Effect] = [ColumnPattern(gain=gains), *PRINTS]
     names = [effect.name for effect in in_order(effects)]
     assert names == ["print_contrast", "print_tilt", "print_blur", "column_pattern"]
-    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), effects).settled()
+    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), effects).resolved()
     assert np.allclose(sensor.rates(np.full((1, 24), 10.0), LIT)[0].reshape(4, 6), 10 * gains)
 
 
@@ -144,12 +144,12 @@ def captures(shown: Scene | None) -> list[Capture]:
 
 
 def test_prints_are_candidates_where_a_capture_is_of_a_scene_and_only_there() -> None:
-    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5)]).settled()
+    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5)]).resolved()
     flat = {c.name for c in candidates(sensor, captures(None))}
     scene = {c.name for c in candidates(sensor, captures(Scene("chart.npy", np.eye(4, 6))))}
     assert scene - flat == {f"add {e.name}" for e in PRINTS} and not flat - scene
     assert flat == {c.name for c in candidates(sensor)}
-    listed = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5), *PRINTS]).settled()
+    listed = Sensor(Layout(4, 6, 25e-12, 1.0), [Detection(pdp=0.5), *PRINTS]).resolved()
     settable = {c.name for c in candidates(listed, captures(Scene("chart.npy", np.eye(4, 6)))) if c.kind == "set"}
     assert {n for n in settable if "print" in n} == {
         "set print_blur.radius",
@@ -161,9 +161,9 @@ def test_prints_are_candidates_where_a_capture_is_of_a_scene_and_only_there() ->
 
 def test_the_angle_of_a_print_is_no_phase() -> None:
     """A phase is another one in every capture; a chart hangs as it hangs."""
-    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [PrintTilt(angle=0.1), Flicker(amplitude=0.1)]).settled()
+    sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [PrintTilt(angle=0.1), Flicker(amplitude=0.1)]).resolved()
     assert swinging(sensor) == [("flicker", "phase")]
-    (tilt,) = (c for c in candidates(Sensor(sensor.layout, []).settled(), captures(Scene("c.npy", np.eye(4, 6))))
+    (tilt,) = (c for c in candidates(Sensor(sensor.layout, []).resolved(), captures(Scene("c.npy", np.eye(4, 6))))
                if c.effect == "print_tilt")  # fmt: skip
     assert not tilt.phases and [coordinate.parameter for coordinate in tilt.strengths] == ["angle"]
 
@@ -212,5 +212,5 @@ def test_a_print_is_settled_by_a_capture_of_its_scene(
         config.read_sensor(tmp_path / "sensor.yaml"), measurement.open(tmp_path / "lab"), add=[effect], jobs=1
     )
     value = found.steps[-1].values[name]
-    true = getattr(truth.settled().effect(effect), name)
+    true = getattr(truth.resolved().effect(effect), name)
     assert value.low <= true <= value.high and value.high - value.low < 0.5 * true

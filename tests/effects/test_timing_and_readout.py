@@ -63,7 +63,7 @@ def chip(pixels: int, tick: float = 0.0, origin: float = 0.0) -> Chip:
 
 
 def sensor(pixels: int, *effects: Effect, rules: str = "paper") -> Sensor:
-    return Sensor(Layout(1, pixels, 1e-12, 1.0), list(effects), rules).settled()
+    return Sensor(Layout(1, pixels, 1e-12, 1.0), list(effects), rules).resolved()
 
 
 def expose(

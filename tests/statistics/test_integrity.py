@@ -318,7 +318,7 @@ def test_empty_and_full_data_have_the_same_cells(statistic: type) -> None:
 
 def test_stamps_that_need_more_than_32_bits_are_refused() -> None:
     effects = [Detection(pdp=0.4), DeadTime(duration=50e-9), Tdc(resolution=1e-12)]
-    sensor = Sensor(grid(2, 2), effects, "device").settled()
+    sensor = Sensor(grid(2, 2), effects, "device").resolved()
     for frame, fits in ((4.29e-3, True), (4.3e-3, False)):
         conditions = Conditions(3 * frame, 3, frame, frame, 500e-9)
         streams = Streams(1, "level", "train", np.arange(1, dtype=np.uint64))
@@ -336,7 +336,7 @@ def test_stamps_that_need_more_than_32_bits_are_refused() -> None:
 def test_what_the_sensor_makes_is_whole(modality: str) -> None:
     """The package's own sensor, with all of its classes for data: nothing is out of order, repeated or silent."""
     effects = [Detection(pdp=0.4), DarkCounts(rate=100.0), DeadTime(duration=50e-9), Tdc(resolution=1e-10)]
-    sensor = Sensor(grid(8, 8), effects, "device").settled()
+    sensor = Sensor(grid(8, 8), effects, "device").resolved()
     conditions = Conditions(4e-3, 400, 1e-5, 1e-5, 500e-9, 3 if modality == "counts" else 0, "counter")
     streams = Streams(1, "level", "train", np.arange(40, dtype=np.uint64))
     recorded = sensor.expose(np.full((40, 64), 5e5), conditions, streams, [modality])
