@@ -652,3 +652,15 @@ def test_no_warning_of_a_library_reaches_a_user(
                 command_line.main([])
         assert caught.value.code == 0
         assert ("divide by zero" in capfd.readouterr().err) == says
+
+
+def test_time_left_is_not_shown_before_it_is_known() -> None:
+    """A slow first part of the work (workers that start) is no estimate of the rest. The clock is given."""
+    from spadmnist.cli._terminal import time_left
+
+    assert time_left(0.0, 100.0, 50.0) == "estimating"
+    assert time_left(1.0, 99.0, 20.0) == "estimating"  # would be 33 min
+    assert time_left(50.0, 50.0, 1.0) == "estimating"
+    assert time_left(2.0, 98.0, 2.0) == "98.0 s left"
+    assert time_left(1.0, 99.0, 30.0) == "49.5 min left"
+    assert time_left(100.0, 0.0, 40.0) == "0.0 s left"

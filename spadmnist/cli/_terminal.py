@@ -43,6 +43,19 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min"
 
 
+_KNOWN_SHARE = 0.02  # of the work; with less done the first, slow part (start of workers, compiling) is the estimate
+_KNOWN_AFTER = (2.0, 30.0)  # s: no time left is shown before the first; after the second it is, however little is done
+
+
+def time_left(done: float, rest: float, elapsed: float) -> str:
+    """`3.5 min left`, from the mean rate so far; `estimating` before enough is known. Times in s."""
+    soon, late = _KNOWN_AFTER
+    share = done / (done + rest) if done > 0 else 0.0
+    if share > 0 and (elapsed >= late or (elapsed >= soon and share >= _KNOWN_SHARE)):
+        return f"{duration(rest * elapsed / done)} left"
+    return "estimating"
+
+
 class progress:
     """A progress bar on standard error, where that is a terminal."""
 
@@ -53,17 +66,24 @@ class progress:
 
         tqdm.monitor_interval = 0  # no thread that watches the bar
 
+        class Bar(tqdm):
+            @property
+            def format_dict(self) -> dict[str, Any]:
+                known = super().format_dict
+                done, rest = known["n"] - known["initial"], known["total"] - known["n"]
+                return {**known, "left": time_left(done, rest, known["elapsed"])}
+
         bar: list[Any] = []
 
         def start(what: str, total: float, done: float) -> None:
             bar.append(
-                tqdm(
+                Bar(
                     total=total,
                     initial=done,
                     desc=visible(what),
                     disable=None,
                     leave=False,
-                    bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
+                    bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {left}{postfix}",
                 )
             )
 
