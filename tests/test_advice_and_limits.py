@@ -110,8 +110,8 @@ def test_the_limit_of_a_drift_is_what_a_ramp_of_so_many_detections_tells(lab):
 
 def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
-    taken(path, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, settle=False)
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(path, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, fitted=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     drop_needless(path)
     assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
     assert [c.name for c in path.scan.accepted] == ["add crosstalk"]
@@ -120,8 +120,8 @@ def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
 
 def test_a_step_that_is_needed_stays(lab):
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
-    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, fitted=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     values, rungs = dict(path.values), len(path.ladder)
     drop_needless(path)
     assert names(path) == ["add afterpulsing", "add crosstalk"] and path.values == values
@@ -139,7 +139,7 @@ def test_a_map_is_taken_out_unless_some_check_fails_without_it(lab, extra: str, 
     candidate = change_of(path.replicates, "per_pixel dark_counts.rate")
     path.scan.accepted.append(candidate)
     path.steps.append(Step(candidate, {}, 0.0, 9.0, ""))
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     assert not path.failed
     drop_needless(path)
     wanted = ["per_pixel dark_counts.rate", "add crosstalk"]
@@ -159,8 +159,8 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     path = begin(bench_of(lab()))
     start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 10.0})
     end = with_residuals(path.evaluation, {"intervals": 9.0})
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
-    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, fitted=False)
     path.evaluation, path.fit = end, None
     for step, name in zip(path.steps, ("neighbours", "intervals"), strict=True):
         step.before = dict(start.residuals)
@@ -187,7 +187,7 @@ def test_two_steps_that_only_look_alike_are_the_last(lab):
     end = with_residuals(path.evaluation, {"neighbours": 9.0, "intervals": 9.0})
     for candidate, values in (("add crosstalk", {CROSSTALK: 0.03}), ("add afterpulsing", {PROBABILITY: 0.05})):
         assert not in_vain(path, True)
-        taken(path, candidate, values, settle=False)
+        taken(path, candidate, values, fitted=False)
         path.evaluation = end
         path.steps[-1].before = dict(start.residuals)
         name = "neighbours" if candidate == "add crosstalk" else "intervals"
@@ -202,7 +202,7 @@ def test_totals_that_the_set_up_explains_take_no_step_away(lab, totals):
     """Where nothing but totals fails; and what swings takes its phases with it when it goes."""
     path = begin(bench_of(lab()))
     start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 20.0})
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, settle=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     step = path.steps[0]
     step.before = dict(start.residuals)
     step.template = {c: np.full(len(z), 5.0 * (c == TOTALS)) for c, z in start.residuals.items()}
@@ -308,7 +308,7 @@ def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, t
     seen = {cell: z for cell, z in path.evaluation.residuals.items() if cell[1] != unseen}
     assert (len(seen) < len(path.evaluation.residuals)) == bool(unseen)
     path.evaluation = replace(path.evaluation, residuals=seen)
-    one = given(path, name, values, settle=True)
+    one = given(path, name, values, fitted=True)
     found = unseen_maps(path.scan, path.evaluation, {}, one)
     assert [t.candidate.effect for t in found if t.candidate.name == "per_pixel dead_time.duration"] == alike
     assert one.gain > 100 and all(t.gain > one.gain - tie(one.gain) and t.residuals for t in found)
@@ -333,7 +333,7 @@ def test_verdicts(lab):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer(lab, monkeypatch):
     kinds = ("add afterpulsing", "add crosstalk")
-    few = [c for c in candidates(lab()[0].settled()) if c.name in kinds]
+    few = [c for c in candidates(lab()[0].resolved()) if c.name in kinds]
     monkeypatch.setattr(Replicates, "candidates", lambda self, sensor: few)
     made = lab("    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n")
     one, same = (diagnose(*made, quick=True, jobs=1, max_steps=1) for _ in range(2))

@@ -142,8 +142,8 @@ def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -
     """Beside later steps: judged by how wide it makes them itself, nothing would ever be missed without it."""
     noise = f"    source_noise: {{contrast: {contrast}, coherence_time: 2 s}}\n" if contrast else ""
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=3)))
-    taken(path, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, resolve=False)
-    taken(path, "add crosstalk", {CROSSTALK: 0.03}, resolve=False)
+    taken(path, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, fitted=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     drop_needless(path)
     assert names(path) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]
 

@@ -661,7 +661,7 @@ def test_paper_line_with_too_little_room(expected: list[float], probability: flo
     effects: list[Effect] = [DeadTime(duration=dead), Tdc(resolution=tick)]
     if probability:
         effects.append(Afterpulsing(probability=probability, lifetime=lifetime))
-    sensor = Sensor(Layout(1, pixels, 25e-12, 1.0), effects).settled()
+    sensor = Sensor(Layout(1, pixels, 25e-12, 1.0), effects).resolved()
     assert sensor.is_paper_line
     streams = Streams(1, "lux", "train", np.array([5, 6], np.uint64))
     recorded = sensor.expose(

@@ -242,7 +242,7 @@ def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab, mo
     """Of a shape; a strength's ends are seen by its slope."""
     delay = ("crosstalk", "delay")
     path = begin(bench_of(lab()))
-    taken(path, "add crosstalk", {CROSSTALK: 0.02, delay: 1e-9}, resolve=False)
+    taken(path, "add crosstalk", {CROSSTALK: 0.02, delay: 1e-9}, fitted=False)
     step, replicates = path.steps[0], path.replicates
     step.coordinates = tuple(d for d in step.candidate.coordinates if d.key in path.values)
     told = {"probability": Value(0.02, 0.019, 0.021), "delay": Value(1e-9, 0.9e-9, 1.1e-9, "s")}
@@ -671,7 +671,7 @@ def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(la
     sensor, data = lab("    slow_recovery: {time_constant: 5 ns}\n", light=900, side=4)
     path = begin(bench_of((sensor, data)))
     key = ("slow_recovery", "time_constant")
-    seen = given(path, "add slow_recovery", {key: 5e-9}, resolve=False)
+    seen = given(path, "add slow_recovery", {key: 5e-9}, fitted=False)
     far = replace(seen, gain=1000.0, times=30.0)
     (found,) = path.scan.again(path.evaluation, {}, [far])
     assert found.values[key] == pytest.approx(5e-9) and found.gain > 25

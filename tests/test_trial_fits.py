@@ -164,7 +164,7 @@ def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) ->
     made = lab("    crosstalk: {probability: 3 %}\n")
     courses = [begin(bench_of(made)) for _ in range(2)]
     for path, weighed in zip(courses, (False, True), strict=True):
-        one = given(path, "add crosstalk", {CROSSTALK: 0.03}, resolve=True)
+        one = given(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=True)
         before = path.replicates.simulations
         if weighed:
             evaluation_of(path.replicates, one)
@@ -287,7 +287,7 @@ def test_a_stated_queue_that_is_another_one_is_found(lab) -> None:
     sensor, data = lab("    readout_loss: {service_time: 100 ns, queue: 2}\n", light=1000)
     stated = with_values(sensor, {("readout_loss", "service_time"): 1e-7, ("readout_loss", "queue"): 4})
     path = begin(bench_of((stated, data)))
-    one = given(path, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, resolve=True)
+    one = given(path, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, fitted=True)
     assert one.values == {("readout_loss", "queue"): 2.0}
     assert one.gain > 100
     accept(path, one, 10.0)

@@ -80,18 +80,18 @@ def change_of(replicates: Replicates, name: str) -> Candidate:
     return next(c for c in candidates(replicates.start) if c.name == name)
 
 
-def given(path: ModelPath, name: str, values: dict[Key, Any], resolve: bool) -> Trial:
-    """A candidate at some values, or resolved from there."""
+def given(path: ModelPath, name: str, values: dict[Key, Any], fitted: bool) -> Trial:
+    """A candidate at some values, or fitted from there."""
     replicates, evaluation = path.replicates, path.evaluation
     candidate = next(c for c in candidates(evaluation.sensors.one) if c.name == name)
     (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], kept="sure")
     assert isinstance(signature, Signature)
     one = Trial(candidate, values, signature, 0.0, 1.0)
-    return fit_trial(path.replicates, evaluation, one) if resolve else one
+    return fit_trial(path.replicates, evaluation, one) if fitted else one
 
 
-def taken(path: ModelPath, name: str, values: dict[Key, Any], resolve: bool = True) -> None:
-    accept(path, given(path, name, values, resolve), 1.0)
+def taken(path: ModelPath, name: str, values: dict[Key, Any], fitted: bool = True) -> None:
+    accept(path, given(path, name, values, fitted), 1.0)
 
 
 def names(path: ModelPath) -> list[str]:
