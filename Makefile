@@ -5,7 +5,7 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify docs docs-two faults bench matrix challenge lint clean
+.PHONY: help demo test verify docs docs-two faults bench matrix package challenge lint clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,6 +78,9 @@ SAMPLE ?= 150
 QUICK ?= --quick
 MINUTES ?= 90
 CHALLENGE ?= $(DEMO)/challenge
+
+package: $(VENV)/installed  ## build sdist and wheel, install the wheel in an empty environment, run the first commands there
+	$(PYTHON) scripts/package.py
 
 challenge: $(VENV)/installed  ## hidden effects of an independent generator, diagnosed blind, then scored
 	@test -d $(CHALLENGE)/cases || $(RUN)/python scripts/challenge.py make $(CASES) --sample $(SAMPLE) -o $(CHALLENGE)

@@ -75,7 +75,7 @@ def read(path: Path) -> Document:
         with disk.opened(path) as file:
             raw = file.read(_MOST_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; name one that is there") from None
+        raise InputError(f"{path}: no such file; {_elsewhere(path)}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if len(raw) > _MOST_BYTES:
@@ -85,6 +85,13 @@ def read(path: Path) -> Document:
     except UnicodeDecodeError as error:
         raise ConfigError([f"{path}: is not UTF-8 text (byte {error.start})"]) from None
     return parse(text, str(path))
+
+
+def _elsewhere(path: Path) -> str:
+    """What to do where a file is not there: the documentation names the program's examples by this folder."""
+    if path.parts[:1] == ("configs",):
+        return "`spadmnist init configs --examples` writes the examples that come with the program"
+    return "name one that is there"
 
 
 def parse(text: str, name: str) -> Document:

@@ -1,4 +1,4 @@
-"""A folder to begin with: a config and a sensor that run as they are, or a plan for a bench, every line explained."""
+"""A folder to begin with: a config and a sensor that run as they are, a plan for a bench, or the program's examples."""
 
 from __future__ import annotations
 
@@ -61,6 +61,11 @@ def measurement(folder: Path, sensor: str) -> dict[str, str]:
     files = {schema.file_of("measurement"): schema.text("measurement"), **_positions(begun)}
     files[entries.FILE] = _explained(schema.first_line("measurement"), _plan(folder, begun, chip))
     return files
+
+
+def examples() -> dict[str, str]:
+    """The configs, sensors and the tutorial that come with the program, by name."""
+    return {name: path.read_text() for name, path in config.examples().items()}
 
 
 def write(folder: Path, files: Mapping[str, str]) -> list[Path]:

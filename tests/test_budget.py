@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import tinylab
 
@@ -13,10 +15,12 @@ from spadmnist.errors import InputError
 from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
+from spadmnist.inference.journal import Journal
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.next_step import after_comparison, after_diagnosis
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.results import Diagnosis, canonical, sentence, table
+from spadmnist.workers import Serial
 
 AFTERPULSING = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
 
@@ -126,3 +130,46 @@ def test_misfit_in_sample_is_the_same_in_both_verbs(lab, few):
 def test_all_that_a_sensor_may_lack_is_tried_by_default(lab):
     sensor, _ = lab()
     assert {"add afterpulsing", "add crosstalk"} <= {c.name for c in candidates(sensor.resolved())}
+
+
+@pytest.mark.slow
+def test_a_search_that_was_stopped_goes_on_to_the_same_answer(lab, few, tmp_path):
+    """Stopped after its first step, begun again; an entry that is damaged is simulated again."""
+
+    class Stopped(Exception):
+        pass
+
+    def stop(so_far: Diagnosis) -> None:
+        raise Stopped
+
+    made, folder = lab(AFTERPULSING), tmp_path / "journal"
+    whole = diagnose(*made, quick=True, jobs=1)
+    with pytest.raises(Stopped):
+        diagnose(*made, quick=True, jobs=1, keep=stop, journal=Journal(folder))
+    entries = sorted(folder.glob("*.npz"))
+    held = sum(path.stat().st_size for path in entries)
+    assert len(entries) > 10 and Journal(folder).bytes == held
+    entries[0].write_bytes(entries[0].read_bytes()[:-1] + b"x")
+    again = Journal(folder)
+    found = diagnose(*made, quick=True, jobs=1, journal=again)
+    assert canonical(found) == canonical(whole) and again.recalled > 100
+    again.remove()
+    assert not folder.exists()
+
+
+def test_what_a_journal_holds_is_of_this_model_capture_light_and_seed(lab):
+    sensor, data = lab()
+    replicates = Replicates(sensor, data, 0, Serial(), 4)
+    seen, photons, numbers = replicates.seen["flat"], np.full(4, 1e5), np.arange(4, dtype=np.uint64)
+    other = sensor.with_values({"dead_time.duration": 51e-9})
+    names = [
+        Journal.name([sensor], seen, photons, numbers, 0),
+        Journal.name([other], seen, photons, numbers, 0),
+        Journal.name([sensor, other], seen, photons, numbers, 0),
+        Journal.name([sensor], replicates.seen["dark"], photons, numbers, 0),
+        Journal.name([sensor], replace(seen, half_of=(seen.capture, True)), photons, numbers, 0),
+        Journal.name([sensor], seen, photons * 1.001, numbers, 0),
+        Journal.name([sensor], seen, photons, numbers + np.uint64(1), 0),
+        Journal.name([sensor], seen, photons, numbers, 1),
+    ]
+    assert len(set(names)) == len(names) and names[0] == Journal.name([sensor], seen, photons, numbers, 0)

@@ -151,3 +151,22 @@ def test_what_it_writes_keeps_the_schema_beside_it() -> None:
     for path in (Path("my/config.yaml"), Path("my/sensor.yaml"), Path("bench/measurement.yaml")):
         beside = path.with_name(schema.file_of(path.stem))
         jsonschema.validate(yaml.safe_load(path.read_text()), json.loads(beside.read_text()))
+
+
+def test_the_examples_are_written_where_the_documentation_names_them(here: Path) -> None:
+    missing = run("generate", "configs/quick.yaml", "-o", "out")
+    assert "spadmnist init configs --examples" in str(missing.exception)
+    files = begin("configs", "--examples")
+    shipped = config.shipped("quick.yaml").parent
+    assert {path.read_bytes() for path in files} == {path.read_bytes() for path in config.examples().values()}
+    assert Path("configs/tutorial/plan/measurement.yaml") in files and Path("configs/tutorial/secret.py") in files
+    assert len(files) == sum(p.is_file() and "__pycache__" not in p.parts for p in shipped.rglob("*"))
+    for path in files:  # those that are named by others are found
+        if path.suffix == ".yaml" and path.name not in ("measurement.yaml", "truth.yaml"):
+            config.read_sensor(path)
+    begin("configs", "--examples")  # again: they are there
+
+
+def test_examples_are_asked_for_alone(here: Path) -> None:
+    done = run("init", "configs", "--examples", "--measurement")
+    assert "--examples" in str(done.exception) and not Path("configs").exists()

@@ -36,7 +36,7 @@ class Verbs(click.Group):
 @click.group(
     cls=Verbs,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Begin with:  spadmnist generate configs/quick.yaml -o out  and then  spadmnist inspect out --plot out.png",
+    epilog="Begin with:  spadmnist init my  and then  spadmnist generate my/config.yaml -o out",
 )
 @click.version_option(package_name="spadmnist", message="%(package)s %(version)s")
 def cli() -> None:

@@ -133,7 +133,8 @@ def diagnose(
     """Find the effects of MEASUREMENT that the model SENSOR lacks, and add them.
 
     Tried are every registered effect, those of --plugin files included, every listed parameter at another value, and
-    every per-pixel parameter as a map. The answer so far is written after each step, so that Ctrl-C keeps it.
+    every per-pixel parameter as a map. The answer so far is written after each step, so that Ctrl-C keeps it; with -o
+    what was simulated is kept as well, and the same command goes on from there to the same answer.
 
     \b
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
@@ -141,7 +142,7 @@ def diagnose(
     """
     from .. import measurement as measurements
     from .. import sensor_file
-    from ..inference import model_selection, next_step, results
+    from ..inference import journal, model_selection, next_step, results
     from ..inference.budget import seconds_of
 
     seconds = seconds_of(within, quick)
@@ -154,6 +155,9 @@ def diagnose(
         sensor_file.check_place(sensor, output / "sensor.yaml", (output / pages.FILES["diagnosis"]).exists())
     _check_answer(json_file)
     workers = options.workers_of(jobs, cluster)
+    before = None if output is None else journal.Journal(output / journal.FOLDER)
+    if before is not None and before.bytes:
+        terminal.say(f"Going on: {before.folder} holds {before.bytes / 1e6:.0f} MB of an earlier run's replicates")
 
     def keep(so_far: Diagnosis) -> None:
         """What is found so far, should the rest be interrupted."""
@@ -162,9 +166,9 @@ def diagnose(
             pages.diagnosis(so_far, output, _source(sensor, measurement, seed, so_far.file))
         _write_answer(json_file, results.canonical(so_far))
 
-    found = model_selection.diagnose(
-        model, data, seed, max_steps, quick, workers, progress=terminal.say, within=seconds, keep=keep
-    )
+    found = model_selection.diagnose(model, data, seed, max_steps, quick, workers, terminal.say, seconds, keep, before)
+    if before is not None and found.finished:
+        before.remove()
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
     new = quoted(found.file or "next/sensor.yaml")

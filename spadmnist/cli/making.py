@@ -152,19 +152,24 @@ def generate(
         terminal.say(f"Look at it:  spadmnist inspect {quoted(root)} --plot {quoted(f'{root.name}.png')}")
 
 
-@cli.verb(20, short_help="Write a first config and sensor, or a plan of captures, every line explained.")
+@cli.verb(20, short_help="Write a first config and sensor, a plan of captures, or the examples.")
 @click.argument("folder", type=options.Place())
 @click.option("--images", type=click.Path(path_type=Path), metavar="DIR", help="Folder of your own pictures.")
 @click.option(
     "--sensor",
     type=click.Choice(["spad23", "spad512", "spad_mnist"]),
-    default="spad_mnist",
     help="Sensor of the config.  [default: spad_mnist]",
 )
 @click.option("--measurement", is_flag=True, help="Write a plan of captures instead. `import -o FOLDER` fills it.")
+@click.option("--examples", is_flag=True, help="Write the configs that come with the program instead.")
 @options.as_json
-def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_json: bool) -> None:
+def init(
+    folder: Path, images: Path | None, sensor: str | None, measurement: bool, examples: bool, as_json: bool
+) -> None:
     """Write FOLDER/config.yaml and FOLDER/sensor.yaml, which run as they are, or FOLDER/measurement.yaml.
+
+    The documentation names the program's examples as configs/NAME: --examples writes them, for who has installed the
+    program without its source.
 
     Their JSON Schemas are written to FOLDER, too; an editor completes and checks with them. A config of pictures has
     gamma: srgb, because pictures are not linear in the light: half of white then gets 21 % of the photons of white.
@@ -173,13 +178,20 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
     spadmnist init my --images photos --sensor spad512
     spadmnist generate my/config.yaml -o my_dataset
     spadmnist init bench --sensor spad512 --measurement
+    spadmnist init configs --examples
     """
     from .. import starting
     from ..errors import SpadError
 
     if measurement and images is not None:
         raise SpadError("--images: belongs to a config, and a plan of captures has none; leave it or --measurement out")
-    files = starting.measurement(folder, sensor) if measurement else starting.dataset(folder, sensor, images)
+    if examples and (measurement or images is not None or sensor is not None):
+        raise SpadError("--examples: writes the program's examples as they are; leave out what else is asked for")
+    chip = sensor or "spad_mnist"
+    if examples:
+        files = starting.examples()
+    else:
+        files = starting.measurement(folder, chip) if measurement else starting.dataset(folder, chip, images)
     written = starting.write(folder, files)
     if as_json:
         terminal.print_json({"files": [str(path) for path in written]})
@@ -187,7 +199,9 @@ def init(folder: Path, images: Path | None, sensor: str, measurement: bool, as_j
     for path in written:
         terminal.print_line(str(path))
     last = quoted(written[-1])
-    if measurement:
+    if examples:
+        terminal.say(f"Begin with:  spadmnist generate {quoted(folder / 'quick.yaml')} -o out")
+    elif measurement:
         terminal.say(f"Then fill it:  spadmnist import FILE... -o {quoted(folder)}")
     else:
         terminal.say(f"What it costs:  spadmnist generate {last} --dry-run")

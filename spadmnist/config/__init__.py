@@ -64,6 +64,13 @@ def shipped(name: str) -> Path:
     raise InputError(f"{package}: {name}, which comes with the program, is not there; install the program again")
 
 
+def examples() -> dict[str, Path]:
+    """Every file that comes with the program to be used as an example, by its name within their folder."""
+    root = shipped("quick.yaml").parent
+    files = {path.relative_to(root).as_posix(): path for path in sorted(root.rglob("*")) if path.is_file()}
+    return {name: path for name, path in files.items() if "__pycache__" not in path.parts}
+
+
 def problems(raw: Any, name: str) -> list[str]:
     """The mistakes in a config that is written out with nothing left open, a sentence each; name: of its place.
 

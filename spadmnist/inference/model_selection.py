@@ -28,6 +28,7 @@ from .elimination import drop_mimics, drop_needless, in_vain, left_in_own_cells
 from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, misfit_null_95, square
 from .findings import mimicked, nuisances, remainder, traces
+from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_GAIN
 from .map_trials import patterns_first, unseen_maps
 from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
@@ -63,6 +64,7 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     within: float = math.inf,
     keep: Callable[[Diagnosis], None] | None = None,
+    journal: Journal | None = None,
 ) -> Diagnosis:
     """The diagnosis of a model: the effects, values and maps that it lacks, added one by one.
 
@@ -75,6 +77,7 @@ def diagnose(
         progress: called with a line about what is being done.
         within: the budget of the search, s of two idle cores, see `budget`.
         keep: called with the diagnosis so far after each step; its verdict and misfits are those of that moment.
+        journal: of an earlier search that was stopped; it goes on from there.
     Raises:
         InputError: where sensor and measurement do not belong together.
     """
@@ -87,13 +90,14 @@ def diagnose(
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
         number = _QUICK if quick else REPLICATES
-        replicates = Replicates(sensor, measurement, seed, workers, number, say, budget=budget)
+        given = sensor, measurement, seed, workers, number, say
+        replicates = Replicates(*given, budget=budget, journal=journal)
         short = setups.stopped_early(replicates)
         if short:
             exposures = {
                 id: replicates.seen[id].capture.conditions.exposure * share for id, (share, _) in short.items()
             }
-            replicates = Replicates(sensor, measurement, seed, workers, number, say, exposures, budget=budget)
+            replicates = Replicates(*given, exposures, budget=budget, journal=journal)
         return _diagnosed(replicates, max_steps, quick, short, keep or (lambda found: None))
 
 

@@ -54,36 +54,49 @@ def recall(name: str) -> CaptureReplicates | None:
     """The replicates of an entry; None where no such entry can be read."""
     path = _folder() / f"{name}.npz"
     try:
-        with np.load(_intact(path.read_bytes()), allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-        facts = from_json(arrays.pop("facts").tobytes())
-        laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts.items()}
-        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in facts}
-        found = CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
+        found = unpacked(path.read_bytes())
         os.utime(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+    except OSError:
         return None
     return found
 
 
 def keep(name: str, made: CaptureReplicates) -> None:
     """Write an entry. An error of the disk is ignored: the cache is no part of the result."""
+    folder = _folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        disk.put_file(folder / f"{name}.npz", packed(made))
+        _make_room(folder)
+    except (OSError, SpadError):  # what is not in the cache is simulated again
+        return
+
+
+def packed(made: CaptureReplicates) -> bytes:
+    """Replicates as the bytes of an entry."""
     arrays = {"numbers": made.numbers, "totals": made.totals}
     for statistic, (_, scale) in made.laws.items():
         arrays[f"values/{statistic}"] = _narrow(made.values[statistic])
         if scale is not None:
             arrays[f"scale/{statistic}"] = scale
     header = np.frombuffer(json.dumps({statistic: law for statistic, (law, _) in made.laws.items()}).encode(), np.uint8)
-    folder = _folder()
+    whole = io.BytesIO()
+    np.savez(whole, allow_pickle=False, facts=header, **arrays)
+    data = whole.getvalue()
+    return data + hashlib.sha256(data).digest()
+
+
+def unpacked(data: bytes) -> CaptureReplicates | None:
+    """The replicates that an entry's bytes hold; None where they are damaged."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        whole = io.BytesIO()
-        np.savez(whole, allow_pickle=False, facts=header, **arrays)
-        data = whole.getvalue()
-        disk.put_file(folder / f"{name}.npz", data + hashlib.sha256(data).digest())
-        _make_room(folder)
-    except (OSError, SpadError):  # what is not in the cache is simulated again
-        return
+        with np.load(_intact(data), allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        facts = from_json(arrays.pop("facts").tobytes())
+        laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts.items()}
+        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in facts}
+        return CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        return None
 
 
 def _narrow(values: np.ndarray) -> np.ndarray:

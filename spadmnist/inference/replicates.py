@@ -11,7 +11,7 @@ import functools
 import pickle
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from .blind_times import ShortestIntervals
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, on_chip, with_values
 from .coordinates import Key, Values
+
+if TYPE_CHECKING:
+    from .journal import Journal
 
 T = TypeVar("T")
 Cell = tuple[str, str]  # (capture, statistic)
@@ -267,6 +270,7 @@ class Replicates:
         reduced: bool = True,
         progress: Callable[[str, float], None] = lambda capture, share: None,
         budget: Budget | None = None,
+        journal: Journal | None = None,
     ):
         """Reduce the measurement.
 
@@ -278,6 +282,7 @@ class Replicates:
             reduced: with all statistics of the captures; without them only counts can be compared.
             progress: called with a capture and the share of the simulations under way that is done.
             budget: of work; without it there is no end to it.
+            journal: what was simulated before, and is not simulated again.
         """
         measurement.check_sensor(sensor)
         self.start = sensor.resolved()
@@ -285,7 +290,7 @@ class Replicates:
         self.dead = self.start.nominal_dead_time
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
-        self.simulations, self.budget = 0, budget or Budget()
+        self.simulations, self.budget, self.journal = 0, budget or Budget(), journal
         for capture in measurement.captures:
             if capture.mean is not None:
                 self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
@@ -354,6 +359,7 @@ class Replicates:
         """
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | str] = [""] * len(wanted)
+        names = [self._name(one, pieces, hasty) for one in wanted]
         for k, (sensors, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
@@ -369,23 +375,46 @@ class Replicates:
         asked = [(id, len(numbers)) for some, (_, id, _, numbers) in zip(tasks, wanted, strict=True) if some]
         self.budget.spend(sum(number * self._work(id) for id, number in asked))
         self.simulations += sum(number for _, number in asked)
-        ids = [wanted[k][1] for k, some in enumerate(tasks) for _ in some]
-        given = {f"replicates of {id} ({n + 1} of {len(ids)})": n for n, id in enumerate(ids)}
+        for k, some in enumerate(tasks):
+            if some and self.journal and (before := self.journal.recall(names[k])) is not None:
+                tasks[k], out[k] = [], before
+        owners = [k for k, some in enumerate(tasks) for _ in some]
+        given = {f"replicates of {wanted[k][1]} ({n + 1} of {len(owners)})": n for n, k in enumerate(owners)}
         every = [task for some in tasks for task in some]
-        simulated: dict[str, CaptureReplicates | str] = {}
+        simulated: dict[int, dict[int, CaptureReplicates | str]] = {k: {} for k in owners}
+        count = 0
 
         def done(key: str, one: CaptureReplicates | str) -> None:
-            simulated[key] = one
-            self.progress(ids[given[key]], len(simulated) / len(ids))
+            nonlocal count
+            n, count = given[key], count + 1
+            k = owners[n]
+            simulated[k][n] = one
+            self.progress(wanted[k][1], count / len(owners))
+            if len(simulated[k]) == len(tasks[k]):
+                out[k] = whole = _whole([part for _, part in sorted(simulated.pop(k).items())])
+                if self.journal and isinstance(whole, CaptureReplicates):
+                    self.journal.keep(names[k], whole)
 
         self.workers.run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
-        results = (simulated[key] for key in given)
-        for k, some in enumerate(tasks):
-            made = [next(results) for _ in some]
-            wrong = [p for p in made if isinstance(p, str)]
-            if some:
-                out[k] = wrong[0] if wrong else joined([p for p in made if isinstance(p, CaptureReplicates)])
         return out
+
+    def _name(self, wanted: tuple[Model, str, np.ndarray, np.ndarray], pieces: int, hasty: bool) -> str | None:
+        """The name in the journal of what is wanted; None without a journal, or where the model cannot be made."""
+        model, id, photons, numbers = wanted
+        if self.journal is None:
+            return None
+        try:
+            sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
+        except UNABLE:
+            return None
+        more = self.seed, self.dead, pieces, hasty
+        return self.journal.name(sensors, self.seen[id], photons, numbers, *more)
+
+
+def _whole(parts: Sequence[CaptureReplicates | str]) -> CaptureReplicates | str:
+    """The parts of one capture together; a reason where one of them has failed."""
+    wrong = [part for part in parts if isinstance(part, str)]
+    return wrong[0] if wrong else joined([part for part in parts if isinstance(part, CaptureReplicates)])
 
 
 def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:

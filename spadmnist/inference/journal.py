@@ -1,0 +1,90 @@
+"""The journal of a search: the replicates that it has simulated, on disk. The same search, begun again, goes on there.
+
+A search that begins again asks for the same replicates in the same order. What the journal holds is read, the rest is
+simulated: the answer is that of a search that was never stopped, bit for bit. The work of replicates that are read
+counts as if they had been simulated, because the budget decides what is tried.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import disk
+from ..sensor import Sensor
+from . import replicate_cache
+from .replicates import CaptureReplicates, ReducedCapture
+
+FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
+_MOST_BYTES = 2 << 30  # bytes of all entries; what comes later is simulated again. Chosen: a full search of 12 steps
+_LARGEST = 1 << 28  # bytes of one entry
+
+
+class Journal:
+    """The replicates of one search, by what they are a function of."""
+
+    def __init__(self, folder: Path):
+        """Open the journal in a folder, which need not be there yet."""
+        self.folder = folder
+        self.bytes = sum(path.stat().st_size for path in folder.glob("*.npz")) if self._own() else 0
+        self.recalled = 0  # replicates that were read
+
+    @staticmethod
+    def name(
+        sensors: Iterable[Sensor], seen: ReducedCapture, photons: np.ndarray, numbers: np.ndarray, *more: Any
+    ) -> str:
+        """The name of the replicates of a capture.
+
+        Args:
+            sensors: one for all replicates, or one for each.
+            photons: (replicates,) photons/s on a pixel.
+            numbers: (replicates,) numbers that seed them.
+            more: numbers and words that they depend on as well.
+        """
+        capture, second = seen.half_of or (seen.capture, None)
+        digest = hashlib.sha256(np.asarray(photons, float).tobytes() + np.asarray(numbers, np.uint64).tobytes())
+        for sensor in sensors:
+            digest.update(replicate_cache.entry_name(sensor, capture, second, *more).encode())
+        return digest.hexdigest()[:32]
+
+    def recall(self, name: str | None) -> CaptureReplicates | None:
+        """The replicates of this name; None where the journal has none that are intact."""
+        try:
+            found = None if name is None else replicate_cache.unpacked(disk.read_file(self._path(name), _LARGEST))
+        except OSError:
+            return None
+        if found is not None:
+            self.recalled += len(found.numbers)
+        return found
+
+    def keep(self, name: str | None, made: CaptureReplicates) -> None:
+        """Add replicates. An error of the disk is ignored: they are simulated again."""
+        if name is None or self.bytes > _MOST_BYTES:
+            return
+        data, part = replicate_cache.packed(made), self.folder / f"{name}.part"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if len(data) <= _LARGEST and self._own():
+                part.write_bytes(data)
+                os.replace(part, self._path(name))
+                self.bytes += len(data)
+        except OSError:
+            part.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the journal: the search is finished."""
+        if self._own():
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npz"
+
+    def _own(self) -> bool:
+        """Whether the folder is there, and no link."""
+        return self.folder.is_dir() and not self.folder.is_symlink()
