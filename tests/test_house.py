@@ -142,7 +142,9 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ("yaml", {"document.py"}),
         ("loky", {"workers.py"}),
         ("distributed", {"cluster.py"}),
-        ("dask", {"cluster.py"}),
+        ("dask", {"cluster.py", "lazy.py"}),
+        ("obstore", {"remote.py"}),
+        ("xarray", {"lazy.py"}),
         ("h5py", {"capture_files.py", "store.py", "importers/hdf5.py", "exporters.py"}),
         ("pooch", {"images.py", "image_files.py"}),
         (
