@@ -51,6 +51,7 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "open": "dataset",
     "concatenate": "dataset",
+    "fetch": "fetching",
     "Dataset": "dataset",
     "Part": "dataset",
     "open_measurement": "measurement",

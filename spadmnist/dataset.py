@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 
-from . import config, disk, kernels, plugins, reconstruct, store, units
+from . import config, disk, kernels, lazy, plugins, reconstruct, remote, store, units
 from . import manifest as manifests
 from .disk import Files
 from .errors import InputError, SpadError, UnknownName, did_you_mean
@@ -31,9 +31,10 @@ from .experiment import Experiment, Level, level_of
 from .foreign import from_json, quoted, short
 from .gather import gather, indices_of, join
 from .identity import FORMAT
-from .images import Images
+from .images import Images, cache_folder
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
+from .sources import Source
 from .store import Column, Expected, ShardReader
 from .tiles import Tiles, of_facts
 
@@ -71,7 +72,9 @@ class Shard:
         level = {} if self.level is None else {"level": self.level}
         return {"split": self.split, "start": self.start, "stop": self.stop, **level}
 
-    def reader(self, root: Path, format: str, like: Likeness, files: Mapping[str, Files] | None = None) -> ShardReader:
+    def reader(
+        self, root: Path | Source, format: str, like: Likeness, files: Mapping[str, Files] | None = None
+    ) -> ShardReader:
         """Reads the shard; a file in its place that is not its own is refused.
 
         files: of each shard, by its place, as `files_by_shard` gives them, where they are known.
@@ -443,7 +446,8 @@ def _check_stamps(reader: ShardReader, name: str, first: int, last: int, count: 
     """Raise InputError unless an array holds the entries `first` to `last`, which are `count`."""
     if last - first != count or not 0 <= first <= last <= reader.shape(name)[0]:
         raise InputError(
-            f"{reader.root / reader.path}: counts and stamps disagree; spadmnist verify {quoted(reader.root)} says more"
+            f"{reader.root / reader.path}: counts and stamps disagree; "
+            f"spadmnist verify {quoted(str(reader.root))} says more"
         )
 
 
@@ -492,13 +496,37 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
-def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
+def read_manifest(root: Path | Source) -> tuple[dict[str, Any], bool]:
     """(manifest, is every byte of it as it was sealed?). Raises InputError where there is none to read."""
+    path, mended = root / MANIFEST, ""
+    if isinstance(root, Source):
+        raw = _manifest_of(root)
+    else:
+        raw, mended = _manifest_in(root), f"; spadmnist verify {quoted(root)} --repair makes it again"
+    try:
+        manifest = from_json(raw)
+        intact = isinstance(manifest, dict) and seal(manifest) == raw
+    except ValueError as error:
+        raise InputError(f"{path}: is damaged ({error}){mended}") from None
+    if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
+        raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
+    if manifest["format"] != FORMAT:
+        raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
+    if intact and (wrong := manifests.problems(manifest, str(path))):
+        said = "; ".join(short(sentence, _LONGEST_SENTENCE) for sentence in wrong[:4])
+        more = f" (and {len(wrong) - 4} more)" if len(wrong) > 4 else ""
+        raise InputError(f"{said}{more}{mended}")
+    if intact and isinstance(root, Source):
+        root.hold(manifest["files"], manifest["sha256"])
+    return manifest, intact
+
+
+def _manifest_in(root: Path) -> bytes:
     path = root / MANIFEST
     if root.exists() and not root.is_dir():
         raise InputError(f"{root} is no folder; a dataset is a folder (spadmnist generate makes one from a config)")
     try:
-        raw = disk.read_file(path, _LARGEST_MANIFEST)
+        return disk.read_file(path, _LARGEST_MANIFEST)
     except FileNotFoundError:
         if (root / STATE).is_dir():
             raise InputError(
@@ -511,29 +539,23 @@ def read_manifest(root: Path) -> tuple[dict[str, Any], bool]:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); spadmnist verify {quoted(root)} says more"
         ) from None
+
+
+def _manifest_of(source: Source) -> bytes:
     try:
-        manifest = from_json(raw)
-        intact = isinstance(manifest, dict) and seal(manifest) == raw
-    except ValueError as error:
+        return source.document(MANIFEST, _LARGEST_MANIFEST)
+    except FileNotFoundError:
         raise InputError(
-            f"{path}: is damaged ({error}); spadmnist verify {quoted(root)} --repair makes it again"
+            f"{source}: there is no {MANIFEST}; give the address of a dataset's folder, in which it lies"
         ) from None
-    if not isinstance(manifest, dict) or not str(manifest.get("format", "")).startswith("spadmnist-dataset/"):
-        raise InputError(f"{path}: is not the manifest of a spadmnist dataset")
-    if manifest["format"] != FORMAT:
-        raise InputError(f"{path}: has format {manifest['format']}; this program reads {FORMAT}")
-    if intact and (wrong := manifests.problems(manifest, str(path))):
-        said = "; ".join(short(sentence, _LONGEST_SENTENCE) for sentence in wrong[:4])
-        more = f" (and {len(wrong) - 4} more)" if len(wrong) > 4 else ""
-        raise InputError(f"{said}{more}; spadmnist verify {root} --repair makes {MANIFEST} again")
-    return manifest, intact
 
 
-def intact_manifest(root: Path) -> dict[str, Any]:
+def intact_manifest(root: Path | Source) -> dict[str, Any]:
     """The manifest as it was sealed. Raises InputError where it is not."""
     manifest, intact = read_manifest(root)
     if not intact:
-        raise InputError(f"{root / MANIFEST}: was changed; spadmnist verify {quoted(root)} --repair makes it again")
+        mended = "" if isinstance(root, Source) else f"; spadmnist verify {quoted(root)} --repair makes it again"
+        raise InputError(f"{root / MANIFEST}: was changed{mended}")
     return manifest
 
 
@@ -753,6 +775,14 @@ class Part:
     def labels(self) -> np.ndarray | None:
         return self._backend.labels()
 
+    def to_dask(self, name: str_) -> Any:
+        """A dask array of all images, image first, of which nothing is read until it is computed (extra `xarray`).
+
+        name: `images`, a readout (`qis`: 0 or 1, `str`: s, `count_frames`: the readout `counts`) or a method of
+        reconstruction (its unit). Raises SpadError where there is no such data or no dask.
+        """
+        return lazy.to_dask(self, name)
+
     @property
     def tiles(self) -> Tiles:
         """The tiles of the chart that these images are of. Raises SpadError where they are of none, or of several."""
@@ -855,6 +885,17 @@ class Dataset:
         sizes = ", ".join(f"{n} {split}" for split, n in self._splits.items())
         return f"Dataset({self._source}: {sizes}; {', '.join(self.levels)})"
 
+    def to_xarray(self, level: str, split: str | None = None) -> Any:
+        """An xarray.Dataset of one split at one level, read where it is computed (extra `xarray`).
+
+        Coordinates: `image` (its number), `label` where there are labels, and `lux` (or `irradiance`, W/m^2).
+        Variables: `original`, each method, and the readouts of one size for every image: `qis` (0 or 1), `str` (s) and
+        `count_frames` (the readout `counts`).
+        """
+        found = level_of(self._levels, level)
+        part = self[level] if split is None else self[level, split]
+        return lazy.to_xarray(part, found.kind, found.value)
+
     def __getitem__(self, key: str | tuple[str, str]) -> Part:
         level_text, split = key if isinstance(key, tuple) else (key, None)
         level = level_of(self._levels, level_text)
@@ -875,7 +916,7 @@ class _Stored:
 
     def __init__(
         self,
-        root: Path,
+        root: Path | Source,
         format: str,
         shards: Sequence[Shard],
         originals: Sequence[Shard],
@@ -1145,20 +1186,35 @@ def concatenate(parts: Sequence[Part]) -> Part:
     return Part(sum(map(len, parts)), backend, stored, readouts, methods, first.shape, first.causes)
 
 
-def open(path: str | Path, images_dir: str | Path | None = None, plugin: Sequence[str | Path] = ()) -> Dataset:
-    """Open a dataset's folder, or a config file: then every image is simulated when it is asked for.
+def open(
+    path: str | Path,
+    images_dir: str | Path | None = None,
+    plugin: Sequence[str | Path] = (),
+    cache: str | Path | None = None,
+) -> Dataset:
+    """Open a dataset: its folder, a zip of it, or its address (`https://`, `http://`, `s3://`: extra `remote`).
 
-    images_dir: where the images of a config are looked for; plugin: files with effects that a config names.
-    Raises InputError or ConfigError with a sentence.
+    Of a config file every image is simulated when it is asked for. images_dir: where the images of a config are looked
+    for; plugin: files with effects that a config names; cache: folder for what was read from an address, default
+    `$SPADMNIST_CACHE` or the system's place for it. Raises InputError or ConfigError with a sentence.
     """
     for file in plugin:
         plugins.load_file(file)
-    root = Path(path)
+    root = at(path, cache)
+    if isinstance(root, Source):
+        return stored(root)
     if not root.exists():
         raise InputError(f"{root}: there is no such dataset or config file")
     if not root.is_dir():
         return simulated(config.read(root), Path(images_dir) if images_dir is not None else None)
     return stored(root)
+
+
+def at(path: str | Path, cache: str | Path | None = None) -> Path | Source:
+    """A place that a user named: a path, or the source that a zip or an address is; cache: see `open`."""
+    if not remote.is_url(path):
+        return remote.at(path)
+    return remote.at(path, (cache_folder() if cache is None else Path(cache)) / "remote")
 
 
 def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset:
@@ -1177,7 +1233,7 @@ def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset
     return Dataset(experiment.levels, sizes, part, experiment.name)
 
 
-def stored(root: Path) -> Dataset:
+def stored(root: Path | Source) -> Dataset:
     """A finished dataset. Only its manifest is read here; checksums are compared as the data are read."""
     manifest = intact_manifest(root)
     levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]

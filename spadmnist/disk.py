@@ -121,10 +121,11 @@ def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
 
 
 @contextlib.contextmanager
-def whole_folder(path: str | os.PathLike[str], size: int) -> Iterator[Path]:
+def whole_folder(path: str | os.PathLike[str], size: int, resumed: bool = False) -> Iterator[Path]:
     """A folder among the user's own, to be filled: there as a whole or not at all; see `whole`.
 
-    What is there already is left alone: raises SpadError.
+    What is there already is left alone: raises SpadError. resumed: what was begun under the hidden name is there again,
+    and stays where it ends with an error.
     """
     path = Path(path)
     check_outside(path)
@@ -141,7 +142,8 @@ def whole_folder(path: str | os.PathLike[str], size: int) -> Iterator[Path]:
             except BlockingIOError:
                 raise SpadError(f"{path}: another run is writing it; wait for it, or choose another -o") from None
             try:
-                _empty(part)
+                if not resumed:
+                    _empty(part)
                 yield part
                 for folder, _, names in os.walk(part):
                     for name in names:
@@ -154,7 +156,8 @@ def whole_folder(path: str | os.PathLike[str], size: int) -> Iterator[Path]:
                         raise taken from None
                     raise
             except BaseException:
-                shutil.rmtree(part, ignore_errors=True)
+                if not resumed:
+                    shutil.rmtree(part, ignore_errors=True)
                 raise
         finally:
             os.close(handle)

@@ -40,6 +40,7 @@ from .golden import versions
 from .identity import ENCODING, FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other
 from .images import Images
 from .reconstruct import median_of_nonzero
+from .sources import Source
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
@@ -889,7 +890,7 @@ def _level_attributes(
 
 
 def statistics_of(
-    root: Path,
+    root: Path | Source,
     format: str,
     levels: Sequence[str],
     methods: Sequence[str],

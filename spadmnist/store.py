@@ -20,8 +20,10 @@ to read one image's part. The reader accepts exactly the layout that the writer 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
+import io
 import json
 import math
 import os
@@ -43,6 +45,7 @@ from numcodecs.fletcher32 import Fletcher32
 from .disk import Files, commit_file, inside, install, put_tree, temporary, workspace, writing
 from .errors import InputError
 from .foreign import from_json, quoted
+from .sources import File, Local, NotAFile, Reading, Source
 
 # One task is one core; with threads of its own Blosc would use more of them without need.
 numcodecs.blosc.use_threads = False
@@ -590,22 +593,25 @@ class Expected:
 class ShardReader:
     """Reads arrays of a shard, or parts of them along axis 0.
 
+    root: the dataset's folder, or the source that it is read from.
     expected: what is compared when the shard and its arrays are opened, once for each.
     It keeps descriptions, never an open file: it may be pickled, and used after a fork.
     """
 
-    def __init__(self, root: str | os.PathLike[str], path: str, format: str, expected: Expected | None = None):
-        self.root, self.path, self.format = Path(root), path, format
+    def __init__(self, root: str | os.PathLike[str] | Source, path: str, format: str, expected: Expected | None = None):
+        self.root: Path | Source = root if isinstance(root, Source) else Path(root)
+        self.path, self.format = path, format
+        self._source = self.root if isinstance(self.root, Source) else Local(self.root)
         self._expected = expected
         self._place = location(path, format)
         self._arrays: dict[str, _Array] = {}
         self._attributes: dict[str, Any] | None = None
         self._names: tuple[str, ...] | None = None
 
-    def __getstate__(self) -> tuple[Path, str, str, Expected | None]:
+    def __getstate__(self) -> tuple[Path | Source, str, str, Expected | None]:
         return self.root, self.path, self.format, self._expected
 
-    def __setstate__(self, state: tuple[Path, str, str, Expected | None]) -> None:
+    def __setstate__(self, state: tuple[Path | Source, str, str, Expected | None]) -> None:
         self.__init__(*state)  # type: ignore[misc]
 
     @property
@@ -633,8 +639,8 @@ class ShardReader:
         return False
 
     def _digest(self, file: str) -> str:
-        with open(self._open(file), "rb") as handle:
-            return hashlib.file_digest(handle, "sha256").hexdigest()
+        with contextlib.closing(self._open(file)) as handle:
+            return hashlib.file_digest(io.BufferedReader(Reading(handle)), "sha256").hexdigest()
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -696,6 +702,8 @@ class ShardReader:
             row = out.nbytes // len(out)
             handle = self._open(array.file)
             try:
+                first, last = array.places[start // rows], array.places[-(-stop // rows) - 1]
+                handle.expect(first[0], last[0] + last[1] - first[0])
                 for i in range(start // rows, -(-stop // rows)):
                     low, high = max(start, i * rows), min(stop, (i + 1) * rows)
                     target = flat[(low - start) * row : (high - start) * row]
@@ -706,7 +714,7 @@ class ShardReader:
                         self._chunk(handle, array, i, chunk)
                         target[:] = chunk[(low - i * rows) * row : (high - i * rows) * row]
             finally:
-                os.close(handle)
+                handle.close()
         except MemoryError:
             raise InputError(
                 f"{self.root / array.file}: rows {start} to {stop} of {name} need more memory than there is; "
@@ -716,10 +724,10 @@ class ShardReader:
             raise self._refuse(array.file, f"{name}: {error}") from None
         return out
 
-    def _chunk(self, handle: int, array: _Array, i: int, into: np.ndarray) -> None:
+    def _chunk(self, handle: File, array: _Array, i: int, into: np.ndarray) -> None:
         offset, length = array.places[i]
         try:
-            raw = os.pread(handle, length, offset)
+            raw = handle.read(offset, length)
             if len(raw) != length:
                 raise _Damaged("the file ends too early")
             if self.format == "zarr":
@@ -730,9 +738,10 @@ class ShardReader:
             raise _Damaged(f"chunk {i} cannot be decoded ({error})") from None
 
     def _refuse(self, file: str, problem: str) -> InputError:
+        mended = ", and with --repair it makes them again" if isinstance(self._source, Local) else ""
         return InputError(
-            f"{self.root / file}: {problem}; the file was changed or damaged: `spadmnist verify {quoted(self.root)}` "
-            "names every such file, and with --repair it makes them again"
+            f"{self.root / file}: {problem}; the file was changed or damaged: `spadmnist verify "
+            f"{quoted(str(self.root))}` names every such file{mended}"
         )
 
     # what is expected
@@ -773,54 +782,49 @@ class ShardReader:
         return self._arrays[name]
 
     # files
-    def _open(self, file: str, folder: bool = False) -> int:
-        """A handle for reading; a symbolic link anywhere below the root is refused."""
-        parts = file.split("/")
-        at = -1
+    def _open(self, file: str) -> File:
+        """A file for reading, which has the size that is known of it."""
+        with self._said(file):
+            handle = self._source.open(file)
         try:
-            at = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            for i, part in enumerate(parts):
-                kind = os.O_DIRECTORY if folder or i < len(parts) - 1 else os.O_NONBLOCK  # never wait for a pipe
-                above, at = at, os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | kind, dir_fd=at)
-                os.close(above)
+            self._compare_size(file, handle.size)
+        except BaseException:
+            handle.close()
+            raise
+        return handle
+
+    @contextlib.contextmanager
+    def _said(self, file: str) -> Iterator[None]:
+        """Turn what the system says of a file into a sentence; a symbolic link anywhere below the root is refused."""
+        try:
+            yield
+        except NotAFile:
+            raise self._refuse(file, "this is not a file") from None
+        except FileNotFoundError:
+            raise _Missing(self._refuse(file, "this file is missing")) from None
         except OSError as error:
-            if at >= 0:
-                os.close(at)
-            if error.errno == errno.ENOENT:
-                raise _Missing(self._refuse(file, "this file is missing")) from None
             if error.errno in (errno.ELOOP, errno.ENOTDIR):
                 raise self._refuse(file, "a symbolic link, or a file in place of a folder, is in the way") from None
             if error.errno == errno.ENXIO:
                 raise self._refuse(file, "this is not a file") from None
             raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
-        if not folder:
-            try:
-                self._compare_file(file, os.fstat(at))
-            except BaseException:
-                os.close(at)
-                raise
-        return at
 
-    def _compare_file(self, file: str, status: os.stat_result) -> None:
-        if not stat.S_ISREG(status.st_mode):
-            raise self._refuse(file, "this is not a file")
+    def _compare_size(self, file: str, size: int) -> None:
         if self._expected is not None and self._expected.files is not None:
             known = self._expected.files.get(file)
             if known is None:
                 raise self._refuse(file, "this file does not belong here")
-            if status.st_size != known["bytes"]:
-                raise self._refuse(file, f"this file has {status.st_size} bytes, and it had {known['bytes']}")
+            if size != known["bytes"]:
+                raise self._refuse(file, f"this file has {size} bytes, and it had {known['bytes']}")
 
     def _tail(self, file: str, size: int) -> tuple[bytes, int]:
         """The last `size` bytes of a file (fewer where it is smaller), and its length."""
         handle = self._open(file)
         try:
-            length = os.fstat(handle).st_size
-            return os.pread(handle, size, max(0, length - size)), length
-        except OSError as error:
-            raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
+            with self._said(file):
+                return handle.read(max(0, handle.size - size), size), handle.size
         finally:
-            os.close(handle)
+            handle.close()
 
     # Zarr
     def _document(self, file: str) -> dict[str, Any]:
@@ -848,12 +852,9 @@ class ShardReader:
 
     def _walk_zarr(self, below: str = "", depth: int = 0) -> Iterator[str]:
         """The names of the arrays: folders with a `zarr.json` that hold no other folder."""
-        handle = self._open(f"{self._place}/{below}".rstrip("/"), folder=True)
-        try:
-            with os.scandir(handle) as entries:
-                folders = sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
-        finally:
-            os.close(handle)
+        place = f"{self._place}/{below}".rstrip("/")
+        with self._said(place):
+            folders = self._source.folders(place)
         if below and not folders:
             yield below
         for name in folders:
@@ -893,14 +894,7 @@ class ShardReader:
     def _zarr_places(self, file: str, count: int) -> list[tuple[int, int]]:
         """The table at the end of an array's file: the chunks must follow each other without a gap."""
         size = 16 * count + 4
-        handle = self._open(file)
-        try:
-            length = os.fstat(handle).st_size
-            table = os.pread(handle, size, length - size) if length >= size else b""
-        except OSError as error:
-            raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
-        finally:
-            os.close(handle)
+        table, length = self._tail(file, size)
         if len(table) != size or _crc32c(table[:-4]) != table[-4:]:
             raise self._refuse(file, "its table of chunks is damaged")
         places = np.frombuffer(table[:-4], "<u8").reshape(count, 2)
@@ -914,10 +908,12 @@ class ShardReader:
         """Read every description in the file, and where each chunk lies in it; HDF5 decodes no data."""
         import h5py
 
-        os.close(self._open(self._place))  # refuses links, and what would keep HDF5 waiting
+        handle = self._open(self._place)  # refuses links, and what would keep HDF5 waiting
         arrays: dict[str, _Array] = {}
         try:
-            with h5py.File(self.root / self._place, "r", locking=False) as file:
+            # of this machine by HDF5 itself, which is faster
+            where = self.root / self._place if isinstance(self.root, Path) else Reading(handle)
+            with h5py.File(where, "r", locking=False) as file:
                 if file.userblock_size:
                     raise _Damaged("it does not begin at its beginning")
                 attributes = _get_attributes(file)
@@ -927,6 +923,8 @@ class ShardReader:
             raise self._refuse(self._place, str(error)) from None
         except (OSError, RuntimeError, KeyError, OverflowError, ValueError, TypeError, MemoryError) as error:
             raise self._refuse(self._place, f"HDF5 cannot read it ({error})") from None
+        finally:
+            handle.close()
         self._compare("", attributes)
         for name, array in arrays.items():
             self._compare(name, array.attributes, array)

@@ -9,7 +9,7 @@ import re
 import shutil
 import stat
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from .experiment import Experiment
 from .factory import Progress
 from .identity import POSITIONS, held, identity
 from .images import Images
+from .sources import Local, Source, Unreadable
 from .tiles import of_facts
 from .workers import Executor, executor
 
@@ -33,47 +34,59 @@ _PIECE = 1 << 22
 
 @dataclass(frozen=True)
 class Damage:
-    """Files that are not as the manifest says, relative to the dataset's folder; files: how many were read."""
+    """Files that are not as the manifest says, relative to the dataset's folder.
+
+    files: how many were read; bytes: of them, the manifest included. At an address no file is known to be extra, as
+    a server does not say what it holds.
+    """
 
     changed: tuple[str, ...]
     missing: tuple[str, ...]
     extra: tuple[str, ...]
     files: int
+    bytes: int = 0
 
     def __bool__(self) -> bool:
         return bool(self.changed or self.missing or self.extra)
 
 
-def verify(root: Path, progress: Progress = Progress()) -> Damage:  # noqa: B008
-    """Read every byte of a dataset. Raises InputError where the folder never was a dataset.
+def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # noqa: B008
+    """Read every byte of a dataset: a folder, or the source that a zip or an address is (`dataset.at`).
 
-    What a damaged manifest says of other files is not to be trusted: then it alone is named (and a lost config).
+    Raises InputError where it never was a dataset, or cannot be reached. What a damaged manifest says of other files is
+    not to be trusted: then it alone is named (and a lost config).
     """
-    manifest = _manifest(root)
+    manifest = _manifest(root) if isinstance(root, Path) else dataset.intact_manifest(root)
     if manifest is None:
+        assert isinstance(root, Path)
         lost = tuple(name for name in (CONFIG, MANIFEST) if not os.path.lexists(root / name))
         return Damage((MANIFEST,) if MANIFEST not in lost else (), lost, (), 0)
     listed: dict[str, dict[str, Any]] = manifest["files"]
-    found = set(_walk(root))
+    source = Local(root) if isinstance(root, Path) else root
+    told = source.names()
+    found = set(listed) if told is None else told
     present = sorted(found & set(listed))
-    changed = []
+    changed, missing = [], sorted(set(listed) - found)
     progress.start("reading", sum(int(listed[name]["bytes"]) for name in present), 0)
     started, read = time.monotonic(), 0
     with ThreadPoolExecutor(max_workers=2) as pool:
-        for name, same in zip(present, pool.map(lambda n: _same(root / n, listed[n]), present), strict=True):
-            read += int(listed[name]["bytes"])
+        for name, size in zip(present, pool.map(lambda n: _size(source, n, listed[n]), present), strict=True):
+            read += max(0, size)
             rate = read / 1e6 / (time.monotonic() - started)
             progress.advance(int(listed[name]["bytes"]), f"{rate:,.0f} MB/s")
-            if not same:
+            if size == _ABSENT:
+                missing.append(name)
+            elif size == _OTHER:
                 changed.append(name)
     progress.stop()
-    missing = sorted(set(listed) - found)
     if not changed and not missing and not _adds_up(root, manifest):
         changed.append(MANIFEST)
-    return Damage(tuple(changed), tuple(missing), tuple(sorted(found - set(listed) - {MANIFEST})), len(present) + 1)
+    read += len(dataset.canonical(manifest))
+    extra = sorted(found - set(listed) - {MANIFEST})
+    return Damage(tuple(changed), tuple(sorted(missing)), tuple(extra), len(present) + 1, read)
 
 
-def _adds_up(root: Path, manifest: Mapping[str, Any]) -> bool:
+def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
     """Are the manifest's statistics those that its shards, which are as they were made, say of themselves?"""
     config, levels = manifest["config"], [level["text"] for level in manifest["levels"]]
     like, shards, files = dataset.Likeness.of(manifest), dataset.shards_in(manifest), manifest["files"]
@@ -103,13 +116,26 @@ def _was_dataset(root: Path) -> bool:
     return any(folder.is_dir() for folder in data)
 
 
-def _walk(root: Path) -> Iterator[str]:
-    for folder, folders, files in os.walk(root):
-        for name in files + [f for f in folders if os.path.islink(os.path.join(folder, f))]:
-            yield os.path.relpath(os.path.join(folder, name), root).replace(os.sep, "/")
+_OTHER, _ABSENT = -1, -2
 
 
-def _same(path: Path, listed: Mapping[str, Any]) -> bool:
+def _size(source: Source, name: str, listed: Mapping[str, Any]) -> int:
+    """The bytes of a file that is as it was made; _OTHER, _ABSENT. Raises InputError where it cannot be reached."""
+    digest, size = hashlib.sha256(), 0
+    try:
+        for piece in source.whole(name):
+            digest.update(piece)
+            size += len(piece)
+            if size > listed["bytes"]:
+                return _OTHER
+    except FileNotFoundError:
+        return _ABSENT
+    except (OSError, Unreadable):
+        return _OTHER
+    return size if size == listed["bytes"] and digest.hexdigest() == listed["sha256"] else _OTHER
+
+
+def is_as_listed(path: Path, listed: Mapping[str, Any]) -> bool:
     digest = hashlib.sha256()
     try:
         # a link is not the file, wherever it leads
@@ -317,7 +343,7 @@ def _remake(
             if manifest is not None and manifest["files"].get(name) != facts:
                 raise golden.other_bytes(root / name, golden.maker(manifest))
             did.extend(_clear_way(root, name))
-            if not _same(root / name, facts):
+            if not is_as_listed(root / name, facts):
                 os.replace(apart / name, root / name)
                 did.append(f"made again: {name}")
         remade[path] = files

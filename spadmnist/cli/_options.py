@@ -45,6 +45,16 @@ class Place(click.Path):
         return place
 
 
+class Readable(click.Path):
+    """A dataset to read from: a path, or an address as it stands."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if "://" in str(value) else super().convert(value, param, ctx)
+
+
 def jobs(command: F) -> F:
     """`--jobs N`."""
     return click.option(

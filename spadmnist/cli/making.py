@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from ..errors import SpadError
 from ..foreign import quoted
 from ..workers import processors
 from . import _options as options
@@ -16,6 +17,7 @@ from ._group import cli
 
 if TYPE_CHECKING:
     from ..sensor import Sensor
+    from ..verify import Damage
 
 
 @cli.verb(10, short_help="Make the dataset of a config.")
@@ -181,7 +183,6 @@ def init(
     spadmnist init configs --examples
     """
     from .. import starting
-    from ..errors import SpadError
 
     if measurement and images is not None:
         raise SpadError("--images: belongs to a config, and a plan of captures has none; leave it or --measurement out")
@@ -258,7 +259,6 @@ def reconstruct_(
     """
     from .. import factory, measurement, report
     from .. import reconstruct as library
-    from ..errors import SpadError
 
     options.load_plugins(plugin_files)
     for name in methods:
@@ -320,7 +320,7 @@ def _reconstruct_measurement(
 
 
 @cli.verb(70, short_help="Compare every byte with the manifest; repair.")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=options.Readable(), metavar="DATASET")
 @click.option("--repair", is_flag=True, help="Make the damaged files again.")
 @click.option(
     "--images-dir",
@@ -334,7 +334,7 @@ def _reconstruct_measurement(
 @options.plugin
 @options.as_json
 def verify(
-    dataset: Path,
+    dataset: Path | str,
     repair: bool,
     images_dir: Path | None,
     jobs: int | None,
@@ -345,25 +345,45 @@ def verify(
 ) -> None:
     """Compare every byte of DATASET with its manifest, and name each file that is changed, missing or extra.
 
+    DATASET is a folder, a zip of it, or its address (https://, http://, s3://).
     Exit status: 0 the dataset is intact, 1 damage was found and not repaired.
+
+    \b
+    spadmnist verify out --repair
+    spadmnist verify https://example.org/digits
     """
+    from .. import dataset as datasets
     from .. import verify as library
 
     options.load_plugins(plugin_files)
+    root = datasets.at(dataset)
+    if not isinstance(root, Path):
+        if repair:
+            raise SpadError(f"--repair: {dataset} is no folder of this machine; repair the folder that it came from")
+        with terminal.progress() as progress:
+            damage = library.verify(root, progress)
+        _say_damage(str(root), damage, damage, [], "bring or make it again", as_json)
+        return
     with options.workers_of(jobs, cluster, no_shared) as workers, terminal.progress() as progress:
-        damage = library.verify(dataset, progress)
+        damage = library.verify(root, progress)
         left, did = damage, []
         if repair:
-            did = library.repair(dataset, damage, workers, images_dir, progress)
-            left = library.verify(dataset, progress) if damage else damage
+            did = library.repair(root, damage, workers, images_dir, progress)
+            left = library.verify(root, progress) if damage else damage
+    _say_damage(str(root), damage, left, did, f"spadmnist verify {quoted(root)} --repair makes them again", as_json)
+
+
+def _say_damage(dataset: str, damage: Damage, left: Damage, did: list[str], advice: str, as_json: bool) -> None:
+    """damage: what was found; left: what is there after `did`. Exits with 1 where something is left."""
     if as_json:
         found = {
             "changed": damage.changed,
             "missing": damage.missing,
             "extra": damage.extra,
             "files": damage.files,
+            "bytes": damage.bytes,
         }
-        terminal.print_json({"dataset": str(dataset), **found, "repaired": did, "intact": not left})
+        terminal.print_json({"dataset": dataset, **found, "repaired": did, "intact": not left})
     else:
         for kind in ("changed", "missing", "extra"):
             for name in getattr(damage, kind):
@@ -371,16 +391,16 @@ def verify(
         for line in did:
             terminal.print_line(line)
         if not damage:
-            terminal.print_line(f"{dataset}: all {damage.files} files are as they were made")
+            read = f"{damage.bytes:,} bytes were read"
+            terminal.print_line(f"{dataset}: all {damage.files} files are as they were made; {read}")
         elif not left:
             terminal.print_line(f"{dataset}: repaired; all {left.files} files are as they were made")
         else:
-            again = f"spadmnist verify {quoted(dataset)} --repair makes them again"
-            terminal.print_line(f"{dataset}: {_count(damage)} not as made; {again}")
+            terminal.print_line(f"{dataset}: {_count(damage)} not as made; {advice}")
     if left:
         sys.exit(1)
 
 
-def _count(damage: Any) -> str:
+def _count(damage: Damage) -> str:
     n = len(damage.changed) + len(damage.missing) + len(damage.extra)
     return f"{n} file is" if n == 1 else f"{n} files are"
