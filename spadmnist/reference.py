@@ -16,6 +16,7 @@ from .readout import READOUTS
 from .reconstruct import Method
 from .recording import MODALITIES
 from .statistics import Statistic
+from .statistics.checks import Check
 
 _WIDTH = 100
 
@@ -89,26 +90,36 @@ def method_page(name: str) -> str:
 
 
 def statistic_list() -> str:
-    """Every statistic: name, modalities, unit, first line of its docstring; TR first."""
-    known: list[type[Statistic]] = [Statistic.registry.find(name) for name in Statistic.registry]
-    known.sort(key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
-    rows = [(cls.name, " ".join(cls.modalities), cls.unit, cls.summary()) for cls in known]
+    """Every statistic and check: name, modalities, unit, first line of its docstring; TR first."""
+    rows = [(cls.name, " ".join(cls.modalities), cls.unit, cls.summary()) for cls in all_statistics()]
     return listing(("statistic", "modality", "unit", "what it measures"), rows)
 
 
+def all_statistics() -> list[type[Statistic] | type[Check]]:
+    """The statistics, and the checks of a comparison that are none; TR first."""
+    known = [registry.find(name) for registry in (Statistic.registry, Check.registry) for name in registry]
+    return sorted(known, key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
+
+
 def statistic_page(name: str) -> str:
-    """All about one statistic. Raises KeyError with a sentence where there is none."""
-    cls: type[Statistic] = Statistic.registry.find(name)
+    """All about one statistic or check. Raises KeyError with a sentence where there is none."""
+    cls: type[Statistic] | type[Check] = _found("statistic", name)
     light = ["uniform light only, not scenes"] if cls.flat else []
     return _page(cls, [f"modality: {', '.join(cls.modalities)}", f"unit: {cls.unit}", *light], [])
 
 
-# kind of plug-in -> its registry, the list of all, the page of one
-_KINDS: dict[str, tuple[Registry, Callable[[], str], Callable[[str], str]]] = {
-    "effect": (Effect.registry, effect_list, effect_page),
-    "method": (Method.registry, method_list, method_page),
-    "statistic": (Statistic.registry, statistic_list, statistic_page),
+# kind of plug-in -> its registries, the list of all, the page of one
+_KINDS: dict[str, tuple[tuple[Registry, ...], Callable[[], str], Callable[[str], str]]] = {
+    "effect": ((Effect.registry,), effect_list, effect_page),
+    "method": ((Method.registry,), method_list, method_page),
+    "statistic": ((Statistic.registry, Check.registry), statistic_list, statistic_page),
 }
+
+
+def _found(kind: str, name: str) -> type[Any]:
+    """The class of that name. Raises KeyError with a sentence, that of the first registry, where there is none."""
+    first, *others = _KINDS[kind][0]
+    return next((registry.find(name) for registry in others if name in registry), None) or first.find(name)
 
 
 def text(kind: str, name: str | None = None) -> str:
@@ -125,15 +136,16 @@ def as_data(kind: str, name: str | None = None) -> list[dict[str, Any]] | dict[s
 
     Raises KeyError with a sentence where there is none.
     """
-    registry = _KINDS[kind][0]
-    return _data(registry.find(name)) if name else [_data(registry.find(known)) for known in registry]
+    if name:
+        return _data(_found(kind, name))
+    return [_data(registry.find(known)) for registry in _KINDS[kind][0] for known in registry]
 
 
 def _data(cls: type[Plugin]) -> dict[str, Any]:
     out: dict[str, Any] = {"name": cls.name, "about": inspect.getdoc(cls)}
     if issubclass(cls, Effect):
         out |= {"stage": cls.stage, "expected_rate": mean_law(cls) or None}
-    if issubclass(cls, Statistic):
+    if issubclass(cls, Statistic | Check):
         out |= {"modalities": list(cls.modalities), "unit": cls.unit}
     if issubclass(cls, Method):
         out |= {"readouts": list(cls.readouts()), "unit": cls.unit, "normalised": cls.normalised}
@@ -155,11 +167,11 @@ def _page(
 
 
 def docstring(cls: type[Plugin]) -> list[str]:
-    """Its paragraphs, filled anew; a law, what it shows and a source begin a line of their own."""
+    """Its paragraphs, filled anew; a law, when it fails, what it shows and a source begin a line of their own."""
     out: list[str] = []
     for number, paragraph in enumerate((inspect.getdoc(cls) or "").split("\n\n")):
         out += [""] if number else []
-        for part in re.split(r"\s(?=(?:Law|Shows|Source): )", paragraph):
+        for part in re.split(r"\s(?=(?:Law|Fails|Shows|Source): )", paragraph):
             out += textwrap.wrap(" ".join(part.split()), _WIDTH)
     return out
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
 from collections.abc import Mapping
@@ -14,7 +15,8 @@ import numpy as np
 from . import config, disk, document, units
 from .effects import Effect
 from .errors import InputError, SpadError
-from .plugins import ByWavelength, Distribution, MapFile, Parameter
+from .foreign import quoted, visible
+from .plugins import ByWavelength, Distribution, MapFile, Parameter, is_from_file, source_file
 from .positions import positions_text
 from .sensor import Sensor
 from .window import Window
@@ -24,6 +26,7 @@ Notes = Mapping[Key, str]
 
 # The first line of every file that is written here: without it, a file is the user's own.
 _OURS = "# Written by spadmnist, which writes it anew when asked to; without this line it is left alone."
+_ITS_EFFECT = "# Its effect"  # begins a line about a plug-in, behind the first line
 
 
 def check_place(source: Path, out: Path, ours: bool = False) -> None:
@@ -105,7 +108,7 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = Fal
         disk.put_file(out.parent / file, held.getvalue())
     if at.positions is not None:
         disk.put_file(out.parent / layout["positions"], positions_text(at.positions).encode())
-    disk.put_file(out, _headed(text).encode())
+    disk.put_file(out, _headed(text, out).encode())
     config.read_sensor(out)
     return out
 
@@ -166,12 +169,12 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
             written[effect, parameter] = _number(declared, value)
     text = _moved_files(text, source.parent, out.parent)
     try:
-        new = _headed(_edited(text, written, notes))
+        new = _headed(_edited(text, written, notes), out)
         disk.put_file(out, new.encode())
         config.read_sensor(out)
     except (SpadError, ValueError):
         # a file written in another way: its contents, without its comments
-        disk.put_file(out, _headed(_dumped(text, written)).encode())
+        disk.put_file(out, _headed(_dumped(text, written), out).encode())
         try:
             config.read_sensor(out)
         except SpadError:
@@ -184,8 +187,29 @@ def _number(declared: Parameter, value: float) -> str:
     return units.show(float(value), declared.unit, 6) if declared.unit else f"{float(value):.6g}"
 
 
-def _headed(text: str) -> str:
-    return text if text.startswith(_OURS) else f"{_OURS}\n{text}"
+def _headed(text: str, out: Path) -> str:
+    """The text with the first line of such files, and a comment for each effect that comes from a plug-in."""
+    lines = text.splitlines()
+    if lines[:1] == [_OURS]:  # with the comments of an earlier file
+        lines = list(itertools.dropwhile(lambda line: line.startswith(_ITS_EFFECT), lines[1:]))
+    read = document.parse(text, str(out)).value
+    names = read.get("sensor", read).get("effects") or {}
+    own = {name: place for name in names if (place := _own_file(Effect.registry.find(name))) is not None}
+    files = " ".join(f"--plugin {quoted(file)}" for file in dict.fromkeys(file for file, _ in own.values()))
+    command = f"spadmnist compare {quoted(out)} MEASUREMENT {files}"
+    needs = [f"{_ITS_EFFECT} {name} {where}. The command with it: {command}" for name, (_, where) in own.items()]
+    return "\n".join([_OURS, *needs, *lines]) + "\n"
+
+
+def _own_file(cls: type[Effect]) -> tuple[str, str] | None:
+    """(the plug-in file of an effect, where the effect is in words); None for one that is there without `--plugin`."""
+    if is_from_file(cls):
+        file = Path(source_file(cls))
+        shown = str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file)
+        return shown, f"is in the plug-in {visible(shown)}"
+    if cls.__module__ == "__main__":
+        return f"{cls.name}.py", f"was defined in no file: put its class into one, {cls.name}.py"
+    return None
 
 
 def _moved_files(text: str, before: Path, after: Path) -> str:

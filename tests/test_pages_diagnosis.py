@@ -23,6 +23,7 @@ from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.results import Diagnosis, Step, Trace, Value, table
 from spadmnist.pages import _diagnosis, _figures
 from spadmnist.statistics import Statistic, Summary
+from spadmnist.statistics.checks import Check
 
 SECTIONS = (
     "What is missing",
@@ -220,7 +221,7 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
             "12 pixels within 1 ns: 31 clusters, 0 expected multiplicity of dark "
             + Statistic.registry.find("multiplicity").summary()
             + " also in spacing of dark, flat 40.1 sigma",
-            "all pixels rate of all captures The detections of the whole capture. 6.5 sigma",
+            f"all pixels rate of all captures {Check.registry.find('rate').summary()} 6.5 sigma",
         ),
         "What to measure next": ("To separate one from two: take dark, 100 s", "differ by 1.3 sigma now", "9.0 sigma"),
         "What is not there": (

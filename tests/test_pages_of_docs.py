@@ -18,6 +18,7 @@ from spadmnist.effects import Effect
 from spadmnist.plugins import parameter
 from spadmnist.reconstruct import Method
 from spadmnist.statistics import Statistic
+from spadmnist.statistics.checks import Check
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 
@@ -172,9 +173,9 @@ def test_every_statistic_of_the_contract_can_be_drawn() -> None:
 
 def test_every_statistic_says_its_law_and_what_it_shows() -> None:
     page = reference.statistics()
-    for name in Statistic.registry:
+    for name in (*Statistic.registry, *Check.registry):
         text = section(page, name)
-        for word in ("Law", "Shows"):
+        for word in ("Law", "Shows", *(["Fails"] if name in Check.registry else [])):
             assert f"\n**{word}.** " in text, f"{name} does not say: {word}"
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from spadmnist import config, document, plugins, reference
 from spadmnist.effects import STAGES, Effect
+from spadmnist.inference import comparison
+from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
 from spadmnist.reconstruct import Method
+from spadmnist.statistics.checks import Check
 
 EFFECTS = list(Effect.registry)
 METHODS = list(Method.registry)
@@ -192,6 +197,23 @@ def test_a_method_page_says_everything_in_a_terminal(name: str) -> None:
 def test_every_method_is_listed() -> None:
     lines = [line for line in reference.method_list().splitlines()[1:] if not line.startswith(" ")]
     assert sorted(line.split()[0] for line in lines) == METHODS
+
+
+def test_every_name_that_a_comparison_gives_a_check_is_explained() -> None:
+    """The names are read off the code that makes the checks; the shares of false alarms are those that it takes."""
+    names = set(re.findall(r'Check\(\s*"(\w+)"', inspect.getsource(comparison))) | set(SHARES)
+    assert names == set(Check.registry)
+    listed = reference.statistic_list()
+    for name in names:
+        page = reference.statistic_page(name)
+        words = " ".join(page.split())
+        assert page.startswith(f"{name}\nmodality: ") and f"\n{name} " in listed
+        share = SHARES.get(name, SHARE_OF_STATISTICS)
+        assert f"{share:.0%}".replace("%", " %") in words and f"fails {FALSE_ALARM:.0%}".replace("%", " %") in words
+        for begun in ("Law: ", "Fails: ", "Shows: ", "Source: "):
+            assert f"\n{begun}" in page, begun
+        assert all(len(line) <= 100 for line in page.splitlines())
+        assert reference.as_data("statistic", name)["about"] == inspect.getdoc(Check.registry.find(name))  # type: ignore[call-overload]
 
 
 def test_an_unknown_name_gets_a_suggestion() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from spadmnist import cli, config, measurement, sensor_file
+from spadmnist import cli, config, measurement, plugins, sensor_file
 from spadmnist.errors import InputError, SpadError
 from spadmnist.inference import model_selection
 from spadmnist.inference.results import Diagnosis
@@ -106,18 +106,64 @@ def test_what_cannot_be_read_again_is_not_left_there(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+# --- plug-ins -------------------------------------------------------------------------------------------------------
+
+ECHO = '''
+from spadmnist.effects import Effect, parameter
+
+class EchoOfTest(Effect, stage="dark"):
+    """Detections without light.
+
+    Source: a test.
+    """
+
+    rate = parameter(1.0, "Hz", "of the echo", bounds=(0, None), off=0.0, search=(1.0, 10.0))
+
+    def apply(self, rate, conditions):
+        return rate + self.rate
+'''
+
+
+def test_a_sensor_file_says_which_plug_in_it_needs_and_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file, out = sensor_in(tmp_path, 2, 2), Path("next", "sensor.yaml")
+    sensor_file.write(file, out, {("crosstalk", "probability"): 0.005}, {})
+    assert "plug-in" not in out.read_text()
+    Path("my echo.py").write_text(ECHO)
+    plugins.load_file("my echo.py")
+    sensor_file.write(file, out, {("echo_of_test", "rate"): 2.0}, {})
+    said = "# Its effect echo_of_test is in the plug-in my echo.py. The command with it: spadmnist compare "
+    command = "next/sensor.yaml MEASUREMENT --plugin 'my echo.py'"
+    assert out.read_text().splitlines()[1] == said + command
+    sensor_file.write(out, Path("third.yaml"), {("crosstalk", "probability"): 0.005}, {})
+    assert Path("third.yaml").read_text().count("# Its effect") == 1
+    assert "compare third.yaml MEASUREMENT" in Path("third.yaml").read_text()
+    saved = sensor_file.save(config.read_sensor(out), Path("saved.yaml"))
+    assert saved.read_text().splitlines()[1].endswith("compare saved.yaml MEASUREMENT --plugin 'my echo.py'")
+
+
+def test_the_next_command_names_the_plug_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my echo.py").write_text(ECHO)
+    done = answered(tmp_path, monkeypatch, {("echo_of_test", "rate"): 2.0}, "--plugin", str(tmp_path / "my echo.py"))
+    assert done.exit_code == 0, done.output
+    last = [line for line in done.output.splitlines() if line.startswith("Next: ")]
+    assert f"--plugin '{tmp_path / 'my echo.py'}'" in last[0]
+
+
 # --- the answer stays -----------------------------------------------------------------------------------------------
 
 
-def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, values: dict[Any, Any]) -> Result:
+def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, values: dict[Any, Any], *options: str) -> Result:
     """`diagnose` on the command line, where these values were found."""
     lists: list[Any] = [[], [], [], [], [], [], []]
-    found = Diagnosis("small", "lab", "adequate", 1.0, 1.0, 1.2, *lists, values=values)
+    found = Diagnosis("small", "lab", "explained" if options else "adequate", 1.0, 1.0, 1.2, *lists, values=values)
     monkeypatch.setattr(model_selection, "diagnose", lambda *_, **__: found)
     monkeypatch.setattr(measurement, "open", lambda path: None)
     (folder / "lab").mkdir()
     asked = ["diagnose", str(sensor_in(folder, 16, 16)), str(folder / "lab"), "-o", str(folder / "next")]
-    return CliRunner().invoke(cli.cli, [*asked, "--json", str(folder / "answer.json")])
+    return CliRunner().invoke(cli.cli, [*asked, *options, "--json", str(folder / "answer.json")])
 
 
 def test_as_many_codes_as_pixels_are_a_next_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,9 +36,9 @@ def paragraphs(doc: str | None) -> list[str]:
         elif lines[0].startswith("|"):
             found.append("\n".join(lines))
         else:
-            for part in re.split(r"\s(?=(?:Law|Shows|Source): )", " ".join(block.split())):
+            for part in re.split(r"\s(?=(?:Law|Fails|Shows|Source): )", " ".join(block.split())):
                 head, colon, rest = part.partition(": ")
-                known = head in ("Law", "Shows", "Source") and colon
+                known = head in ("Law", "Fails", "Shows", "Source") and colon
                 found.append(f"**{head}.** {plain(rest)}" if known else plain(part))
     return [one for one in found if one]
 

@@ -11,8 +11,9 @@ from typing import Any
 import spadmnist
 from spadmnist import schema
 from spadmnist.reconstruct import Method
-from spadmnist.recording import MODALITIES
+from spadmnist.reference import all_statistics
 from spadmnist.statistics import Statistic
+from spadmnist.statistics.checks import Check
 
 from . import formats, keys, verbs
 from . import markdown as md
@@ -43,8 +44,7 @@ def _title(text: str | bytes) -> str:
 
 def statistics() -> str:
     """The page of all statistics: what each is, its law, what it shows, its source."""
-    known: list[type[Statistic]] = [Statistic.registry.find(name) for name in Statistic.registry]
-    known.sort(key=lambda cls: ([MODALITIES.index(m) for m in cls.modalities], cls.name))
+    known = all_statistics()
     rows = [[f"[`{c.name}`](#{c.name})", _modalities(c), c.unit, md.plain(c.summary())] for c in known]
     blocks = [
         "A statistic reduces a capture to numbers, its cells. `compare` sets each cell of the measured capture against "
@@ -58,7 +58,7 @@ def statistics() -> str:
     return md.page("Statistics", *blocks)
 
 
-def _modalities(cls: type[Statistic]) -> str:
+def _modalities(cls: type[Statistic] | type[Check]) -> str:
     return ", ".join(f"`{m}`" for m in cls.modalities)
 
 

@@ -148,6 +148,13 @@ def load_plugins(plugin_files: tuple[Path, ...]) -> None:
         plugins.load_file(file)
 
 
+def again(measurement: Path, plugin_files: tuple[Path, ...]) -> str:
+    """MEASUREMENT and the plug-ins, as the next command names them, quoted for a shell."""
+    from ..foreign import quoted
+
+    return " ".join([quoted(measurement), *(f"--plugin {quoted(file)}" for file in plugin_files)])
+
+
 def model_of(sensor: Path, crop: str | None) -> Sensor:
     """The sensor of a file, or the part of it that `--crop` names."""
     from .. import config, window

@@ -89,7 +89,7 @@ def compare(
         found = comparison.compare(model, data, seed, smallest, workers, progress=told)
         progress.stop()
     _write_answer(json_file, comparison.canonical(found))
-    what = next_step.after_comparison(found, quoted(sensor), quoted(measurement))
+    what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files))
     if output is not None:
         page = pages.comparison(found, output, _source(sensor, measurement, seed, then=what))
         terminal.say(f"Report: {page}")
@@ -172,7 +172,7 @@ def diagnose(
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
     new = quoted(found.file or "next/sensor.yaml")
-    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), new)
+    what = next_step.after_diagnosis(found, quoted(sensor), options.again(measurement, plugin_files), new)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
             source = _source(sensor, measurement, seed, found.file, what)
@@ -227,7 +227,9 @@ def fit(
     found = named_fit.fit_named(model, data, added, freed, mapped, seed, workers, progress=terminal.say)
     _write_next(found, sensor, output, model)
     _write_answer(json_file, results.canonical(found))
-    what = next_step.after_diagnosis(found, quoted(sensor), quoted(measurement), quoted(found.file or output))
+    what = next_step.after_diagnosis(
+        found, quoted(sensor), options.again(measurement, plugin_files), quoted(found.file or output)
+    )
     terminal.print_lines(f"{results.table(found)}\n\nNext: {what}")
     if found.unwritten:
         sys.exit(2)

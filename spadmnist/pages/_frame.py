@@ -17,14 +17,11 @@ from .. import disk, units
 from ..errors import SpadError
 from ..foreign import visible_lines
 from ..statistics import Statistic
+from ..statistics.checks import Check
 
 # kind of page -> its file in the folder
 FILES = {"comparison": "index.html", "diagnosis": "report.html", "experiment": "report.html"}
 
-_TOTALS = {
-    "light": "The light level of all lit captures together, against what the measurement states.",
-    "rate": "The detections of the whole capture.",
-}
 _CERTAIN = 1e-12  # smaller p-values rest on tails that nobody has seen
 _LONGEST = 60_000  # characters of a file that a page holds
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -141,10 +138,10 @@ def _mark(kind: str) -> str:
 
 def title_of(statistic: str) -> str:
     """What a statistic looks at: the first line of its docstring."""
-    try:
-        return str(Statistic.registry.find(statistic).summary())
-    except KeyError:  # the plug-in of a stored comparison may not be at hand
-        return _TOTALS.get(statistic, statistic)
+    for registry in (Check.registry, Statistic.registry):
+        if statistic in registry:
+            return str(registry.find(statistic).summary())
+    return statistic  # the plug-in of a stored comparison may not be at hand
 
 
 def number(value: float) -> str:
