@@ -13,6 +13,7 @@ import logging
 import os
 import shutil
 import stat
+import sys
 import tempfile
 import threading
 import time
@@ -21,9 +22,32 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
-import numba
-from numba.core import event
-from numba.misc.appdirs import user_cache_dir
+
+@contextlib.contextmanager
+def _without(module: str) -> Iterator[None]:
+    """Let an optional import of a module fail in here, unless it was imported before."""
+    absent = module not in sys.modules
+    if absent:
+        sys.modules[module] = cast(Any, None)
+    try:
+        yield
+    finally:
+        if absent:
+            del sys.modules[module]
+
+
+# numba asks as it is imported whether there is a BLAS, which takes 0.3 s of every process, and which no kernel here
+# calls. What calls it is compiled as before: numba then asks again.
+with _without("scipy.linalg"):
+    import numba
+    import numba.np.arraymath
+    from numba import types
+    from numba.core import event
+    from numba.extending import intrinsic
+    from numba.misc.appdirs import user_cache_dir
+numba.np.arraymath._HAVE_BLAS = True
+
+__all__ = ["compiling", "folder", "for_workers", "intrinsic", "kernel", "types"]
 
 WORKERS = "SPADMNIST_KERNELS"  # tells workers the place that their parent has found; empty: none
 

@@ -138,10 +138,18 @@ def another(path: Path, head: bytes, wanted: str, inside_gzip: bool = False) -> 
 
 def idx_sha256(array: np.ndarray) -> str:
     """SHA-256 of the unpacked IDX file that holds the uint8 array: the format leaves no freedom."""
-    header = bytes([0, 0, 8, array.ndim]) + b"".join(n.to_bytes(4, "big") for n in array.shape)
-    digest = hashlib.sha256(header)
+    digest = hashlib.sha256(_idx_header(array))
     digest.update(array.data)
     return digest.hexdigest()
+
+
+def idx_bytes(array: np.ndarray) -> bytes:
+    """The unpacked IDX file that holds the uint8 array."""
+    return _idx_header(array) + array.tobytes()
+
+
+def _idx_header(array: np.ndarray) -> bytes:
+    return bytes([0, 0, 8, array.ndim]) + b"".join(n.to_bytes(4, "big") for n in array.shape)
 
 
 def read_image(path: Path, grey_palettes: bool = True, exif: bool = False) -> tuple[np.ndarray, np.ndarray | None]:

@@ -21,13 +21,14 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Any, Literal
 
 import numpy as np
+import platformdirs
 from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
 from . import disk, image_files, tiles
 from .digits import draw_digit
-from .errors import InputError
+from .errors import InputError, SpadError
 from .events import MOST_PIXELS
-from .image_files import another, idx_sha256, read_idx, read_image, read_member, read_npy, reason
+from .image_files import another, idx_bytes, idx_sha256, read_idx, read_image, read_member, read_npy, reason
 from .photos import Making
 from .section import LATER, Section
 from .tiles import Tiles
@@ -44,6 +45,7 @@ MNIST_MIRRORS = (
     "https://storage.googleapis.com/cvdf-datasets/mnist/",
 )
 _MNIST_MAX_BYTES = 64 * 2**20  # no mirror may send more than this for one file
+_GZIP_TAIL = 8  # bytes at the end of a gzip file: CRC-32 and size of what is in it (RFC 1952)
 
 _SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"),
@@ -344,7 +346,7 @@ class Mnist(_Source):
     """MNIST, 60,000 training and 10,000 test images of 28 x 28, byte for byte.
 
     Looked for in --images-dir or, without it, in SPADMNIST_DATA and in the user's cache, and downloaded into
-    the cache once. Every file's SHA-256 is checked.
+    the cache once. A packed file is unpacked into the cache once. Every file's SHA-256 is checked each time.
     """
 
     source: Literal["mnist"] = "mnist"
@@ -363,7 +365,7 @@ class Mnist(_Source):
                 f"{images_dir}: MNIST's {', '.join(missing)} (or with .gz) are missing; put the files there, "
                 "or leave --images-dir out to have them downloaded"
             )
-        arrays = [_checked_mnist(path, name) if path else _cached_mnist(name) for name, path in found.items()]
+        arrays = [_mnist(path, name) if path else _cached_mnist(name) for name, path in found.items()]
         train_images, train_labels, test_images, test_labels = arrays
         return {
             "train": Images(train_images, train_labels, 255.0).head(limit),
@@ -381,6 +383,28 @@ def _find_mnist(name: str, folder: Path) -> Path | None:
     return None
 
 
+def _mnist(path: Path, name: str) -> np.ndarray:
+    """MNIST's file; what is packed is taken unpacked from the user's cache, where it is put the first time.
+
+    The checksum at the end of a packed file names what is in it: another file of the same name is unpacked, and
+    refused. A damaged copy in the cache is made again; without a cache every run unpacks.
+    """
+    kept = None
+    if path.suffix == ".gz":
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _GZIP_TAIL))
+            kept = cache_folder() / "unpacked" / f"{name}-{file.read(4).hex()}"
+        with contextlib.suppress(InputError, OSError):
+            return _checked_mnist(kept, name)
+    array = _checked_mnist(path, name)
+    if kept is not None:
+        with contextlib.suppress(OSError, SpadError):
+            kept.parent.parent.mkdir(parents=True, exist_ok=True)
+            kept.parent.mkdir(mode=0o700, exist_ok=True)
+            disk.commit_file(kept, idx_bytes(array), kept.parent)
+    return array
+
+
 def _checked_mnist(path: Path, name: str) -> np.ndarray:
     array = read_idx(path, 3 if "images" in name else 1)
     digest = idx_sha256(array)
@@ -394,7 +418,7 @@ def _checked_mnist(path: Path, name: str) -> np.ndarray:
 
 def cache_folder() -> Path:
     """Where the program keeps what it can make or fetch again: `$SPADMNIST_CACHE`, or the system's place for it."""
-    return Path(os.environ.get("SPADMNIST_CACHE") or _pooch().os_cache("spadmnist"))
+    return Path(os.environ.get("SPADMNIST_CACHE") or platformdirs.user_cache_dir("spadmnist"))
 
 
 def _pooch() -> Any:
@@ -411,7 +435,7 @@ def _cached_mnist(name: str) -> np.ndarray:
     path = cache_folder() / "mnist" / f"{name}.gz"
     if path.is_file():
         with contextlib.suppress(InputError):
-            return _checked_mnist(path, name)
+            return _mnist(path, name)
     return _download_mnist(name, path)
 
 

@@ -19,10 +19,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from .compiled import kernel
+from .compiled import intrinsic, kernel, types
 
 # `error_model="numpy"` drops the check for division by zero, which would keep LLVM from vectorising.
 _jit = kernel(error_model="numpy", nogil=True)

@@ -233,3 +233,17 @@ def test_a_moment_of_compiling_and_what_is_not_kept_need_no_word(
         monkeypatch.setattr(compiled, "_SILENCE", 0.0)
         numba.njit(lambda x: x + 1)(1)
     assert said == []
+
+
+def test_kernels_start_without_linear_algebra_and_leave_it_to_those_who_call_for_it() -> None:
+    code = """if True:
+        import sys
+        import spadmnist.kernels
+        print("scipy.linalg" in sys.modules)
+        import numba, numpy as np
+        print(numba.njit(lambda a: a.dot(a))(np.array([3.0, 4.0])), "scipy.linalg" in sys.modules)
+        from numba.np import arraymath
+        print(arraymath._HAVE_BLAS)
+    """
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.split() == ["False", "25.0", "True", "True"]

@@ -10,7 +10,10 @@ import http.server
 import io
 import lzma
 import math
+import os
 import struct
+import subprocess
+import sys
 import threading
 import time
 import zipfile
@@ -58,7 +61,8 @@ needs_mnist = pytest.mark.skipif(
 def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No test sees the user's data or cache, or the network."""
     monkeypatch.delenv("SPADMNIST_DATA", raising=False)
-    monkeypatch.setattr("pooch.os_cache", lambda project: tmp_path / "cache" / project)
+    monkeypatch.delenv("SPADMNIST_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda project: str(tmp_path / "cache" / project))
     monkeypatch.setattr(module, "MNIST_MIRRORS", ("http://127.0.0.1:9/a/", "http://127.0.0.1:9/b/"))
 
 
@@ -378,6 +382,46 @@ def test_missing_files_of_a_given_folder_are_not_downloaded(tiny: dict[str, byte
         *(tmp_path / "d", "t10k-labels-idx1-ubyte", "train-labels-idx1-ubyte", "leave --images-dir out"),
     )
     assert "train-images" not in message and not (tmp_path / "cache").exists()
+
+
+def test_what_is_packed_is_unpacked_once(
+    tiny: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(tiny, tmp_path / "d", lambda name: f"{name}.gz", pack=True)
+    first = Mnist().load(SHAPE, tmp_path / "d")
+    kept = tmp_path / "cache" / "spadmnist" / "unpacked"
+    assert kept.stat().st_mode & 0o777 == 0o700
+    assert sorted(path.read_bytes() for path in kept.iterdir()) == sorted(tiny.values())
+    read: list[str] = []
+    monkeypatch.setattr(module, "read_idx", lambda path, ndim: [read.append(path.suffix), read_idx(path, ndim)][1])
+    assert Mnist().load(SHAPE, tmp_path / "d")["train"].sha256 == first["train"].sha256
+    assert read == [""] * 4
+
+    # a damaged copy is made again
+    damaged = next(kept.glob("train-images*"))
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
+    assert Mnist().load(SHAPE, tmp_path / "d")["train"].sha256 == first["train"].sha256
+    assert damaged.read_bytes() == tiny["train-images-idx3-ubyte"]
+
+    # another file of the same name is no MNIST, whatever is kept
+    path = tmp_path / "d" / "train-images-idx3-ubyte.gz"
+    path.write_bytes(gzip.compress(idx(PIXELS[::-1].copy())))
+    refused(lambda: Mnist().load(SHAPE, tmp_path / "d"), path, "source: idx")
+
+
+def test_without_a_cache_what_is_packed_is_read_all_the_same(tiny: dict[str, bytes], tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("not a folder")
+    put(tiny, tmp_path / "d", lambda name: f"{name}.gz", pack=True)
+    assert len(Mnist().load(SHAPE, tmp_path / "d")["train"]) == 3
+
+
+@needs_mnist
+def test_nothing_of_a_download_is_imported_for_files_that_are_there(tmp_path: Path) -> None:
+    code = "import sys; from spadmnist.images import Mnist; Mnist().load((28, 28), limit=1); print(*sys.modules)"
+    environment = {**os.environ, "SPADMNIST_DATA": str(MNIST), "XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop("SPADMNIST_CACHE", None)
+    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert not {"pooch", "requests", "urllib3", "charset_normalizer"} & set(said.stdout.split())
 
 
 def test_another_digest(tiny: dict[str, bytes], tmp_path: Path) -> None:
