@@ -209,6 +209,34 @@ def test_x_and_y_as_channels(tmp_path: Path) -> None:
     assert "2 channels are no 3 x 5 pixels" in refusal(tmp_path / "a.csv", said)
 
 
+# --- one pixel ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "ticks"),
+    [
+        ("time (ps)\n70\n5\n", [5, 70]),
+        ("Arrival Time (ns)\n0.5\n\n7\n", [500, 7000]),
+        ("fine (ps),time (us)\n250,3\n", [3_000_250]),
+        ('"timestamp_ns"\n1\n', [1000]),
+    ],
+)
+def test_times_alone_are_of_one_pixel_and_it_is_said(tmp_path: Path, text: str, ticks: list[int]) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    assert "of one pixel, not of 4 x 1; leave --rows" in refusal(tmp_path / "a.csv", replace(SECOND, rows=4))
+    made = run(tmp_path / "a.csv")
+    assert taken(made) == [(0, n) for n in ticks] and back(made).layout.shape == (1, 1)
+    said = f"{tmp_path / 'a.csv'}: has no column of pixels; all its detections are taken as of one pixel"
+    assert said in made.notes
+
+
+def test_a_time_of_one_pixel_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time (ps)\n5\n-7\n")
+    assert "a.csv:3: the detection at -7 ps is no" in refusal(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("time (ps)\n5\nseven\n")
+    assert "a line is 1250" in refusal(tmp_path / "a.csv")
+
+
 # --- what is refused ----------------------------------------------------------------------------------------------
 
 

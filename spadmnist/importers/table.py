@@ -39,12 +39,18 @@ class _Head:
     y: int | None
     times: tuple[tuple[int, float, str], ...]
 
+    @property
+    def alone(self) -> bool:
+        """Does no column say the pixel? Then there is one."""
+        return self.pixel is None and self.x is None
+
 
 class Table(Format):
     """A table of detections: a line `pixel,time (ps)` (or ns, us, s), then a line for each of them.
 
     The columns may stand in any order, between commas, semicolons (numbers may then have a decimal comma), tabs or
     spaces; `x,y,time (ps)` instead of a pixel's number, with --rows and --columns; `fine (ps)` is added to the time.
+    A table of times alone, `time (ps)`, is of one pixel.
     Times are rounded to ticks of --tick, 1 ps without it.
     """
 
@@ -57,11 +63,13 @@ class Table(Format):
         """Times are read as they are written, and rounded to ticks once: exact below 2^53 of them."""
         tick = said.tick or PICOSECOND
         with _text(path) as file:
-            shape = _shape(_head(file.readline(_LONGEST_LINE), path), said, path)
+            head = _head(file.readline(_LONGEST_LINE), path)
+            shape = _shape(head, said, path)
         facts = {"tick": tick} | ({} if shape is None else {"rows": shape[0], "columns": shape[1]})
         source = "--tick" if said.tick is not None else "a table's times are rounded to it"
         detections = Detections(path, lambda: _detections(path, shape, tick))
-        return Found(facts, detections, sources={"tick": source})
+        notes = ("has no column of pixels; all its detections are taken as of one pixel",) * head.alone
+        return Found(facts, detections, notes=notes, sources={"tick": source})
 
 
 @contextlib.contextmanager
@@ -116,6 +124,8 @@ def _head(text: str, path: Path) -> _Head:
     separator = next((mark for mark in (";", ",", "\t") if mark in line), None)
     cells = line.split(separator) if separator else re.findall(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?", line)
     cells = [cell.strip().strip('"').lower() for cell in cells]
+    if separator is None and _named(line.strip('"').lower())[0] in _TIME:  # one column, `arrival time (ps)`
+        cells = [line.strip('"').lower()]
     shown = f"{line[:60]!r}"
     if cells and all(re.fullmatch(r"[-+.\d,]+(e[-+]?\d+)?", cell) for cell in cells):
         raise InputError(f"{path}:1: {shown} is a line of numbers, and a header is missing; {_HOW}")
@@ -138,7 +148,7 @@ def _head(text: str, path: Path) -> _Head:
         else:
             strange.append(cell)
     coarse = [one for one in times if not one[0]]
-    placed = (pixel is not None) != (x is not None and y is not None) and (x is None) == (y is None)
+    placed = (x is None) == (y is None) and (pixel is None or x is None)
     if strange or len(coarse) != 1 or len(times) > 2 or not placed:
         bare = [cell for cell in strange if cell in _TIME]
         why = f"{bare[0]!r} has no unit" if bare else "is no header"
@@ -157,7 +167,15 @@ def _named(cell: str) -> tuple[str, str]:
 
 
 def _shape(head: _Head, said: Said, path: Path) -> tuple[int, int] | None:
-    """Rows and columns, which x and y need."""
+    """Rows and columns, which x and y need; 1 x 1 where no column says the pixel."""
+    if head.alone:
+        rows, columns = said.rows or 1, said.columns or 1
+        if rows * columns != 1:
+            raise InputError(
+                f"{path}: has no column of pixels, so it is of one pixel, not of {rows} x {columns}; leave --rows and "
+                f"--columns out, or name a pixel in every line: {_HOW}"
+            )
+        return 1, 1
     if head.x is None:
         return None
     if said.rows is None or said.columns is None:
@@ -166,10 +184,12 @@ def _shape(head: _Head, said: Said, path: Path) -> tuple[int, int] | None:
 
 
 def _channels(head: _Head, table: np.ndarray, shape: tuple[int, int] | None) -> tuple[np.ndarray, Any]:
-    """(the pixel of each line, -1 where there is none; how the file names it, by line)."""
+    """(the pixel of each line, 0 in a table of one pixel, -1 where there is none; how the file names it, by line)."""
     if head.pixel is not None:
         number = table[:, head.pixel]
         return number, lambda row: f"{number[row]:g}"
+    if head.alone:
+        return np.zeros(len(table)), lambda row: "the detection"
     assert shape is not None and head.x is not None and head.y is not None
     x, y = table[:, head.x], table[:, head.y]
     inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0]) & (x == np.floor(x)) & (y == np.floor(y))
@@ -203,7 +223,9 @@ def _numbers(lines: Sequence[str], line: int, path: Path, head: _Head) -> np.nda
     try:
         table = np.loadtxt(lines, delimiter=head.separator, ndmin=2, comments=None)
     except ValueError as error:
-        raise InputError(f"{path}: {image_files.reason(error)}, from line {line} on; a line is 3,1250") from None
+        raise InputError(
+            f"{path}: {image_files.reason(error)}, from line {line} on; a line is {'1250' if head.alone else '3,1250'}"
+        ) from None
     if table.shape[1] != head.columns:
         what = "a pixel and a time" if head.columns == 2 else f"{head.columns} numbers, as the first line says"
         raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is {what}")
