@@ -193,9 +193,12 @@ def _record_path(root: Path, shard: Shard) -> Path:
 
 
 def note(root: Path, shard: Shard, files: Files) -> None:
-    """Remember the digests of a shard's files until the manifest lists them, and by what they were made."""
+    """Remember the digests of a shard's files until the manifest lists them, and by what they were made.
+
+    A loss of power may take the note with it; the shard is then made again.
+    """
     record = {"files": files, "made_by": golden.made_by()}
-    disk.commit_file(_record_path(root, shard), dataset.canonical(record), disk.temporary(root))
+    disk.commit_file(_record_path(root, shard), json.dumps(record).encode(), disk.temporary(root), sync=False)
 
 
 # --- the state of a run -------------------------------------------------------------------------------------------

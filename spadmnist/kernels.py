@@ -1622,19 +1622,27 @@ def pack_rows(bits, width, rows):
     bits: (n * rows, ceil(width / 8)) uint8, most significant bit first, padding 0.
     Returns (n, ceil(rows * width / 8)) uint8.
     """
-    n = bits.shape[0] // rows
-    size = (rows * width + 7) // 8
-    out = np.zeros((n, size + 1), np.uint8)  # one more byte, which the last shift may touch
+    n, each = bits.shape[0] // rows, np.uint64(bits.shape[1])
+    size = np.uint64((rows * width + 7) // 8)
+    out = np.zeros((n, size), np.uint8)
     for i in range(n):
+        line = out[i]
         for r in range(rows):
-            for j in range(bits.shape[1]):
-                byte = bits[i * rows + r, j]
-                if byte:
-                    place = r * width + 8 * j
-                    shift = place & 7
-                    out[i, place >> 3] |= byte >> shift
-                    out[i, (place >> 3) + 1] |= (np.uint32(byte) << np.uint32(8 - shift)) & np.uint32(255)
-    return out[:, :size].copy()
+            row = bits[i * rows + r]
+            any_bit = np.uint8(0)
+            for j in range(each):
+                any_bit |= row[j]
+            if not any_bit:
+                continue
+            start = np.uint64(r * width) >> np.uint64(3)
+            right = np.uint8(r * width & 7)
+            left = np.uint8(8 - right)
+            line[start] |= row[0] >> right
+            for j in range(np.uint64(1), each):
+                line[start + j] = (row[j - np.uint64(1)] << left) | (row[j] >> right)
+            if start + each < size:  # behind the end of the line there is padding alone
+                line[start + each] = row[each - np.uint64(1)] << left
+    return out
 
 
 @_jit

@@ -17,6 +17,7 @@ from .plugins import Plugin, Registry
 from .readout import Recorded
 
 _ROWS_AT_ONCE = 1 << 15  # numbers whose arithmetic stays in the processor's cache
+_VALUES_KEPT = 1 << 25  # of 4 bytes: up to so many the median is found without reading them twice
 
 # what a method may ask for (columns of Recorded) -> the readout that it comes from
 COLUMNS = {"counts": "tr", "span": "tr", "ones": "qis", "waited": "str"}
@@ -224,15 +225,21 @@ def median_of_nonzero(chunks: Callable[[], Iterable[np.ndarray]]) -> float | Non
 def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]]) -> dict[str, float | None]:
     """Exact medians of the non-zero values (float32, not negative), in memory that does not grow with their number.
 
-    chunks: gives the values anew at each call, in any order, as arrays by name; it is called twice. Non-negative
-    floats are ordered as their bits are, so the upper and then the lower 16 bits of the two middle values are found
-    by counting. None where every value is zero.
+    chunks: gives the values anew at each call, in any order, as arrays by name; it is called twice where there are more
+    values than are kept. Non-negative floats are ordered as their bits are, so the upper and then the lower 16 bits of
+    the two middle values are found by counting. None where every value is zero.
     """
     upper: dict[str, np.ndarray] = {}
-    for chunk in chunks():
-        for name, values in chunk.items():
+    kept: list[dict[str, np.ndarray]] = []
+    room = _VALUES_KEPT
+    for nonzero in map(_nonzero, chunks()):
+        for name, bits in nonzero.items():
             counted = upper.setdefault(name, np.zeros(1 << 16, np.int64))
-            counted += np.bincount(_bits_of_nonzero(values) >> 16, minlength=1 << 16)
+            counted += np.bincount(bits >> 16, minlength=1 << 16)
+        room -= sum(bits.size for bits in nonzero.values())
+        kept.append(nonzero)
+        if room < 0:
+            kept.clear()
     # for each name the ranks of the two middle values, as (bin of the upper bits, rank within it)
     wanted: dict[str, list[tuple[int, int]]] = {}
     for name, counted in upper.items():
@@ -242,9 +249,8 @@ def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]])
         bins = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
         wanted[name] = [(b, rank - int(running[b] - counted[b])) for b, rank in zip(bins, ranks, strict=True)]
     lower = {(name, b): np.zeros(1 << 16, np.int64) for name, pairs in wanted.items() for b, _ in pairs}
-    for chunk in chunks():
-        for name, values in chunk.items():
-            bits = _bits_of_nonzero(values)
+    for nonzero in kept if room >= 0 else map(_nonzero, chunks()):
+        for name, bits in nonzero.items():
             for b in {b for b, _ in wanted[name]}:
                 lower[name, b] += np.bincount(bits[bits >> 16 == b] & 0xFFFF, minlength=1 << 16)
     medians: dict[str, float | None] = {}
@@ -255,6 +261,10 @@ def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]])
             middle.append(float(np.array([(b << 16) | low], np.uint32).view(np.float32)[0]))
         medians[name] = sum(middle) / len(middle) if middle else None
     return medians
+
+
+def _nonzero(chunk: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: _bits_of_nonzero(values) for name, values in chunk.items()}
 
 
 def _bits_of_nonzero(values: np.ndarray) -> np.ndarray:

@@ -723,3 +723,15 @@ def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> 
     bits = np.full((frames, pixels), 7, np.uint8)
     kernels.bits_first(np.packbits(ones, axis=1), bits)
     assert np.array_equal(bits, ones.T)
+
+
+@pytest.mark.parametrize("width", [1, 3, 8, 9, 63, 64, 100, 104])
+@pytest.mark.parametrize("rows", [1, 2, 28])
+def test_packed_rows_lie_next_to_each_other(width: int, rows: int) -> None:
+    """As numpy packs them, full and empty rows among them; and back."""
+    set_ = np.random.default_rng(width).random((3 * rows, width)) < 0.4
+    set_[::3], set_[1::5] = False, True
+    bits = np.packbits(set_, axis=1)
+    packed = kernels.pack_rows(bits, width, rows)
+    assert np.array_equal(packed, np.packbits(set_.reshape(3, rows * width), axis=1))
+    assert np.array_equal(kernels.unpack_rows(packed, width, rows), bits)

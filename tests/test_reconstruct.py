@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import algorithm1
 import numpy as np
@@ -345,6 +345,23 @@ def test_medians_of_several_images_at_once() -> None:
     }
     chunks = [{name: v[i : i + 500] for name, v in values.items()} for i in range(0, 3001, 500)]
     assert medians_of_nonzero(lambda: iter(chunks)) == {n: _expected_median(v) for n, v in values.items()}
+
+
+@pytest.mark.parametrize(("kept", "times"), [(2500, 1), (2499, 2), (0, 2)])
+def test_values_are_read_twice_only_where_there_are_too_many(
+    kept: int, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconstruct, "_VALUES_KEPT", kept)
+    values = np.random.default_rng(1).lognormal(10, 2, (5, 500)).astype(np.float32)
+    read: list[int] = []
+
+    def chunks() -> Iterator[np.ndarray]:
+        for i, chunk in enumerate(values):
+            read.append(i)
+            yield np.append(chunk, np.float32(0))
+
+    assert median_of_nonzero(chunks) == _expected_median(values.ravel())
+    assert read == [0, 1, 2, 3, 4] * times
 
 
 def test_median_of_nothing() -> None:

@@ -31,7 +31,7 @@ from zarr.core.metadata.v3 import ArrayV3Metadata
 
 from spadmnist import disk, store
 from spadmnist.errors import InputError, SpadError
-from spadmnist.store import Column, ShardReader, append_columns, exists, write_groups, write_shard
+from spadmnist.store import Column, ShardReader, append_columns, exists, location, write_groups, write_shard
 
 FORMATS = ["zarr", "hdf5"]
 IMAGE = ("image", "y", "x")
@@ -672,6 +672,34 @@ def test_other_failures_of_the_disk(tmp_path: Path, code: int, monkeypatch: pyte
     with pytest.raises(SpadError, match=rf"s: cannot write .*{os.strerror(code)}; .* is kept"):
         write_shard(tmp_path, "s", some_columns(), {}, "zarr")
     assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_all_of_a_shard_is_on_the_disk_before_it_is_in_its_place(
+    tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[tuple[str, str]] = []
+    sync, rename = os.fsync, os.rename
+
+    def synced(handle: int) -> None:
+        path = os.readlink(f"/proc/self/fd/{handle}")
+        time.sleep(0.01)
+        sync(handle)
+        done.append(("sync", path))
+
+    def renamed(old: Path, new: Path) -> None:
+        done.append(("rename", str(old)))
+        rename(old, new)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "rename", renamed)
+    write_shard(tmp_path, "s", some_columns(), {}, format)
+    at = next(i for i, (what, _) in enumerate(done) if what == "rename")
+    new = Path(done[at][1])
+    place = tmp_path / location("s", format)
+    there = {str(new / path.relative_to(place)) for path in place.rglob("*")} | {str(new), str(new.parent)}
+    assert there <= {path for what, path in done[:at] if what == "sync"}
+    assert ("sync", str(place.parent)) in done[at:]
 
 
 def test_a_name_that_is_too_long(tmp_path: Path) -> None:
