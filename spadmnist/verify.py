@@ -136,6 +136,7 @@ def _size(source: Source, name: str, listed: Mapping[str, Any]) -> int:
 
 
 def is_as_listed(path: Path, listed: Mapping[str, Any]) -> bool:
+    """Is it the file whose size and SHA-256 a manifest lists?"""
     digest = hashlib.sha256()
     try:
         # a link is not the file, wherever it leads
