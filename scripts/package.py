@@ -1,8 +1,8 @@
-"""Build the sdist, the wheel from it, install it where nothing else is, and run the first commands of the README there.
+"""Build the sdist and the wheel, install the wheel in an empty environment, and run the first commands there.
 
     python scripts/package.py [-o FOLDER]
 
-What it needs beside Python is fetched by pip. The folder holds the two archives afterwards.
+The wheel is built from the sdist. pip fetches the build tool and the dependencies. FOLDER then holds both archives.
 """
 
 from __future__ import annotations

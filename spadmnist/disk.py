@@ -24,7 +24,7 @@ from .errors import InputError, SpadError
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
 _LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
-_SYNCS_AT_ONCE = 4  # files of a shard; with 8 or 32 a shard was not sooner on the disk
+_SYNCS_AT_ONCE = 4  # threads that synchronise the files of a shard; 8 and 32 were no faster
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
 
@@ -300,7 +300,7 @@ def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
 def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
     """Write new files below a folder that is made here, and synchronise all of it.
 
-    Each is synchronised while the next ones are made: the disk works beside the processor.
+    Other threads synchronise a file while the next ones are made, so that the processor does not wait for the disk.
     """
     folders = {folder}
     os.mkdir(folder)

@@ -129,7 +129,7 @@ def _bring(source: Source, part: Path, files: Mapping[str, Mapping[str, Any]], s
 
 def _bring_one(source: Source, part: Path, name: str, facts: Mapping[str, Any], number: str) -> int:
     place, coming = disk.inside(part, name), part / _COMING / number
-    if not verify.is_as_listed(place, facts):
+    if not verify.is_as_listed(part, name, facts):
         digest, size = hashlib.sha256(), 0
         try:
             with open(coming, "wb") as file:

@@ -45,7 +45,7 @@ MNIST_MIRRORS = (
     "https://storage.googleapis.com/cvdf-datasets/mnist/",
 )
 _MNIST_MAX_BYTES = 64 * 2**20  # no mirror may send more than this for one file
-_GZIP_TAIL = 8  # bytes at the end of a gzip file: CRC-32 and size of what is in it (RFC 1952)
+_GZIP_TAIL = 8  # bytes at the end of a gzip file: CRC-32 and size of its content (RFC 1952)
 
 _SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"),

@@ -843,7 +843,7 @@ _OPEN, _LOST, _FIRED = np.uint8(0), np.uint8(1), np.uint8(2)  # what is known of
 
 @_jit
 def _fire_until(times, parents, i, goal, state, blind, needed, extends, before):
-    """Settle a row's candidates from `i` to `goal` (TR), up to the first whose parent is not settled yet.
+    """Decide a row's candidates from `i` to `goal` (TR), up to the first whose parent is not decided yet.
 
     before: when the pixel's blindness began. Returns (where it stopped, before).
     """

@@ -19,7 +19,7 @@ from .validated import brief
 
 _HEADERS = (["x", "y"], ["x(um)", "y(um)"])
 _MOST_POSITIONS = 100_000
-_LARGEST_POSITIONS = 1 << 24  # bytes
+LARGEST_POSITIONS = 1 << 24  # bytes
 _FARTHEST = 1.0  # m
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
 
@@ -29,7 +29,12 @@ def read_positions(path: Path) -> np.ndarray:
 
     Raises InputError with the line.
     """
-    rows = csv.reader(io.StringIO(_text_of(path), newline=""), strict=True)
+    return positions_in(_read(path), str(path))
+
+
+def positions_in(raw: bytes, path: str) -> np.ndarray:
+    """(pixels, 2) m, the positions that such a file holds; path: its name in errors."""
+    rows = csv.reader(io.StringIO(_text_of(raw, path), newline=""), strict=True)
     found: list[tuple[float, float]] = []
     first_of: dict[tuple[int, int], int] = {}
     headed = False
@@ -65,20 +70,23 @@ def read_positions(path: Path) -> np.ndarray:
     return np.array(found)
 
 
-def _text_of(path: Path) -> str:
+def _read(path: Path) -> bytes:
     try:
-        raw = disk.read_file(os.path.realpath(path), _LARGEST_POSITIONS)
+        return disk.read_file(os.path.realpath(path), LARGEST_POSITIONS)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; the positions of the pixels are read from there") from None
     except OSError as error:
         if error.errno == errno.EFBIG:
-            most = f"{_LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_POSITIONS} pixels"
+            most = f"{LARGEST_POSITIONS >> 20} MiB; give at most {_MOST_POSITIONS} pixels"
             raise InputError(f"{path}: is larger than {most}") from None
         if error.errno in (errno.EINVAL, errno.EISDIR):
             raise InputError(f"{path}: is no file; positions is the name of a CSV file") from None
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:
         raise InputError(f"{brief(str(path))} is not the name of a file; positions names a CSV file") from None
+
+
+def _text_of(raw: bytes, path: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:

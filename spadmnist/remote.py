@@ -1,11 +1,11 @@
 """A dataset on a web server or in a bucket, read by HTTP ranges (package obstore, extra `remote`).
 
-**Blocks.** What comes from afar is asked for in blocks of 256 KiB. They are kept in memory, and on disk in the user's
-cache, under the dataset's seal and the place it came from: another server cannot put its bytes there. A block that was
-damaged on disk is asked for again. Where nothing can be written there is no cache, and reading goes on.
+**Blocks.** Files are read in blocks of 256 KiB. Blocks are kept in memory, and on disk in the user's cache. The name of
+a block on disk holds the dataset's seal and the address, so that another server cannot replace it. A damaged block is
+read again from the server. If nothing can be written, there is no cache on disk.
 
-**Trust.** Whether a server gives ranges is told by the status of the first answer. Another size than the manifest's,
-and a redirect to anything but http(s), are refused; what a chunk holds is compared with its checksum by who decodes it.
+**Trust.** The status of the first answer says whether a server gives ranges. A file whose size is not the manifest's is
+refused, and so is a redirect to anything but http(s). The decoder compares each chunk with its checksum.
 """
 
 from __future__ import annotations

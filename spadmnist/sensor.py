@@ -747,7 +747,7 @@ class Sensor:
         """The events with all that they may cause, and the parent of each (empty where there is none to look at).
 
         By the paper's rules every event has its children, whether or not it will be recorded, and they have none. By
-        a device's, children have children; which of them happen is resolved later, when it is known what fires.
+        a device's, children have children; which of them happen is decided later, when it is known what fires.
         """
         cascade = self.rules == "device"
         correlated = self.at("correlated")

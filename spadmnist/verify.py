@@ -7,7 +7,6 @@ import itertools
 import os
 import re
 import shutil
-import stat
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -135,21 +134,9 @@ def _size(source: Source, name: str, listed: Mapping[str, Any]) -> int:
     return size if size == listed["bytes"] and digest.hexdigest() == listed["sha256"] else _OTHER
 
 
-def is_as_listed(path: Path, listed: Mapping[str, Any]) -> bool:
-    """Is it the file whose size and SHA-256 a manifest lists?"""
-    digest = hashlib.sha256()
-    try:
-        # a link is not the file, wherever it leads
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with open(handle, "rb") as file:
-            facts = os.fstat(file.fileno())
-            if not stat.S_ISREG(facts.st_mode) or facts.st_size != listed["bytes"]:
-                return False
-            while piece := file.read(_PIECE):
-                digest.update(piece)
-    except OSError:
-        return False
-    return digest.hexdigest() == listed["sha256"]
+def is_as_listed(root: Path, name: str, listed: Mapping[str, Any]) -> bool:
+    """Is a file below a folder the one whose size and SHA-256 a manifest lists? A link is not, wherever it leads."""
+    return _size(Local(root), name, listed) >= 0
 
 
 # --- repair -------------------------------------------------------------------------------------------------------
@@ -344,7 +331,7 @@ def _remake(
             if manifest is not None and manifest["files"].get(name) != facts:
                 raise golden.other_bytes(root / name, golden.maker(manifest))
             did.extend(_clear_way(root, name))
-            if not is_as_listed(root / name, facts):
+            if not is_as_listed(root, name, facts):
                 os.replace(apart / name, root / name)
                 did.append(f"made again: {name}")
         remade[path] = files

@@ -19,7 +19,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,7 @@ class Block:
     line: int
     language: str
     text: str
+    needs: frozenset[str] = frozenset()  # packages whose names it uses, imported by blocks above it
 
     @property
     def place(self) -> str:
@@ -125,7 +126,7 @@ class Block:
     @property
     def lacking(self) -> str:
         """What it needs and this machine has not, or nothing."""
-        for name in self._imported():
+        for name in sorted(self.needs | set().union(*self.imports.values())):
             if importlib.util.find_spec(name) is None and not (ROOT / "configs" / f"{name}.py").is_file():
                 return f"{name} is not installed"
         if "spad_mnist.yaml" in self.text and not MNIST.is_dir():
@@ -136,14 +137,22 @@ class Block:
                 return f"{program} is not installed"
         return ""
 
-    def _imported(self) -> set[str]:
-        if self.language != "python":
-            return set()
-        nodes = list(ast.walk(ast.parse(self.text)))
-        found = {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
-        found |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
-        heads = {name.partition(".")[0] for name in found}
-        return heads | ({"torch"} if any(name.startswith("spadmnist.torch") for name in found) else set())
+    @property
+    def nodes(self) -> list[ast.AST]:
+        """Its Python."""
+        return list(ast.walk(ast.parse(self.text))) if self.language == "python" else []
+
+    @property
+    def imports(self) -> dict[str, set[str]]:
+        """The packages that each name which it imports is made of."""
+        found = {}
+        for node in self.nodes:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                for name in node.names:
+                    module = name.name if isinstance(node, ast.Import) else str(node.module)
+                    own = {"torch"} if module.startswith("spadmnist.torch") else set()
+                    found[name.asname or name.name.partition(".")[0]] = own | {module.partition(".")[0]}
+        return found
 
 
 def blocks(page: str) -> list[Block]:
@@ -158,7 +167,14 @@ def blocks(page: str) -> list[Block]:
         elif opened := re.match(r"(```+)([^`]*)$", line):
             start, fence, language = number, opened[1], opened[2].strip()
     assert not fence, f"{page}:{start} has no end"
-    return [block for block in found if not block.language.startswith("{")]
+    imported: dict[str, set[str]] = {}
+    out = []
+    for block in (block for block in found if not block.language.startswith("{")):
+        used = {node.id for node in block.nodes if isinstance(node, ast.Name)}
+        needs = set().union(*(imported[name] for name in used & set(imported)))
+        out.append(replace(block, needs=frozenset(needs)))
+        imported |= block.imports
+    return out
 
 
 def commands_of(block: Block) -> list[tuple[str, int]]:

@@ -251,7 +251,7 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     assert told(gain=93.0) == [("slow_afterpulsing", True)]
     assert told(gain=88.0) == [("slow_afterpulsing", False)]
     assert told(residuals=foul) == [("slow_afterpulsing", False)]
-    assert told(residuals=None) == [("slow_afterpulsing", False)]  # never settled
+    assert told(residuals=None) == [("slow_afterpulsing", False)]  # never fitted
     many = _alternatives(quiet(replicates), evaluation, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
     # where chance makes pixels odd, by that model's own scatter

@@ -133,9 +133,9 @@ def test_widths_of_codes_are_cut_by_pixel_and_shared_ones_stay(tmp_path: Path) -
         assert np.array_equal(part.effect("tdc_nonlinearity").widths, expected)
 
 
-def test_what_is_drawn_is_the_same_whether_the_sensor_was_settled_before_or_not() -> None:
-    unsettled = Sensor(GRID, [of("dark_counts", rate=Distribution("lognormal", (5e3, 1.0)))], "device", CHIP)
-    one, other = unsettled.cropped(*FEW), unsettled.resolved().cropped(*FEW)
+def test_what_is_drawn_is_the_same_whether_the_sensor_was_resolved_before_or_not() -> None:
+    unresolved = Sensor(GRID, [of("dark_counts", rate=Distribution("lognormal", (5e3, 1.0)))], "device", CHIP)
+    one, other = unresolved.cropped(*FEW), unresolved.resolved().cropped(*FEW)
     assert np.array_equal(one.rates(lit(one), CLOCK), other.rates(lit(other), CLOCK))
 
 

@@ -84,7 +84,7 @@ def measured(tmp_path, sensor, captures):
     return measurements.open(measurements.write(tmp_path / "data", "made", sensor.layout, iter(recordings), plans))
 
 
-def test_a_dead_time_is_settled_and_a_map_found(tmp_path, made):
+def test_a_dead_time_is_fitted_and_a_map_found(tmp_path, made):
     sensor, captures, map_ = made
     data = measured(tmp_path, sensor, captures)
     with Serial() as workers:
@@ -104,7 +104,7 @@ def test_a_dead_time_is_settled_and_a_map_found(tmp_path, made):
     assert abs(value - 60e-9) < max(2e-9, high - low)
 
 
-def test_what_cannot_be_settled_is_told(tmp_path, made):
+def test_what_cannot_be_fitted_is_told(tmp_path, made):
     sensor, captures, _ = made
     data = measured(tmp_path, sensor, captures)
     with pytest.raises(InputError, match="crosstalk"):
@@ -173,7 +173,7 @@ def test_what_a_law_leaves_in_its_own_cells_makes_its_numbers_less_certain():
     assert error_scale(nothing, evaluation).tolist() == [1.0, 1.0]
 
 
-def test_what_is_unseen_is_what_numbers_settled_without_it_leave():
+def test_what_is_unseen_is_what_numbers_fitted_without_it_leave():
     """Against least squares done anew without each capture, and in one that alone tells a number without each cell."""
     rng = np.random.default_rng(12)
     cells = {("a", "x"): 30, ("b", "x"): 20, ("b", "y"): 10, ("c", "x"): 30, TOTALS: 3}
@@ -200,7 +200,7 @@ def test_what_is_unseen_is_what_numbers_settled_without_it_leave():
 
 
 def test_numbers_that_are_not_where_the_squares_are_least_gain_nothing_by_that() -> None:
-    """At a bound, or resolved half way: what they lack there they lack on captures that are not seen, too."""
+    """At a bound, or fitted half way: what they lack there they lack on captures that are not seen, too."""
     rng = np.random.default_rng(14)
     jacobian = {(id, "x"): rng.standard_normal((50, 2)) for id in "abc"}
     noise = {cell: rng.standard_normal(50) for cell in jacobian}
@@ -379,7 +379,7 @@ def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     found = fit_named(sensor, data, free=["dead_time.paralyzable"], jobs=1)
     assert found.steps[0].values["paralyzable"].value == 0 and not found.values
     assert found.steps[0].significance == 0
-    # nothing was wrong, and nothing explained: it was resolved
+    # nothing was wrong, and nothing explained: it was fitted
     assert found.verdict == "adequate" and sentence(found).endswith("No check failed before, and none fails now.")
     blind = with_values(sensor, {("dead_time", "paralyzable"): True})
     found = fit_named(blind, data, free=["dead_time.paralyzable"], jobs=1)
@@ -387,7 +387,7 @@ def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     assert found.values["dead_time", "paralyzable"] is False and found.steps[0].significance > 3
 
 
-def test_beside_maps_no_number_that_changes_rates_is_settled_by_likelihood(made):
+def test_beside_maps_no_number_that_changes_rates_is_fitted_by_likelihood(made):
     """Which takes the pixels' rates for known; of a dead time it need not know them."""
     sensor, captures, _ = made
     data = [recording for _, _, recording in captures]
@@ -426,7 +426,7 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after(monkeypatch):
     assert sum(n > 1 for n in asked) <= 4 < 16
 
 
-def test_what_cannot_be_settled_is_told_with_what_can(made):
+def test_what_cannot_be_fitted_is_told_with_what_can(made):
     sensor, *_ = made
     known = candidates(sensor.resolved()), {e.name for e in sensor.effects}
     with pytest.raises(

@@ -129,7 +129,7 @@ def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_pat
 def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     """Draws of a map are as wide as the pixels may be: of 256 that say little each, that is uncertain.
 
-    Against maps resolved to data made anew, which scatter by what `_DOUBT` says; a ratio beyond 0.7 to 1.4 is a chance
+    Against maps fitted to data made anew, which scatter by what `_DOUBT` says; a ratio beyond 0.7 to 1.4 is a chance
     of less than 1e-6 for 400 draws.
     """
     rng, n, sigma, noise = np.random.default_rng(3), 256, 0.012, 0.015

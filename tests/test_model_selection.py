@@ -410,7 +410,7 @@ def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
 
 @pytest.mark.parametrize("rival", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, monkeypatch, rival: bool) -> None:
-    """It moves the dead time to where checks fail: without a rival that is said, with one what was resolved stays."""
+    """It moves the dead time to where checks fail: without a rival that is said, with one what was fitted stays."""
     sensor, data = lab(dead=55)
     path = begin(bench_of((sensor, data)))
     taken(path, "set dead_time.duration", {DURATION: 55e-9})

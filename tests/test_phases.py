@@ -47,7 +47,7 @@ def test_a_cell_that_some_phases_leave_alone() -> None:
 
 
 @pytest.mark.parametrize(("amplitude", "seed"), [pytest.param(0.3, 0, marks=pytest.mark.slow), (0.12, 1)])
-def test_strength_and_phase_are_settled(lab, amplitude: float, seed: int) -> None:
+def test_strength_and_phase_are_fitted(lab, amplitude: float, seed: int) -> None:
     """By a trace eight times as strong, or half: 20 ms of 100 Hz, about 18,000 detections of 10,000 a pixel and s.
 
     A known sine tells its amplitude to root(2 / n) and its phase to that / amplitude; six standard deviations are

@@ -24,6 +24,7 @@ import spadmnist
 from spadmnist import dataset, remote, verify, zipped
 from spadmnist.errors import SpadError
 from spadmnist.remote import Blocks, Remote
+from spadmnist.report import places_of
 
 pytest.importorskip("obstore")
 LEVEL = "2560 mlux"
@@ -481,3 +482,24 @@ def test_fetch_leaves_what_is_there_alone(site: Site, out: Path, tmp_path: Path)
     with fails("is there already, and is not this dataset"):
         spadmnist.fetch(f"{site.url}/out", seal_of(out), tmp_path / "got")
     assert (tmp_path / "got" / "mine").read_text() == "mine" and not site.asked
+
+
+def test_inspect_shows_what_a_zip_and_an_address_hold(site: Site, out: Path, tmp_path: Path) -> None:
+    made = shutil.make_archive(str(tmp_path / "packed"), "zip", out)
+    here = run("inspect", str(out))
+    assert here.returncode == 0 and here.stdout
+    for place in (made, f"{site.url}/out"):
+        found = run("inspect", place, "--plot", str(tmp_path / "sheet.png"))
+        assert found.returncode == 0 and found.stdout.startswith(here.stdout), found.stderr
+        assert (tmp_path / "sheet.png").stat().st_size > 0
+
+
+def test_positions_of_pixels_are_read_from_a_zip(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "places.csv").write_text("x,y\n0,0\n23.0,-11.5\n")
+    (tmp_path / "out" / "manifest.json").write_text("{}")
+    packed = dataset.at(shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path / "out"))
+    manifest = {"config": {"sensor": {"layout": {"positions": "places.csv"}}}}
+    assert np.array_equal(places_of(manifest, packed), [[0, 0], [23e-6, -11.5e-6]])
+    manifest["config"]["sensor"]["layout"].clear()
+    assert places_of(manifest, packed) is None

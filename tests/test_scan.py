@@ -1,4 +1,4 @@
-"""Search: what candidates are compared by, and how faint ones and those of either sign are resolved."""
+"""Search: what candidates are compared by, and how faint ones and those of either sign are fitted."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
     evaluation.residuals[ramp], evaluation.residuals[power] = 0.0 * told[ramp], -told[power]
     assert quiet(replicates)._marked(evaluation, one).gain == 0
     evaluation.residuals.update(told)
-    # resolved as strong as it is seen, it helps, and the opposite does not
+    # fitted as strong as it is seen, it helps, and the opposite does not
     strong = min(
         (0.02 * k for k in range(1, 50)),
         key=lambda x: abs(score_test(replicates, evaluation, one.signature.at(x)).size - 5.0),
@@ -179,7 +179,7 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
 
 
 def test_of_directions_side_by_side_all_together_are_asked(lab) -> None:
-    """Two of 6.4 standard deviations each are together 9: what is resolved has both, though each was tried alone."""
+    """Two of 6.4 standard deviations each are together 9: what is fitted has both, though each was tried alone."""
     replicates = bench_of(lab())
     evaluation = evaluate(replicates, {})
     cell, candidate = ("flat", "pixel_map"), change_of(replicates, "add illumination_gradient")
@@ -224,7 +224,7 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
 
 
 @pytest.mark.slow
-def test_a_faint_effect_is_settled_at_its_own_strength(lab) -> None:
+def test_a_faint_effect_is_fitted_at_its_own_strength(lab) -> None:
     """Afterpulsing of 0.4 % in 19,000 detections a second: what a stronger one does only says what it looks like."""
     made = lab("    afterpulsing: {probability: 0.6 %, lifetime: 40 ns}\n", light=900, side=4)
     path = begin(bench_of(made))
@@ -438,7 +438,7 @@ def test_a_users_effect_that_cannot_be_tried_is_told(lab, tmp_path, monkeypatch)
     )
 
 
-def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> None:
+def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_fitted(lab) -> None:
     replicates = bench_of(lab())
     look, nothing = quiet(replicates), Signature({}, {}, {})
     chance = Trial(change_of(replicates, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True, fell=100.0)
@@ -453,7 +453,7 @@ def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_settled(lab) -> Non
     clear = replace(map_, gain=1000.0)
     assert worth_fitting(look, [clear, other, chance]) == [clear, chance]
     assert worth_fitting(look, [clear, replace(chance, gain=20.0, fell=20.0)]) == [clear]
-    # as the squares say: until its number is resolved, how it scatters may tell against it
+    # as the squares say: until its number is fitted, how it scatters may tell against it
     assert [t.chips for t in worth_fitting(look, [clear, replace(chance, gain=-50.0)])] == [False, True]
 
 
@@ -526,7 +526,7 @@ def test_only_edges_are_followed_close_by(lab) -> None:
     assert edge_errors(path, fit) == {gate.key: pytest.approx(0.2)}
 
 
-def test_a_number_that_a_step_settles_is_no_map(lab) -> None:
+def test_a_number_that_a_step_fits_is_no_map(lab) -> None:
     """It cannot be both: a measurement of pixels whose dark counts blink ended with a fault of the program."""
     replicates = bench_of(lab())
     look, candidate = quiet(replicates), change_of(replicates, "add blinking_dark_counts")
@@ -553,7 +553,7 @@ def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> No
 
 
 @pytest.mark.parametrize(("truth", "first"), [(4, 8), (64, 8), (1, 32), (5, 2)])
-def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> None:
+def test_a_whole_number_is_fitted_by_its_neighbours(truth: int, first: int) -> None:
     """The other number follows it along a narrow valley; from afar the valley's floor is not reached at once."""
     coordinate = Coordinate("bus", "queue", "", 1.0, 256.0, None, whole=True)
 
@@ -571,10 +571,8 @@ def test_a_whole_number_is_settled_by_its_neighbours(truth: int, first: int) -> 
 
 
 @pytest.mark.parametrize(("dependent", "reach", "alone"), [(1.0, 0.45, True), (9.0, 0.8, False)])
-def test_a_whole_number_that_was_settled_from_afar_is_settled_again(
-    dependent: float, reach: float, alone: bool
-) -> None:
-    """The time that suits 4 places is far from the one that suits 8; what is resolved in one go does not get there.
+def test_a_whole_number_that_was_fitted_from_afar_is_fitted_again(dependent: float, reach: float, alone: bool) -> None:
+    """The time that suits 4 places is far from the one that suits 8; what is fitted in one go does not get there.
 
     Then 4 is known to be it, and the time with it; or where cells depend on each other 3 and 5 are not excluded, and
     what the time is with these is not either.

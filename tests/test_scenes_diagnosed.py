@@ -82,7 +82,7 @@ def lab(*hidden: Any, seed: int = 1, modality: str = "qis", frames: int = 4000, 
 
 
 def looked_at(made: Lab, effects: Sequence[str]) -> list[Trial]:
-    """Candidates, maps beside them, in the order in which they are resolved."""
+    """The candidates and maps, in the order in which they are fitted."""
     replicates = bench_of(made)
     scan, evaluation = quiet(replicates), evaluate(replicates, {})
     tried: list[Trial] = []

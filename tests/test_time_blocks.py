@@ -1,4 +1,4 @@
-"""Halves of a capture by alternating blocks of time: what one resolves judges the other."""
+"""Halves of a capture by alternating blocks of time: what is fitted to one is judged by the other."""
 
 from __future__ import annotations
 

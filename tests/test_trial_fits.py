@@ -180,7 +180,7 @@ def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) ->
         assert np.array_equal(known.evaluation.residuals[cell], z)
 
 
-def test_numbers_that_were_settled_since_do_not_move_twice(lab, monkeypatch) -> None:
+def test_numbers_that_were_fitted_since_do_not_move_twice(lab, monkeypatch) -> None:
     """The last step of a number is not simulated: a model that was has it where it was before that step."""
     path = begin(bench_of(lab()))
     before = path.evaluation = replace(path.evaluation, values={CROSSTALK: 0.02})
@@ -255,8 +255,8 @@ def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow
     assert not _of_pixels(path, other, maps).any()
 
 
-def test_what_is_settled_is_looked_at_everywhere(lab, monkeypatch) -> None:
-    """Also where its first values did nothing, so that nobody looked there while it was resolved."""
+def test_what_is_fitted_is_looked_at_everywhere(lab, monkeypatch) -> None:
+    """Also where its first values did nothing, so that nobody looked there while it was fitted."""
     path = begin(bench_of(lab(dead=55)))
     replicates, evaluation = path.replicates, path.evaluation
     monkeypatch.setattr("spadmnist.inference.trial_fits.captures_showing", lambda *_: ["dark"])

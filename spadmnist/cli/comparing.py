@@ -169,10 +169,14 @@ def diagnose(
     found = model_selection.diagnose(model, data, seed, max_steps, quick, workers, terminal.say, seconds, keep, before)
     if before is not None and found.finished:
         before.remove()
+    elif before is not None and before.bytes:
+        kept = f"{before.bytes / 1e6:.0f} MB of replicates"
+        terminal.say(f"Not finished: {before.folder} keeps {kept}, from which the next command goes on")
     if output is not None:
         _write_next(found, sensor, output / "sensor.yaml", model)
     new = quoted(found.file or "next/sensor.yaml")
-    what = next_step.after_diagnosis(found, quoted(sensor), options.again(measurement, plugin_files), new)
+    same = f"-o {quoted(output or 'next')}{' --quick' if quick else ''}"
+    what = next_step.after_diagnosis(found, quoted(sensor), options.again(measurement, plugin_files), new, same)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
             source = _source(sensor, measurement, seed, found.file, what)

@@ -170,8 +170,8 @@ def init(
 ) -> None:
     """Write FOLDER/config.yaml and FOLDER/sensor.yaml, which run as they are, or FOLDER/measurement.yaml.
 
-    The documentation names the program's examples as configs/NAME: --examples writes them, for who has installed the
-    program without its source.
+    --examples writes the configs that the documentation calls configs/NAME. They come with the program, also where its
+    source is not at hand.
 
     Their JSON Schemas are written to FOLDER, too; an editor completes and checks with them. A config of pictures has
     gamma: srgb, because pictures are not linear in the light: half of white then gets 21 % of the photons of white.

@@ -14,7 +14,7 @@ from ._group import cli
 
 
 @cli.verb(50, short_help="Show what a dataset or a measurement holds.")
-@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
+@click.argument("dataset", metavar="DATASET|MEASUREMENT", type=options.Readable())
 @click.option(
     "--plot",
     type=options.Place(),
@@ -22,8 +22,8 @@ from ._group import cli
     help="Draw a sheet of images in all readouts and methods, or of maps, rates and intervals of captures.",
 )
 @options.as_json
-def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
-    """Show what DATASET or MEASUREMENT holds.
+def inspect(dataset: Path | str, plot: Path | None, as_json: bool) -> None:
+    """Show what DATASET or MEASUREMENT holds. A DATASET is a folder, a zip of it, or its address (https://, s3://).
 
     Of a dataset, for each light level: detections, empty and saturated pixels, bytes, bits per detection. Of a
     measurement, for each capture: detections, rates, empty, hot and dead pixels, intervals.
@@ -38,10 +38,11 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
 
     if plot is not None and plot.suffix.lower() != ".png":
         raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
-    if measurement.is_measurement(dataset):
-        _inspect_measurement(dataset, plot, as_json)
+    root = library.at(dataset)
+    if isinstance(root, Path) and measurement.is_measurement(root):
+        _inspect_measurement(root, plot, as_json)
         return
-    manifest = library.intact_manifest(dataset)
+    manifest = library.intact_manifest(root)
     if as_json:
         terminal.print_json(
             {
@@ -54,7 +55,7 @@ def inspect(dataset: Path, plot: Path | None, as_json: bool) -> None:
         terminal.print_lines(report.level_table(manifest))
     if plot is not None:
         with options.writing(plot):
-            report.sheet(library.open(dataset), plot, places=report.places_of(manifest, dataset))
+            report.sheet(library.stored(root), plot, places=report.places_of(manifest, root))
         terminal.say(f"Drawn: {plot}")
 
 

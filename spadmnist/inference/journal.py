@@ -22,8 +22,9 @@ from . import replicate_cache
 from .replicates import CaptureReplicates, ReducedCapture
 
 FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
-_MOST_BYTES = 2 << 30  # bytes of all entries; what comes later is simulated again. Chosen: a full search of 12 steps
-_LARGEST = 1 << 28  # bytes of one entry
+# bytes of all entries, beyond which nothing is added: the quick diagnosis of the tutorial, of two steps, writes 0.3 GB
+_MOST_BYTES = 2 << 30
+_LARGEST = 1 << 28  # bytes of one entry that is read or written; the largest of the tutorial has 5 MB
 
 
 class Journal:
@@ -33,7 +34,6 @@ class Journal:
         """Open the journal in a folder, which need not be there yet."""
         self.folder = folder
         self.bytes = sum(path.stat().st_size for path in folder.glob("*.npz")) if self._own() else 0
-        self.recalled = 0  # replicates that were read
 
     @staticmethod
     def name(
@@ -56,12 +56,9 @@ class Journal:
     def recall(self, name: str | None) -> CaptureReplicates | None:
         """The replicates of this name; None where the journal has none that are intact."""
         try:
-            found = None if name is None else replicate_cache.unpacked(disk.read_file(self._path(name), _LARGEST))
+            return None if name is None else replicate_cache.unpacked(disk.read_file(self._path(name), _LARGEST))
         except OSError:
             return None
-        if found is not None:
-            self.recalled += len(found.numbers)
-        return found
 
     def keep(self, name: str | None, made: CaptureReplicates) -> None:
         """Add replicates. An error of the disk is ignored: they are simulated again."""

@@ -21,11 +21,21 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
 
 
 def after_diagnosis(
-    found: Diagnosis, sensor: str = SENSOR, measurement: str = MEASUREMENT, new: str = "next/sensor.yaml"
+    found: Diagnosis,
+    sensor: str = SENSOR,
+    measurement: str = MEASUREMENT,
+    new: str = "next/sensor.yaml",
+    same: str = "-o next",
 ) -> str:
-    """What follows a diagnosis or a fit. new: the next sensor file; other arguments as of `after_comparison`."""
+    """What follows a diagnosis or a fit.
+
+    Args:
+        sensor, measurement: as of `after_comparison`.
+        new: the next sensor file.
+        same: the options under which a diagnosis that is not finished goes on from its journal.
+    """
     if not found.finished:
-        return f"spadmnist diagnose {sensor} {measurement} -o next --within none goes on to the end."
+        return f"spadmnist diagnose {sensor} {measurement} {same} --within none goes on to the end."
     if found.asked == "fit":
         return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
     if found.verdict == "adequate":

@@ -17,8 +17,9 @@ from .. import pictures, reconstruct, units
 from ..dataset import Dataset, Part
 from ..errors import SpadError
 from ..events import Events
-from ..positions import read_positions
+from ..positions import LARGEST_POSITIONS, positions_in, read_positions
 from ..readout import Frames
+from ..sources import Source
 from ._text import number, percent
 
 _CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstructions
@@ -73,10 +74,14 @@ class _Cell:
     caption: str
 
 
-def places_of(manifest: Mapping[str, Any], root: Path) -> np.ndarray | None:
+def places_of(manifest: Mapping[str, Any], root: Path | Source) -> np.ndarray | None:
     """(pixels, 2) m, where the pixels of a dataset's sensor lie; None on a grid. Raises InputError as the file's."""
     file = manifest["config"]["sensor"]["layout"].get("positions")
-    return None if file is None else read_positions(root / file)
+    if file is None:
+        return None
+    if isinstance(root, Source):
+        return positions_in(root.document(file, LARGEST_POSITIONS), root / file)
+    return read_positions(root / file)
 
 
 def sheet(

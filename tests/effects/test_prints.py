@@ -192,7 +192,7 @@ captures:
         ("print_tilt: {angle: 0.08 rad}", "angle"),
     ],
 )
-def test_a_print_is_settled_by_a_capture_of_its_scene(
+def test_a_print_is_fitted_by_a_capture_of_its_scene(
     hidden: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The 95 % interval holds the hidden value, with this seed; without a scene it is no candidate."""
