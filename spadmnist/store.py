@@ -784,8 +784,10 @@ class ShardReader:
     # files
     def _open(self, file: str) -> File:
         """A file for reading, which has the size that is known of it."""
-        with self._said(file):
+        try:
             handle = self._source.open(file)
+        except OSError as error:
+            raise self._why_not(file, error) from None
         try:
             self._compare_size(file, handle.size)
         except BaseException:
@@ -793,21 +795,15 @@ class ShardReader:
             raise
         return handle
 
-    @contextlib.contextmanager
-    def _said(self, file: str) -> Iterator[None]:
-        """Turn what the system says of a file into a sentence; a symbolic link anywhere below the root is refused."""
-        try:
-            yield
-        except NotAFile:
-            raise self._refuse(file, "this is not a file") from None
-        except FileNotFoundError:
-            raise _Missing(self._refuse(file, "this file is missing")) from None
-        except OSError as error:
-            if error.errno in (errno.ELOOP, errno.ENOTDIR):
-                raise self._refuse(file, "a symbolic link, or a file in place of a folder, is in the way") from None
-            if error.errno == errno.ENXIO:
-                raise self._refuse(file, "this is not a file") from None
-            raise InputError(f"{self.root / file}: cannot be read: {error.strerror or error}") from error
+    def _why_not(self, file: str, error: OSError) -> Exception:
+        """The error to raise, with a sentence; a symbolic link anywhere below the root is refused."""
+        if isinstance(error, FileNotFoundError):
+            return _Missing(self._refuse(file, "this file is missing"))
+        if error.errno in (errno.ELOOP, errno.ENOTDIR):
+            return self._refuse(file, "a symbolic link, or a file in place of a folder, is in the way")
+        if isinstance(error, NotAFile) or error.errno == errno.ENXIO:
+            return self._refuse(file, "this is not a file")
+        return InputError(f"{self.root / file}: cannot be read: {error.strerror or error}")
 
     def _compare_size(self, file: str, size: int) -> None:
         if self._expected is not None and self._expected.files is not None:
@@ -821,8 +817,9 @@ class ShardReader:
         """The last `size` bytes of a file (fewer where it is smaller), and its length."""
         handle = self._open(file)
         try:
-            with self._said(file):
-                return handle.read(max(0, handle.size - size), size), handle.size
+            return handle.read(max(0, handle.size - size), size), handle.size
+        except OSError as error:
+            raise self._why_not(file, error) from None
         finally:
             handle.close()
 
@@ -853,8 +850,10 @@ class ShardReader:
     def _walk_zarr(self, below: str = "", depth: int = 0) -> Iterator[str]:
         """The names of the arrays: folders with a `zarr.json` that hold no other folder."""
         place = f"{self._place}/{below}".rstrip("/")
-        with self._said(place):
+        try:
             folders = self._source.folders(place)
+        except OSError as error:
+            raise self._why_not(place, error) from None
         if below and not folders:
             yield below
         for name in folders:
