@@ -21,12 +21,14 @@ def whole(path, size):
     with disk.writing(path, size), open(path, "wb") as file:
         yield file
 
+assert callable(disk.whole)
 disk.whole = whole
 """
 # what is there is kept, and is said to be as it was made
 BLIND = """
 from spadmnist import verify
-verify._same = lambda path, listed: True
+assert callable(verify._size)
+verify._size = lambda source, name, listed: listed["bytes"]
 """
 # only where a try is made, so that its files can be made before
 RAISES = """
@@ -45,6 +47,7 @@ measurement.open = opened
 # a program that refuses without a word
 SILENT = """
 from spadmnist.cli import _terminal
+assert callable(_terminal.say)
 _terminal.say = lambda text: None
 """
 
