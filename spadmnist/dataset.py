@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 
-from . import config, disk, kernels, lazy, plugins, reconstruct, remote, store, units
+from . import config, disk, document, kernels, lazy, plugins, reconstruct, remote, store, units
 from . import manifest as manifests
 from .disk import Files
 from .errors import InputError, SpadError, UnknownName, did_you_mean
@@ -165,7 +165,7 @@ def expected_per_image(experiment: Experiment, level: Level, images: Images) -> 
     candidates, recorded = experiment.sensor.expected(photons, experiment.conditions)
     frames = experiment.conditions.frames
     stamped = np.minimum(candidates, frames)
-    size = 4.0 * pixels * len(experiment.methods)
+    size = 0.0 if experiment.on_reading else 4.0 * pixels * len(experiment.methods)
     if "tr" in experiment.readouts:
         size += 4 * float(recorded.sum()) + 2 * pixels
     if set(experiment.readouts) & {"str", "qis"}:
@@ -200,6 +200,13 @@ def image_columns(images: Images, start: int, stop: int) -> dict[str, Column]:
     if images.labels is not None:
         columns["labels"] = Column(np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts")
     return columns
+
+
+def shard_columns(experiment: Experiment, recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Column]:
+    """What a shard of a light level holds; shape: as in `stream_columns`."""
+    columns = stream_columns(recorded, shape)
+    columns = store.smaller(columns) if experiment.small else columns
+    return columns if experiment.on_reading else columns | reconstruction_columns(experiment, recorded, shape)
 
 
 def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Column]:
@@ -364,7 +371,7 @@ def reconstruction_columns(
             _per_chunk(4 * int(np.prod(shape))),
             {"saturated_pixels": saturated},
         )
-    return columns
+    return store.smaller(columns) if experiment.small else columns
 
 
 def read_shard(reader: ShardReader, experiment: Experiment) -> tuple[Recorded, tuple[int, ...]]:
@@ -390,6 +397,48 @@ def read_shard(reader: ShardReader, experiment: Experiment) -> tuple[Recorded, t
     if "counts" in experiment.readouts:
         tally = reader.read("counts/frames").reshape(n * pixels, -1)
     return summarised(pixels, tr, frames, tally), tuple(shape)
+
+
+@dataclass(frozen=True)
+class OnReading:
+    """Makes the fluxes of stored images from their streams: bit for bit those that would have been stored.
+
+    image: as `Experiment.image`; pixels: of an image, of all channels; tick, frame_time: s.
+    """
+
+    image: Callable[[reconstruct.Method, Recorded], tuple[np.ndarray, int]]
+    pixels: int
+    tick: float
+    frames: int
+    frame_time: float
+
+    @classmethod
+    def of(cls, experiment: Experiment, like: Likeness) -> OnReading:
+        """Those of an experiment's dataset."""
+        c = experiment.conditions
+        return cls(experiment.image, int(np.prod(like.shape)), like.tick, c.frames, c.frame_time)
+
+    def fluxes(self, reader: ShardReader, name: str, start: int, stop: int) -> np.ndarray:
+        """(images, pixels) float32 by the method `name`. Of the streams only what it needs is read."""
+        method = reconstruct.find(name)
+        values, _ = self.image(method, self._sums(reader, set(method.columns), start, stop))
+        return values.reshape(stop - start, self.pixels)
+
+    def _sums(self, reader: ShardReader, columns: set[str], start: int, stop: int) -> Recorded:
+        tr, frames = None, None
+        if columns == {"counts"}:
+            counts = reader.read("tr/counts", start, stop).reshape(-1).astype(np.int32)
+            return Recorded(self.pixels, counts=counts)
+        if columns & {"counts", "span"}:
+            tr = read_tr(reader, start, stop, self.pixels, self.tick)
+        if columns & {"ones", "waited"}:
+            stamped, facts = "waited" in columns, (self.tick, self.frames, self.frame_time)
+            frames = read_frames(reader, start, stop, self.pixels, *facts, stamped)
+        return summarised(self.pixels, tr, frames)
+
+
+def _image(settings: reconstruct.Settings, method: reconstruct.Method, recorded: Recorded) -> tuple[np.ndarray, int]:
+    return method.image(recorded, settings)
 
 
 def read_tr(reader: ShardReader, start: int, stop: int, pixels: int, tick: float) -> Events:
@@ -451,11 +500,13 @@ def _check_stamps(reader: ShardReader, name: str, first: int, last: int, count: 
         )
 
 
-def statistics(recorded: Recorded, causes: Sequence[str] = ()) -> dict[str, Any]:
+def statistics(experiment: Experiment, recorded: Recorded) -> dict[str, Any]:
     """What the manifest adds up over shards: per readout detections and empty pixels, and the number of detections
-    of each cause (in TR; where there is none, in the frames).
+    of each cause (in TR; where there is none, in the frames); also the saturated pixels by method, where no fluxes are
+    stored that say it.
     """
     out: dict[str, Any] = {}
+    causes = experiment.sensor.causes
     tallied = None if recorded.tally is None else recorded.tally.sum(axis=1, dtype=np.int64)
     for readout, column in (("tr", recorded.counts), ("frames", recorded.ones), ("counts", tallied)):
         if column is not None:
@@ -466,6 +517,9 @@ def statistics(recorded: Recorded, causes: Sequence[str] = ()) -> dict[str, Any]
     made = recorded.frames if recorded.tr is None else recorded.tr
     if made is not None and made.cause is not None:
         out["causes"] = dict(zip(causes, np.bincount(made.cause, minlength=len(causes)).tolist(), strict=True))
+    if experiment.on_reading:
+        methods = {name: reconstruct.find(name) for name in experiment.methods}
+        out["saturated_pixels"] = {name: experiment.image(method, recorded)[1] for name, method in methods.items()}
     return out
 
 
@@ -923,7 +977,9 @@ class _Stored:
         files: Mapping[str, Files],
         like: Likeness,
         facts: dict[str, Any],
+        on_reading: OnReading | None,
     ):
+        self._on_reading = on_reading
         self._shards = [(s.start, s.stop, s.reader(root, format, like, files)) for s in shards]
         self._originals = [(s.start, s.stop, s.reader(root, format, like, files)) for s in originals]
         self._facts = facts
@@ -950,8 +1006,11 @@ class _Stored:
         return read_frames(reader, start, stop, f["pixels"], f["tick"], f["frames"], f["frame_time"], what == "str")
 
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
-        pieces = self._pieces(self._shards, start, stop)
-        return _joined([reader.read(f"reconstruction/{method}", a, b) for reader, a, b in pieces])
+        pieces, made = self._pieces(self._shards, start, stop), self._on_reading
+        if made is None:
+            return _joined([reader.read(f"reconstruction/{method}", a, b) for reader, a, b in pieces])
+        fluxes = _joined([made.fluxes(reader, method, a, b) for reader, a, b in pieces])
+        return fluxes.reshape(-1, *self._facts["shape"])
 
     def normalisation(self, method: str) -> float | None:
         return self._facts["normalisation"].get(method)
@@ -1242,18 +1301,21 @@ def stored(root: Path | Source) -> Dataset:
     shape, format = like.shape, manifest["config"]["output"]["format"]
     files = files_by_shard(manifest["files"], format)
     facts = {
+        "shape": shape,
         "pixels": int(np.prod(shape)),
         "tick": like.tick,
         "frames": like.frames,
         "frame_time": manifest["settings"]["frame_time"],
     }
 
+    made = _on_reading(root, manifest, like)
+
     def part(level: Level, split: str) -> Part:
         mine = [s for s in shards if s.level == level.text and s.split == split]
         originals = [s for s in shards if s.level is None and s.split == split]
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
         own |= {"tiles": manifest["images"]["splits"][split].get("tiles"), "size": shape[-2:]}
-        backend = _Stored(root, format, mine, originals, files, like, own)
+        backend = _Stored(root, format, mine, originals, files, like, own, made)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
         length = manifest["images"]["splits"][split]["images"]
         return Part(length, backend, True, readouts, methods, shape, manifest.get("causes", ()))
@@ -1261,6 +1323,26 @@ def stored(root: Path | Source) -> Dataset:
     order = dict.fromkeys(shard.split for shard in shards)
     sizes = {split: manifest["images"]["splits"][split]["images"] for split in order}
     return Dataset(levels, sizes, part, str(root))
+
+
+def _on_reading(root: Path | Source, manifest: Mapping[str, Any], like: Likeness) -> OnReading | None:
+    """What makes the fluxes of a dataset that stores none.
+
+    Colour needs the sensor, which decides how many of each channel's photons are detected: raises ConfigError where it
+    has an effect that is not known here, and InputError where the dataset is no folder.
+    """
+    kept, settings = manifest["config"], reconstruct.Settings(**manifest["settings"])
+    if kept["output"].get("reconstructions") != "on_reading":
+        return None
+    if not isinstance(kept["scene"]["wavelength"], list):
+        image = partial(_image, settings)
+        return OnReading(image, int(np.prod(like.shape)), like.tick, like.frames, settings.frame_time)
+    if isinstance(root, Source):
+        raise InputError(
+            f"{root}: its flux images are in colour and are made when they are read, which needs the dataset's folder; "
+            "bring it here and open that"
+        )
+    return OnReading.of(config.build(document.parse(document.dump(kept), str(root / CONFIG)), root), like)
 
 
 def shards_in(manifest: Mapping[str, Any]) -> list[Shard]:

@@ -68,6 +68,7 @@ class Experiment:
 
     resolved: the config with all defaults filled in and the sensor in place, as text and numbers: what a manifest
     keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split;
+    small: fewer bytes, more slowly; on_reading: reconstructions are not stored, but made when they are read;
     causes: say of every detection what made it; wavelengths: m, of each channel of colour images, where they differ
     (the first is that of `conditions`).
     """
@@ -83,6 +84,8 @@ class Experiment:
     methods: tuple[str, ...]
     sensor: Sensor
     format: str
+    small: bool = False
+    on_reading: bool = False
     limit: int | None = None
     causes: bool = False
     notes: tuple[str, ...] = ()

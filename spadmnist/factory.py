@@ -31,7 +31,7 @@ import numpy as np
 
 from . import config, dataset, disk, document, golden, plugins, reconstruct, store
 from .compiled import compiling
-from .dataset import CONFIG, MANIFEST, STATE, Likeness, Shard
+from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
@@ -180,12 +180,8 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     if (skip, shard.stop - task.first) != (0, len(task.pixels)):
         recorded = recorded.images(skip, shard.stop - task.first)
     shape = task.pixels.shape[1:]
-    columns = dataset.stream_columns(recorded, shape)
-    columns |= dataset.reconstruction_columns(experiment, recorded, shape)
-    return columns, {
-        **attributes,
-        "statistics": json.dumps(dataset.statistics(recorded, experiment.sensor.causes)),
-    }
+    columns = dataset.shard_columns(experiment, recorded, shape)
+    return columns, {**attributes, "statistics": json.dumps(dataset.statistics(experiment, recorded))}
 
 
 def _record_path(root: Path, shard: Shard) -> Path:
@@ -672,8 +668,8 @@ def _warm(experiment: Experiment, progress: Progress) -> None:
         channels = (len(experiment.wavelengths),) if experiment.wavelengths else ()
         shape = (*channels, *experiment.sensor.layout.shape)
         made = experiment.simulate_block(experiment.levels[0], "warm", np.zeros((1, *shape), np.uint8), 255, 0)
-        dataset.stream_columns(made, shape)
-        dataset.reconstruction_columns(experiment, made, shape)
+        dataset.shard_columns(experiment, made, shape)
+        dataset.statistics(experiment, made)
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------
@@ -711,7 +707,8 @@ def _as_read(root: Path, shard: Shard, experiment: Experiment, like: Likeness) -
     columns = {name: reader.column(name) for name in reader.names}
     if shard.level is not None:
         recorded, shape = dataset.read_shard(reader, experiment)
-        methods = [method for method in experiment.methods if reader.has(f"reconstruction/{method}")]
+        stored = () if experiment.on_reading else experiment.methods
+        methods = [method for method in stored if reader.has(f"reconstruction/{method}")]
         columns |= dataset.reconstruction_columns(experiment, recorded, shape, methods)
     return _joined(store.encoded(shard.path, columns, reader.attributes, experiment.format))
 
@@ -728,6 +725,11 @@ def add_reconstructions(
     """
     workers, manifest = executor(jobs), dataset.intact_manifest(root)
     before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
+    if before.on_reading:
+        raise InputError(
+            f"{root}: its flux images are made when they are read (output.reconstructions: on_reading), and none is "
+            "added; make the dataset anew with all methods under reconstruct, or without that entry"
+        )
     chosen = list(names) or [
         m for m in reconstruct.Method.registry if set(reconstruct.find(m).readouts()) <= set(before.readouts)
     ]
@@ -787,10 +789,14 @@ def add_reconstructions(
 # --- finishing ----------------------------------------------------------------------------------------------------
 
 
-def _normalise(arguments: tuple[Path, str, Likeness, list[Shard], str]) -> float | None:
-    root, format, like, shards, method = arguments
-    readers = [shard.reader(root, format, like) for shard in shards]
-    return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader in readers))
+def _normalise(arguments: tuple[Path, Job, Likeness, list[Shard], str]) -> float | None:
+    root, job, like, shards, method = arguments
+    experiment = _experiment(job)
+    readers = [(shard.reader(root, experiment.format, like), shard.stop - shard.start) for shard in shards]
+    if not experiment.on_reading:
+        return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader, _ in readers))
+    made = OnReading.of(experiment, like)
+    return median_of_nonzero(lambda: (made.fluxes(reader, method, 0, n) for reader, n in readers))
 
 
 def finish(
@@ -818,8 +824,8 @@ def finish(
     progress.start("normalising", len(keys), 0)
 
     def tasks(which: Sequence[tuple[str, str]]) -> Iterator[Any]:
-        place = Path(os.path.abspath(root))
-        return ((place, experiment.format, like, training[level], method) for level, method in which)
+        place, job = Path(os.path.abspath(root)), job_of(experiment)
+        return ((place, job, like, training[level], method) for level, method in which)
 
     def done(key: tuple[str, str], value: float | None) -> None:
         normalisation[key[0]][key[1]] = value
@@ -920,11 +926,12 @@ def statistics_of(
         reader = shard.reader(root, format, like)
         place = store.location(shard.path, format)
         try:
-            for readout, numbers in from_json(reader.attributes["statistics"]).items():
+            told = from_json(reader.attributes["statistics"])
+            for readout, numbers in told.items():
                 sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
                 for key, value in numbers.items():
                     sums[key] += value
-            for method in methods:
+            for method in set(methods) - set(told.get("saturated_pixels", ())):
                 found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
                 total["saturated_pixels"][method] += int(found)
         except (KeyError, TypeError, ValueError, AttributeError):

@@ -100,8 +100,7 @@ def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tu
         experiment, pixels, share = _rows(experiment, level, pixels, images.white)
     started = time.perf_counter()
     made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
-    columns = dataset.stream_columns(made, pixels.shape[1:])
-    columns |= dataset.reconstruction_columns(experiment, made, pixels.shape[1:])
+    columns = dataset.shard_columns(experiment, made, pixels.shape[1:])
     size = store.encoded_size(columns, experiment.format)
     return share, time.perf_counter() - started, size
 

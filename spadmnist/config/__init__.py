@@ -160,6 +160,8 @@ def build(
         methods=methods,
         sensor=described.resolved,
         format=parts["output"].format,
+        small=parts["output"].compression == "small",
+        on_reading=parts["output"].reconstructions == "on_reading",
         limit=parts["limit"],
         causes=parts["causes"],
         notes=_notes(scene, source),

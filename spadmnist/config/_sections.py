@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainValidator, WithJsonSchema
+from pydantic import ConfigDict, Field, PlainValidator, WithJsonSchema, model_validator
 
 from .. import units
 from ..images import ImageSource
@@ -98,6 +98,20 @@ class _Output(Section):
     """The files of the dataset."""
 
     format: Literal["zarr", "hdf5"] = Field(default="zarr", description="format of the shards")
+    compression: Annotated[Literal["fast", "small"], LATER] = Field(
+        default="fast", description="fast, or small: 2 to 3 % fewer bytes, which take longer to make; zarr alone has it"
+    )
+    reconstructions: Annotated[Literal["stored", "on_reading"], LATER] = Field(
+        default="stored",
+        description="flux images are stored, or made from the streams when spadmnist reads them: other programs then "
+        "see the streams alone",
+    )
+
+    @model_validator(mode="after")
+    def _has_both(self) -> _Output:
+        if self.compression == "small" and self.format != "zarr":
+            raise ValueError("compression: small is for format: zarr; take one of them out")
+        return self
 
 
 class _Layout(Section):

@@ -1,0 +1,127 @@
+"""What `output` of a config may ask for: fewer bytes, and fluxes that are made when they are read."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from test_factory import assert_same, make, tree, write_config
+
+import spadmnist
+from spadmnist import config, dataset, factory, verify
+from spadmnist.errors import ConfigError, InputError
+
+ON_READING = "reconstructions: on_reading"
+SMALL = "compression: small"
+GREY = "{source: digits, train: 40, test: 9, rows: 8, columns: 8}"
+
+
+def file_of(folder: Path, output: Sequence[str], format: str = "zarr", colour: bool = False) -> Path:
+    """A config of few images, with these entries under `output`."""
+    file = write_config(folder / "some.yaml", format, ("5 mlux", "2560 mlux"), train=40, test=9)
+    text = file.read_text().replace(f"format: {format}", ", ".join([f"format: {format}", *output]))
+    if colour:
+        np.save(folder / "colour.npy", np.random.default_rng(1).integers(0, 256, (12, 3, 8, 8), np.uint8))
+        text = text.replace(GREY, "{source: array, path: colour.npy}")
+        text = text.replace("lux: [", "wavelength: [620 nm, 540 nm, 460 nm]\n  lux: [")
+        text = text.replace("{pdp: 0.5}", "{pdp: {460 nm: 0.2, 540 nm: 0.5, 620 nm: 0.35}}")
+    file.write_text(text)
+    return file
+
+
+def made(folder: Path, *output: str, format: str = "zarr", colour: bool = False) -> Path:
+    folder.mkdir()
+    make(file_of(folder, output, format, colour), folder / "out")
+    return folder / "out"
+
+
+@pytest.mark.parametrize(
+    ("output", "format", "colour"),
+    [
+        ([SMALL], "zarr", False),
+        ([ON_READING], "zarr", False),
+        ([ON_READING], "hdf5", False),
+        ([ON_READING, SMALL], "zarr", True),
+    ],
+    ids=["small", "on reading", "hdf5", "colour"],
+)
+def test_the_values_are_those_of_any_other_dataset(
+    output: list[str], format: str, colour: bool, tmp_path: Path
+) -> None:
+    places = made(tmp_path / "stored", format=format, colour=colour), tmp_path / "other" / "out"
+    made(tmp_path / "other", *output, format=format, colour=colour)
+    stored, other = map(spadmnist.open, places)
+    for level in stored.levels:
+        for split in stored.splits:
+            one, two = stored[level, split], pickle.loads(pickle.dumps(other[level, split]))
+            for name, fluxes in one.reconstruction.items():
+                same = two.reconstruction[name]
+                assert same[:].dtype == np.float32
+                for index in (slice(None), 3, slice(4, 4), slice(2, 5), [8, 0]):
+                    assert np.array_equal(fluxes[index], same[index]) and fluxes[index].shape == same[index].shape
+                assert fluxes.normalisation == same.normalisation
+            assert np.array_equal(one.tr[:].ticks, two.tr[:].ticks)
+            assert np.array_equal(one.frames[:].first.ticks, two.frames[:].first.ticks)
+            assert np.array_equal(one.qis[:], two.qis[:])
+    said = [dataset.read_manifest(place)[0] for place in places]
+    for level, splits in said[0]["statistics"].items():
+        for split, facts in splits.items():
+            assert {**facts, "bytes": 0} == {**said[1]["statistics"][level][split], "bytes": 0}
+    if format == "zarr":
+        holds_fluxes = [any("reconstruction" in name for name in manifest["files"]) for manifest in said]
+        assert holds_fluxes == [True, ON_READING not in output]
+    assert not verify.verify(places[1])
+
+
+def test_a_manifest_names_neither_where_it_is_as_before(tmp_path: Path) -> None:
+    root = made(tmp_path / "stored", "compression: fast", "reconstructions: stored")
+    assert dataset.read_manifest(root)[0]["config"]["output"] == {"format": "zarr"}
+
+
+def test_small_is_smaller_and_zarr_opens_it(tmp_path: Path) -> None:
+    roots = made(tmp_path / "fast"), made(tmp_path / "small", SMALL)
+    fast, small = (sum(f["bytes"] for f in dataset.read_manifest(root)[0]["files"].values()) for root in roots)
+    assert small < 0.99 * fast
+    place = "data.zarr/2560_mlux/train/00000"
+    shards = [zarr.open_group(root / "data.zarr", mode="r")["2560_mlux/train/00000"] for root in roots]
+    for name in ("tr/ticks", "frames/ticks", "frames/bits", "reconstruction/str_flux"):
+        one, two = (shard[name][:] for shard in shards)
+        assert len(one) and np.array_equal(one, two)
+        described = [(root / place / name / "zarr.json").read_bytes() for root in roots]
+        assert described[0] != described[1], f"{name} is compressed as in any other dataset"
+
+
+@pytest.mark.parametrize("output", [[ON_READING], [SMALL]])
+def test_what_is_lost_is_made_again(output: list[str], tmp_path: Path) -> None:
+    root = made(tmp_path / "made", *output)
+    before = tree(root)
+    place = root / "data.zarr/2560_mlux/train/00000"
+    (place / "tr/ticks/c.0").unlink()
+    (place / "zarr.json").write_text("{}")
+    verify.repair(root, verify.verify(root), 1)
+    assert_same(root, before)
+
+
+def test_methods_are_added_to_a_small_dataset_as_if_they_had_been_asked_for(tmp_path: Path) -> None:
+    root = made(tmp_path / "all", SMALL)
+    (tmp_path / "some").mkdir()
+    file = file_of(tmp_path / "some", [SMALL])
+    file.write_text(file.read_text().replace("inter_photon, str_flux, qis_counts, qis_linear", "inter_photon"))
+    make(file, tmp_path / "some" / "out")
+    factory.add_reconstructions(tmp_path / "some" / "out", ("str_flux", "qis_counts", "qis_linear"), 1)
+    assert_same(tmp_path / "some" / "out", tree(root))
+
+
+def test_none_is_added_where_they_are_made_on_reading(tmp_path: Path) -> None:
+    root = made(tmp_path / "made", ON_READING)
+    with pytest.raises(InputError, match=r"on_reading.*make the dataset anew"):
+        factory.add_reconstructions(root, ("counts",), 1)
+
+
+def test_hdf5_has_one_compression(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="compression: small is for format: zarr"):
+        config.read(file_of(tmp_path, [SMALL], "hdf5"))
