@@ -13,7 +13,7 @@ import numpy as np
 
 from . import kernels, light, standing, units
 from .effects import Conditions
-from .errors import InputError, UnknownName, did_you_mean
+from .errors import InputError, UnknownName
 from .images import Images, check_size
 from .readout import Recorded
 from .reconstruct import Method, Settings
@@ -58,7 +58,7 @@ def level_of(levels: Sequence[Level], text: str) -> Level:
             continue
     known = [x.text for x in levels]
     near = next((x for x in known if x.split()[0] == str(text).strip()), None)
-    hint = f' Did you mean "{near}"?' if near else did_you_mean(text, known)
+    hint = f' Did you mean "{near}"?' if near else ""  # a level that is written alike is another amount of light
     raise UnknownName(f"{text!r} is not a light level here.{hint} There are {', '.join(known)}")
 
 

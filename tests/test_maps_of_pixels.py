@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import spadmnist
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
-from spadmnist.inference.candidates import candidates, with_values
+from spadmnist.inference.candidates import candidates, maps_beside, with_values
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps, light_levels_of
 from spadmnist.inference.pixel_maps import _DOUBT, PixelMap, pattern_tests
 from spadmnist.inference.replicates import Replicates
+from spadmnist.sensor import Sensor
 from spadmnist.workers import Serial
 
 SIDE, FRAMES = 20, 60_000
@@ -182,3 +184,45 @@ def test_a_gradient_is_a_gradient_and_no_pattern_of_rows(slope: float) -> None:
     assert found["rows"][1] < found["gradient"][1]
     found = told(np.ones(n))
     assert min(p for p, _ in found.values()) > 1e-4
+
+
+ANOTHER = """format: spadmnist-measurement/1
+name: lab
+layout: {rows: 16, columns: 16}
+captures:
+  - {id: dark, modality: qis, light: {kind: dark}, frames: 2000, frame_time: 10 us, frame_period: 10 us}
+  - {id: flat, modality: qis, frames: 2000, frame_time: 10 us, frame_period: 10 us,
+     light: {kind: flat, wavelength: 500 nm, irradiance: 20 nW/cm^2, relative_uncertainty: 5 %}}
+"""
+
+
+def chip(folder: Path, seed: int) -> Sensor:
+    text = SENSOR.replace(f"rows: {SIDE}, columns: {SIDE}", "rows: 16, columns: 16")
+    text = text.replace("200 Hz", "{lognormal: {median: 20 Hz, sigma: 2.27}}").replace("rules: device", "rules: paper")
+    (folder / "sensor.yaml").write_text(text.replace("  layout", f"  chip_seed: {seed}\n  layout"))
+    return config.read_sensor(folder / "sensor.yaml")
+
+
+def test_a_map_of_another_chip_is_a_candidate_until_it_is_fitted(tmp_path: Path) -> None:
+    model = chip(tmp_path, 1).resolved()
+    name = "per_pixel dark_counts.rate"
+    assert name in [c.name for c in candidates(model)]
+    fitted = with_values(model, {("dark_counts", "rate"): np.full(256, 30.0)})
+    (key,) = maps_beside(fitted, model)
+    assert key == ("dark_counts", "rate") and maps_beside(model, model) == []
+    assert name not in [c.name for c in candidates(fitted, (), [key])]
+
+
+@pytest.mark.slow
+def test_a_camera_has_another_chip_than_the_model(tmp_path: Path) -> None:
+    """The dark counts of its pixels are found and fitted; where the model is of that very chip nothing is missing."""
+    (tmp_path / "plan.yaml").write_text(ANOTHER)
+    truth, model = chip(tmp_path, 2).resolved(), chip(tmp_path, 1)
+    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
+    found = spadmnist.diagnose(model, data, quick=True, within="none")
+    assert found.verdict == "explained" and [s.candidate.name for s in found.steps] == ["per_pixel dark_counts.rate"]
+    hot = (rates := np.asarray(truth.effect("dark_counts").rate)) > 2000  # 40 dark counts in each capture
+    fitted = np.asarray(found.model.effect("dark_counts").rate)
+    assert hot.sum() > 3 and np.all(np.abs(fitted[hot] / rates[hot] - 1) < 0.5)
+    assert spadmnist.diagnose(truth, data, quick=True, within="none").verdict == "adequate"

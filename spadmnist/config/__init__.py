@@ -48,7 +48,8 @@ def read(
         try:
             return experiment.with_levels(lux)
         except KeyError as error:
-            raise ConfigError([f"--lux: {error.args[0]}"]) from None
+            add = f"add it in {path} under scene, {experiment.levels[0].kind}"
+            raise ConfigError([f"--lux: {error.args[0]}; to make another one, {add}"]) from None
     return experiment
 
 

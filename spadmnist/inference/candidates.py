@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -108,12 +108,14 @@ def _numeric(declared: Parameter) -> bool:
     return declared.unit != "bool" and not declared.choices and declared.search is not None
 
 
-def candidates(sensor: Sensor, captures: Iterable[Capture] = ()) -> list[Candidate]:
+def candidates(sensor: Sensor, captures: Iterable[Capture] = (), fitted: Collection[Key] = ()) -> list[Candidate]:
     """Every candidate of a sensor, in the order of the effects' names.
 
     Args:
         sensor: the model to change.
         captures: an effect that is `of_scene` is a candidate only where one of these is of a scene.
+        fitted: the parameters whose values are maps that these captures gave. Another map, of a file or of another
+            chip, may be wrong here.
     """
     scenes = any(capture.light.scene is not None for capture in captures)
     out: list[Candidate] = []
@@ -126,7 +128,7 @@ def candidates(sensor: Sensor, captures: Iterable[Capture] = ()) -> list[Candida
         if listed[name].of_scene and not scenes:
             continue
         out += _settings(listed[name])
-        out += _maps(sensor, listed[name])
+        out += _maps(sensor, listed[name], fitted)
     return out
 
 
@@ -180,7 +182,7 @@ def _settings(effect: Effect) -> Iterator[Candidate]:
         yield Candidate("set", effect.name, name, (coordinate,))
 
 
-def _maps(sensor: Sensor, effect: Effect) -> Iterator[Candidate]:
+def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[Candidate]:
     whole = {k: p for k, p in effect.parameters.items() if p.per_pixel}
     for name, declared in whole.items():
         value = getattr(effect, name)
@@ -189,18 +191,30 @@ def _maps(sensor: Sensor, effect: Effect) -> Iterator[Candidate]:
             continue  # it carries the map of another parameter
         carrier = multipliers[0] if declared.by_wavelength and multipliers else name
         at = getattr(effect, carrier)
-        if isinstance(at, (ByWavelength, bool, np.ndarray)) or isinstance(value, np.ndarray):
-            continue
         key = effect.name, carrier
+        if isinstance(at, (ByWavelength, bool)) or key in fitted:
+            continue
         blinds = declared.unit == "s" and _blinds(sensor, key, value)
         yield Candidate("per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds)
 
 
-def _blinds(sensor: Sensor, key: Key, value: float) -> bool:
+def maps_beside(sensor: Sensor, start: Sensor) -> list[Key]:
+    """The parameters of a sensor whose values are maps that `start` lacks."""
+    return [
+        (effect.name, name)
+        for effect in sensor.effects
+        for name in effect.parameters
+        if np.ndim(at := getattr(effect, name)) and not np.array_equal(getattr(start.effect(effect.name), name, 0), at)
+    ]
+
+
+def _blinds(sensor: Sensor, key: Key, value: float | np.ndarray) -> bool:
     """Whether a parameter is the sensor's dead time itself: the dead times equal it and follow it."""
     other = value * _TURNED
     follows = sensor.dead_times, with_values(sensor, {key: other}).dead_times
-    return value > 0 and all(np.allclose(a, b, rtol=1e-9) for a, b in zip(follows, (value, other), strict=True))
+    return bool(np.all(value > 0)) and all(
+        np.allclose(a, b, rtol=1e-9) for a, b in zip(follows, (value, other), strict=True)
+    )
 
 
 def templates(candidate: Candidate) -> list[dict[Key, float]]:

@@ -26,7 +26,7 @@ from ..streams import Streams
 from ..workers import Executor
 from .blind_times import ShortestIntervals
 from .budget import Budget, work_of
-from .candidates import Candidate, candidates, on_chip, with_values
+from .candidates import Candidate, candidates, maps_beside, on_chip, with_values
 from .coordinates import Key, Values
 
 if TYPE_CHECKING:
@@ -307,7 +307,8 @@ class Replicates:
 
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """Every candidate of a sensor that these captures can show."""
-        return candidates(sensor, (seen.capture for seen in self.seen.values()))
+        captures = (seen.capture for seen in self.seen.values())
+        return candidates(sensor, captures, maps_beside(sensor, self.start))
 
     def halves(self, ids: Collection[str]) -> Replicates:
         """Some captures alone, each as two: its blocks of time 1, 3, ... and its blocks 2, 4, ...

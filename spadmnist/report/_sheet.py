@@ -264,7 +264,7 @@ def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf
     largest = float(values.max())
     if white is None:
         usual = float(np.quantile(values, 0.995))
-        white = min(usual if 0 < 4 * usual < largest else largest, clip)
+        white = min(usual if 0 < 2 * usual < largest else largest, clip)
     scaled = np.clip(values / white, 0, 1) if white > 0 else np.zeros(values.shape)
     if values.ndim == 4 and values.shape[1] == 3:
         rgb = np.moveaxis(scaled, 1, -1)
