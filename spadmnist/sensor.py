@@ -207,6 +207,16 @@ class Sensor:
         return next((e for e in self.effects if e.name == name), None)
 
     @cached_property
+    def _apart(self) -> Sensor | None:
+        """A part of a chip as a sensor of its own, whose closed forms are the same, at the cost of its pixels alone;
+        None where an effect's closed form needs the whole chip (`Effect.by_pixel`).
+        """
+        if not all(effect.by_pixel for effect in self.effects):
+            return None
+        effects = [type(e)(**{name: getattr(e, name) for name in e.parameters}) for e in self.effects]
+        return replace(self, effects=effects, chip=None, window=None, _resolved=False).resolved()
+
+    @cached_property
     def block(self) -> int:
         """Images that must be simulated together: 1, or `BLOCK` where an effect does not count its draws."""
         return BLOCK if self.uncounted else 1
@@ -220,7 +230,7 @@ class Sensor:
     def dead_times(self) -> np.ndarray:
         """(pixels,) s during which a pixel is blind after a detection; 0 without a dead time."""
         if self.chip is not None and self.window is not None:
-            return self.chip.dead_times[self.window.pixels]
+            return self.chip.dead_times[self.window.pixels] if self._apart is None else self._apart.dead_times
         longest = np.zeros(self.layout.pixels)
         for effect in self.at("dead_time"):
             if not hasattr(effect, "blind_time"):
@@ -277,6 +287,8 @@ class Sensor:
         photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             # by this very rule: one that a subclass has set is upon what it finds here
+            if self._apart is not None:
+                return Sensor.rates(self._apart, photons, conditions)
             there = Sensor.rates(self.chip, self.window.spread(photons), conditions)
             return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate = photons
@@ -301,6 +313,8 @@ class Sensor:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
         photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
+            if self._apart is not None:
+                return self._apart.expected(photons, conditions)
             there = self.chip.expected(self.window.spread(photons), conditions)
             return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate, light = self.rates(photons, conditions)

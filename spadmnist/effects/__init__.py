@@ -148,6 +148,8 @@ class Effect(Plugin, abstract=True):
     # light stage: it changes the scene that is seen, before all others; light that is the same everywhere stays so
     of_scene: ClassVar[bool] = False
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
+    # its closed forms are those of each pixel by itself, so that a part of a chip needs no other part's
+    by_pixel: ClassVar[bool] = False
     acts_on: ClassVar[str] = "light"  # arrival stage: "light", "dark" or "own"
     cause: ClassVar[str] = (
         ""  # dark, arrival ("own") and correlated stage: what its events are called; default: its name

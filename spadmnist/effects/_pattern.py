@@ -10,6 +10,8 @@ from . import Chip, Conditions, Effect
 class Pattern(Effect, stage="light", abstract=True):
     """Every line of pixels, a row or a column, sees the light with a gain of its own."""
 
+    by_pixel = True
+
     gain: float | np.ndarray
 
     def line(self, chip: Chip) -> np.ndarray:

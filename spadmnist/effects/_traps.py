@@ -18,6 +18,7 @@ class Traps(Effect, stage="correlated", abstract=True):
     A subclass declares the parameters `probability` and `lifetime`.
     """
 
+    by_pixel = True
     counted = True
     probability: Any
     lifetime: Any

@@ -15,6 +15,7 @@ class BackgroundLight(Effect, stage="dark"):
     Source: no published number; up to 20 % of the signal is realistic.
     """
 
+    by_pixel = True
     moves = ("linearity", "level")
 
     rate = parameter(

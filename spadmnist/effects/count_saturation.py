@@ -15,6 +15,7 @@ class CountSaturation(Effect, stage="readout"):
     Source: counters of 1-12 bit; no published number.
     """
 
+    by_pixel = True
     counted = True
     moves = ("saturation",)
 

@@ -14,6 +14,7 @@ class DarkCounts(Effect, stage="dark"):
     Source: Suonsivu et al., Alg. 1 lines 10-12; typical 1-1000 Hz (Table 1).
     """
 
+    by_pixel = True
     cause = "dark"
     moves = ("dark_level", "dark_map", "level", "outliers")
 

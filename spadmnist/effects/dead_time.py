@@ -19,6 +19,7 @@ class DeadTime(Effect, stage="dead_time"):
     Knoll, Radiation Detection and Measurement, ch. 4.
     """
 
+    by_pixel = True
     moves = ("edge", "intervals", "linearity", "fano", "level", "ceiling")
     shown: ClassVar[dict[str, Any]] = {"duration": 100e-9}  # the same in all pixels: a sharp edge
 

@@ -16,6 +16,7 @@ class Detection(Effect, stage="detection"):
     Source: Suonsivu et al., Alg. 1 lines 6-9; typical 30-70 % at the peak (Table 1).
     """
 
+    by_pixel = True
     moves = ("map", "rows_columns", "surface", "level", "outliers")
 
     pdp = parameter(

@@ -39,6 +39,7 @@ class Flicker(Effect, stage="arrival"):
     Source: no published number; 100 or 120 Hz and their harmonics, 0.01-10 %, are realistic.
     """
 
+    by_pixel = True
     moves = ("spectrum", "far_pairs", "neighbours", "autocorrelation", "trend")
     shown: ClassVar[dict[str, Any]] = {"frequency": 5e3}  # several periods in an exposure
 

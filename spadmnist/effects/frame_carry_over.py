@@ -14,6 +14,7 @@ class FrameCarryOver(Effect, stage="dead_time"):
     Source: no published number; a dead time is 0.1-1 % of a frame, and the frame's reset may or may not end it.
     """
 
+    by_pixel = True
     moves = ("frames_lag", "first")
 
     share = parameter(

@@ -21,6 +21,7 @@ class Jitter(Effect, stage="timing"):
     after Sun et al. 2019. Alg. 1 leaves it out. Tails of 5-20 % and 0.1-1 ns are experience, no published number.
     """
 
+    by_pixel = True
     counted = True
     moves = ("edge",)
     mimic = Mimic("a dead time that differs from event to event", "pixel", "a pulsed source")

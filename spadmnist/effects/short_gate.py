@@ -19,6 +19,7 @@ class ShortGate(Effect, stage="gate"):
     5.75 ns; for a fixed error, 0.2-20 ns a frame by experience, no published number.
     """
 
+    by_pixel = True
     moves = (
         "first",
         "spectrum",

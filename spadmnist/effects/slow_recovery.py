@@ -21,6 +21,7 @@ class SlowRecovery(Effect, stage="dead_time"):
     Source: Krause and Walenta, arXiv 2507.10361; typical 1-50 ns.
     """
 
+    by_pixel = True
     shown: ClassVar[dict[str, Any]] = {"time_constant": 3e-9}  # the whole climb behind the dead time
     moves = ("edge", "intervals", "linearity", "fano", "level")
 

@@ -15,6 +15,7 @@ class SourceDrift(Effect, stage="arrival"):
     Source: no published number; 0.1-5 % per capture is realistic for plasma and incandescent lamps.
     """
 
+    by_pixel = True
     moves = ("trend", "spectrum", "far_pairs", "neighbours", "autocorrelation", "fano")
 
     slope = parameter(

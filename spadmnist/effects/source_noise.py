@@ -107,6 +107,7 @@ class SourceNoise(Effect, stage="arrival"):
     light and laser noise have 1 us to ms.
     """
 
+    by_pixel = True
     counted = True
     moves = ("far_pairs", "neighbours", "autocorrelation", "spectrum", "fano", "intervals", "frames_lag", "ceiling")
 

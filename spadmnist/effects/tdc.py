@@ -17,6 +17,7 @@ class Tdc(Effect, stage="timing"):
     Source: Suonsivu et al., Alg. 1 lines 30-32; typical 5-100 ps (Table 1).
     """
 
+    by_pixel = True
     counted = True
     last = True  # whatever else happens to a time stamp happens before it becomes a number
     moves = ("phase", "edge", "ceiling")
