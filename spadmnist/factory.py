@@ -40,12 +40,12 @@ from .golden import versions
 from .identity import ENCODING, FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other
 from .images import Images
 from .reconstruct import median_of_nonzero
+from .sensor import BYTES_PER_EVENT
 from .sources import Source
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
-_PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 
@@ -431,7 +431,7 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
     # packed bits are held once; stamps and images two to three times, before and after they are put in order
     framed = bool({"str", "qis"} & set(experiment.readouts))
     streams = bits = scratch = 0.0
-    each = _PER_EVENT_CAUSED if experiment.causes else _PER_EVENT
+    each = _PER_EVENT_CAUSED if experiment.causes else BYTES_PER_EVENT
     for (level, split), n in most.items():
         events, size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])
         scratch = max(scratch, each * experiment.sensor.at_once(events, experiment.readouts))
