@@ -397,9 +397,8 @@ def check_bytes(
 def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
     """Raise InputError where one image would hold more than can be simulated or stored."""
     images = next(iter(splits.values()))
-    shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else 1000]
     channels = images.pixels[0].size // experiment.sensor.layout.pixels
-    experiment.check_volume(float(shown.mean(dtype=np.float64)) / images.white, channels)
+    experiment.check_volume(images.mean(1000) / images.white, channels)
 
 
 def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard], jobs: int) -> int:
@@ -634,7 +633,7 @@ def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: 
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
     labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
-    return Task(job, os.path.abspath(root), shard, images.pixels[first:last], labels, images.white, first, run)
+    return Task(job, os.path.abspath(root), shard, images.some(first, last), labels, images.white, first, run)
 
 
 def greet(workers: Executor, experiment: Experiment) -> None:
