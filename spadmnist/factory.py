@@ -45,7 +45,7 @@ from .sources import Source
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
-_LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
+_LIBRARIES = 170 * 2**20  # bytes (measured: 110 to 170 MB)
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 
@@ -421,7 +421,11 @@ def most_workers(experiment: Experiment, splits: Mapping[str, Images], processor
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
-    """Bytes: interpreter and libraries, what is simulated at once, and the streams and encoded bytes of a shard."""
+    """Bytes: interpreter and libraries, images, what is simulated at once, the streams and encoded bytes of a shard.
+
+    The images are those that lie in memory, in one process alone: it is counted to each, for it may be the only one.
+    """
+    held = sum(part.pixels.nbytes for part in splits.values() if part.in_memory)
     most: dict[tuple[str, str], int] = {}
     for shard in shards:
         if shard.level is not None:
@@ -436,7 +440,7 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
         scratch = max(scratch, each * experiment.sensor.at_once(events, experiment.readouts))
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
-    return int(_LIBRARIES + scratch + 3 * streams + 1.2 * bits)
+    return int(_LIBRARIES + held + scratch + 3 * streams + 1.2 * bits)
 
 
 def _memory_there() -> int:

@@ -114,6 +114,11 @@ class Images:
             digest.update(np.ascontiguousarray(self.labels).data)
         return digest.hexdigest()
 
+    @property
+    def in_memory(self) -> bool:
+        """Do all images lie in memory? Not large ones, which lie in a file, nor repetitions of one."""
+        return self.pixels.nbytes <= large.IN_MEMORY and self.pixels.strides[0] != 0
+
     def mean(self, n: int) -> float:
         """The mean grey level of the first `n` images, or of all."""
         if n not in self._means:  # there may be as many as fill a disk, and each shard asks for it

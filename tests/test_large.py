@@ -210,3 +210,42 @@ def test_large_images_take_little_memory(tmp_path: Path) -> None:
 def test_repetitions_of_a_small_set_share_no_memory() -> None:
     images = Images(numbers((2, 6, 5), "u1"), None, 255.0)
     assert np.array_equal(images.repeated(2).pixels, np.repeat(images.pixels, 2, axis=0))
+
+
+_TAKEN = """
+import sys
+from pathlib import Path
+from spadmnist import config, factory, plan
+experiment = config.read(sys.argv[1])
+splits = experiment.load_images()
+told = plan.estimate(experiment, splits, 1)["memory_per_worker"]
+factory.generate(experiment, splits, Path(sys.argv[2]), 1)
+peak = next(int(l.split()[1]) * 1024 for l in Path("/proc/self/status").read_text().splitlines() if l[:5] == "VmHWM")
+print(told, peak)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of a process is read from /proc")
+@pytest.mark.parametrize("kind", ["digits", "chart", "photos"])
+def test_the_memory_that_is_told_is_what_a_run_takes(tmp_path: Path, kind: str) -> None:
+    """The peak of a process that makes a dataset alone is between half of what is told, and all of it."""
+    rng = np.random.Generator(np.random.PCG64(1))
+    (tmp_path / "photos").mkdir()
+    for i in range(8):
+        Image.fromarray(rng.integers(0, 256, (480, 640), np.uint8)).save(tmp_path / "photos" / f"{i}.png")
+    source, side, lux = {
+        "digits": ("{source: digits, train: 3000, test: 0}", (28, 28), "160 mlux"),
+        "chart": ("{source: chart, count: 64, of: {source: digits, train: 100, test: 0}}", (512, 512), "160 mlux"),
+        "photos": ("{source: folder, path: photos}", (480, 640), "160 mlux"),
+    }[kind]
+    (tmp_path / "config.yaml").write_text(
+        f"seed: 1\nscene: {{lux: [{lux}], images: {source}}}\n"
+        "recording: {exposure: 1 ms, frames: 100, frame_time: 10 us, readouts: [tr, str, qis]}\n"
+        "reconstruct: [counts, inter_photon]\n"
+        f"sensor:\n  name: some\n  layout: {{rows: {side[0]}, columns: {side[1]}, pixel_area: 25 um^2}}\n"
+        "  effects: {detection: {pdp: 0.5}, dead_time: {duration: 50 ns}, tdc: {resolution: 10 ps}}\n"
+    )
+    arguments = [sys.executable, "-c", _TAKEN, str(tmp_path / "config.yaml"), str(tmp_path / "out")]
+    told, peak = map(int, subprocess.run(arguments, capture_output=True, text=True, check=True).stdout.split())
+    print(told, peak)
+    assert 0.5 * told < peak < told
