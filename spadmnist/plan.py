@@ -65,7 +65,7 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
         counted = np.asarray(counted) * (n // len(shown))
         photons = experiment.photons(level, np.arange(256, dtype=np.uint8)[:, None, None], images.white)
         everywhere = np.broadcast_to(photons[:, :1], (256, experiment.sensor.layout.pixels))
-        recorded = np.concatenate([_seen(experiment, np.array(part))[:, 0] for part in _some_of(everywhere)])
+        recorded = np.concatenate([_seen(experiment, np.array(part))[:, 0].copy() for part in _some_of(everywhere)])
         total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
         return total, float(counted @ recorded)
     step = max(1, n // max(1, min(256, _NUMBERS // pixels[0].size)))
