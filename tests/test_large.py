@@ -249,5 +249,4 @@ def test_the_memory_that_is_told_is_what_a_run_takes(tmp_path: Path, kind: str) 
     arguments = [sys.executable, "-c", _TAKEN, str(tmp_path / "config.yaml"), str(tmp_path / "out")]
     subprocess.run([*arguments[:-1], str(tmp_path / "before")], check=True)  # compiles what is not compiled yet
     told, peak = map(int, subprocess.run(arguments, capture_output=True, text=True, check=True).stdout.split())
-    print(told, peak)
     assert 0.5 * told < peak < told
