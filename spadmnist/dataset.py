@@ -155,8 +155,7 @@ def _cut(level: str | None, folder: str, split: str, n: int, most: int) -> list[
 def expected_per_image(experiment: Experiment, level: Level, images: Images) -> tuple[float, float]:
     """(events, bytes before compression) expected of one mean image of a split."""
     n = experiment.wanted(images)
-    shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else n]
-    grey = float(shown.mean(dtype=np.float64)) / images.white
+    grey = images.mean(n) / images.white
     pixels = images.pixels[0].size
     photons = np.full((1, pixels), experiment.white(level) * grey)
     if experiment.wavelengths:

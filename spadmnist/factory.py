@@ -40,12 +40,12 @@ from .golden import versions
 from .identity import ENCODING, FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other
 from .images import Images
 from .reconstruct import median_of_nonzero
+from .sensor import BYTES_PER_EVENT
 from .sources import Source
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
-_LIBRARIES = 200 * 2**20  # bytes (measured: 170 to 200 MB)
-_PER_EVENT = 50  # bytes, of what is simulated at once (measured: 20 to 70, by the effects that there are)
+_LIBRARIES = 240 * 2**20  # bytes (measured: 110 to 230 MB, by the kernels that there are)
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 
@@ -397,9 +397,8 @@ def check_bytes(
 def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
     """Raise InputError where one image would hold more than can be simulated or stored."""
     images = next(iter(splits.values()))
-    shown = images.pixels[: 1 if images.pixels.strides[0] == 0 else 1000]
     channels = images.pixels[0].size // experiment.sensor.layout.pixels
-    experiment.check_volume(float(shown.mean(dtype=np.float64)) / images.white, channels)
+    experiment.check_volume(images.mean(1000) / images.white, channels)
 
 
 def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard], jobs: int) -> int:
@@ -422,7 +421,11 @@ def most_workers(experiment: Experiment, splits: Mapping[str, Images], processor
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
-    """Bytes: interpreter and libraries, what is simulated at once, and the streams and encoded bytes of a shard."""
+    """Bytes: interpreter and libraries, images, what is simulated at once, the streams and encoded bytes of a shard.
+
+    The images are those that lie in memory, in one process alone: it is counted to each, for it may be the only one.
+    """
+    held = sum(part.pixels.nbytes for part in splits.values() if part.in_memory)
     most: dict[tuple[str, str], int] = {}
     for shard in shards:
         if shard.level is not None:
@@ -431,13 +434,13 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
     # packed bits are held once; stamps and images two to three times, before and after they are put in order
     framed = bool({"str", "qis"} & set(experiment.readouts))
     streams = bits = scratch = 0.0
-    each = _PER_EVENT_CAUSED if experiment.causes else _PER_EVENT
+    each = _PER_EVENT_CAUSED if experiment.causes else BYTES_PER_EVENT
     for (level, split), n in most.items():
         events, size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])
         scratch = max(scratch, each * experiment.sensor.at_once(events, experiment.readouts))
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
-    return int(_LIBRARIES + scratch + 3 * streams + 1.2 * bits)
+    return int(_LIBRARIES + held + scratch + 3 * streams + 1.2 * bits)
 
 
 def _memory_there() -> int:
@@ -634,7 +637,7 @@ def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: 
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
     labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
-    return Task(job, os.path.abspath(root), shard, images.pixels[first:last], labels, images.white, first, run)
+    return Task(job, os.path.abspath(root), shard, images.some(first, last), labels, images.white, first, run)
 
 
 def greet(workers: Executor, experiment: Experiment) -> None:

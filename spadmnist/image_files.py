@@ -18,7 +18,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.lib import format as npy
 
-from . import disk
+from . import disk, large
 from .errors import InputError
 
 MAX_BYTES = 8 * 2**30  # the images of one source; beyond it a header is taken for damaged or hostile
@@ -96,13 +96,9 @@ def _read_idx(stream: IO[bytes], ndim: int, path: Path, most: int, packed: bool)
         raise InputError(f"{path}: {declared}, more than the {MAX_BYTES} allowed; the file is damaged")
     if size > most - len(head):
         raise InputError(f"{path}: {declared}, more than the file can hold; download or copy it again")
-    data = np.empty(size, np.uint8)
-    view, filled = data.data, 0
-    while filled < size:
-        got = stream.readinto(view[filled:])  # type: ignore[attr-defined]
-        if not got:
-            raise InputError(f"{path}: {declared}, but only {filled} follow; download or copy it again")
-        filled += got
+    data = large.empty((size,), np.uint8)
+    if (found := large.filled(data, stream)) < size:
+        raise InputError(f"{path}: {declared}, but only {found} follow; download or copy it again")
     # reading past the end also makes gzip check its checksum
     if stream.read(1):
         raise InputError(f"{path}: {declared}, but more follow; the file is damaged or not what it says")
@@ -245,7 +241,7 @@ def read_npy(stream: IO[bytes], size: int, place: str) -> np.ndarray:
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"format version {version[0]}.{version[1]}, which plain numbers never need")
         read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
+        shape, fortran, dtype = read_header(stream)
     # the header is a Python literal, and NumPy's reader of it raises nearly anything when it is damaged
     except Exception as error:
         raise InputError(f"{place}: its header is damaged ({reason(error)}); store it again by np.save") from error
@@ -256,6 +252,16 @@ def read_npy(stream: IO[bytes], size: int, place: str) -> np.ndarray:
         raise InputError(f"{place}: it declares {declared} bytes, {MAX_BYTES} are allowed; store fewer images")
     if declared != held or min(shape, default=0) < 0:
         raise InputError(f"{place}: it declares {shape} {dtype}, {declared} bytes, but {held} follow; store it again")
+    if declared > large.IN_MEMORY:
+        if fortran:  # an image lies across all of the file
+            raise InputError(
+                f"{place}: it holds {declared} bytes in the order of Fortran, in which {large.IN_MEMORY} are allowed; "
+                "store np.ascontiguousarray(images)"
+            )
+        out = large.empty(shape, dtype)
+        if (found := large.filled(out, stream)) < declared:
+            raise InputError(f"{place}: it ends too early (after {found} bytes); store it again by np.save")
+        return out
     stream.seek(0)
     try:
         return npy.read_array(stream, allow_pickle=False)

@@ -15,7 +15,7 @@ import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Any, Literal
@@ -24,7 +24,7 @@ import numpy as np
 import platformdirs
 from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
-from . import disk, image_files, tiles
+from . import disk, image_files, large, tiles
 from .digits import draw_digit
 from .errors import InputError, SpadError
 from .events import MOST_PIXELS
@@ -76,6 +76,7 @@ class Images:
     ignored: int = 0
     tiles: Tiles | None = None
     transparent: int = 0
+    _means: dict[int, float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (3, 4) or self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
@@ -106,12 +107,32 @@ class Images:
         """
         pixels = self.pixels[:1] if self.pixels.strides[0] == 0 else self.pixels
         digest = hashlib.sha256(f"{pixels.dtype.name} {self.pixels.shape}".encode())
-        for image in pixels:
-            digest.update(np.ascontiguousarray(image).data)
+        for _, some in large.blocks(pixels):
+            digest.update(np.ascontiguousarray(some).data)
         if self.labels is not None:
             digest.update(b"labels")
             digest.update(np.ascontiguousarray(self.labels).data)
         return digest.hexdigest()
+
+    @property
+    def in_memory(self) -> bool:
+        """Do all images lie in memory? Not large ones, which lie in a file, nor repetitions of one."""
+        return self.pixels.nbytes <= large.IN_MEMORY and self.pixels.strides[0] != 0
+
+    def mean(self, n: int) -> float:
+        """The mean grey level of the first `n` images, or of all."""
+        if n not in self._means:  # there may be as many as fill a disk, and each shard asks for it
+            self._means[n] = large.mean(self.pixels[: 1 if self.pixels.strides[0] == 0 else n])
+        return self._means[n]
+
+    def some(self, start: int, stop: int) -> np.ndarray:
+        """The pixels of the images from `start` to `stop`, apart from the others where those lie in a file."""
+        part = self.pixels[start:stop]
+        if self.pixels.nbytes <= large.IN_MEMORY or self.pixels.strides[0] == 0:
+            return part
+        part = part.copy()
+        large.release(self.pixels)
+        return part
 
     def head(self, n: int | None) -> Images:
         """The first `n` images (all where `n` is None), in memory of their own so that the rest can go."""
@@ -119,7 +140,7 @@ class Images:
             return self
         pixels = self.pixels[:n]
         if pixels.strides[0] != 0:
-            pixels = pixels.copy()
+            pixels = large.copied(pixels)
         labels = None if self.labels is None else self.labels[:n].copy()
         names = None if self.names is None else self.names[:n]
         return replace(self, pixels=pixels, labels=labels, names=names)
@@ -131,7 +152,7 @@ class Images:
         if len(self) == 1:
             pixels = np.broadcast_to(self.pixels, (times, *self.pixels.shape[1:]))
         else:
-            pixels = np.repeat(self.pixels, times, axis=0)
+            pixels = large.repeated(self.pixels, times)
         labels = None if self.labels is None else np.repeat(self.labels, times)
         names = None if self.names is None else tuple(name for name in self.names for _ in range(times))
         return replace(self, pixels=pixels, labels=labels, names=names)
@@ -334,7 +355,7 @@ class Idx(_Source):
             labels = read_idx(labels_file, 1) if labels_file else None
             part = _labelled(images, labels, 255.0, (images_file, labels_file)).head(limit)
             if self.transpose:
-                part = replace(part, pixels=np.ascontiguousarray(part.pixels.swapaxes(1, 2)))
+                part = replace(part, pixels=large.converted(part.pixels.swapaxes(1, 2), np.uint8))
             splits[split] = part
         return splits
 
@@ -686,8 +707,8 @@ def _read_folder(root: Path, names: list[str], how: Folder, grey_palettes: bool)
             f"{root}: {len(names)} images like {names[0]} take more than the {image_files.MAX_BYTES} bytes allowed; "
             "give fewer (--limit) or smaller ones"
         )
-    pixels = np.empty((len(names), *first.shape), first.dtype)
-    transparent = 0
+    pixels = large.empty((len(names), *first.shape), first.dtype)
+    transparent, fresh = 0, 0  # fresh: bytes that lie in memory
     for i, name in enumerate(names):
         image, clear = _read_picture(root / name, how, grey_palettes) if i else (first, clear)
         if (image.shape, image.dtype) != (first.shape, first.dtype):
@@ -697,6 +718,7 @@ def _read_folder(root: Path, names: list[str], how: Folder, grey_palettes: bool)
             )
         pixels[i] = image
         transparent += clear
+        fresh = large.kept_low(pixels, fresh + image.nbytes)
     return pixels, transparent
 
 
@@ -811,7 +833,11 @@ def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.n
         raise InputError(f"{place}: its shape is {array.shape}, that is nothing; give at least one image")
     dtype: np.dtype[Any]
     if array.dtype.kind == "b":
-        array, dtype = np.where(array, np.uint8(255), np.uint8(0)), np.dtype(np.uint8)
+        bits, dtype = array, np.dtype(np.uint8)
+        array = large.empty(bits.shape, dtype)
+        for start, part in large.blocks(bits):
+            array[start : start + len(part)] = np.where(part, np.uint8(255), np.uint8(0))
+            large.release(array)
     elif array.dtype.kind == "f":
         dtype = np.dtype(np.float32)
     elif array.dtype.kind == "u" and array.itemsize <= 2:
@@ -824,7 +850,8 @@ def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.n
     top = _white(white, dtype)
     allowed = min(top, 65535.0) if dtype.kind == "u" else top
     # a NaN makes both comparisons false
-    if not (array.min() >= 0 and array.max() <= allowed):
+    least, most = large.range_of(array)
+    if not (least >= 0 and most <= allowed):
         for i, image in enumerate(array):
             wrong = image[~((image >= 0) & (image <= allowed))]
             if wrong.size:
@@ -832,7 +859,7 @@ def _to_images(array: np.ndarray, white: float | None, place: str) -> tuple[np.n
                     f"{place}: image {i} (counted from 0) has the value {wrong[0]}, allowed is 0 to "
                     f"{allowed:g}; correct it, or set white to the grey level of white"
                 )
-    return np.ascontiguousarray(array, dtype), top
+    return large.converted(array, dtype), top
 
 
 def _to_labels(array: np.ndarray, place: str) -> np.ndarray:
@@ -879,9 +906,10 @@ class Digits(_Source):
                     f"scene.images: {number} digits of {self.rows} x {self.columns} pixels take more than "
                     f"the {image_files.MAX_BYTES} bytes allowed; ask for fewer or smaller ones"
                 )
-            pixels = np.empty((number, self.rows, self.columns), np.uint8)
+            pixels, fresh = large.empty((number, self.rows, self.columns), np.uint8), 0
             for i in range(number):
                 pixels[i] = draw_digit(i % 10, (self.seed, stream, i), self.rows, self.columns)
+                fresh = large.kept_low(pixels, fresh + pixels[i].nbytes)
             splits[split] = Images(pixels, (np.arange(number) % 10).astype(np.uint8), 255.0)
         return splits
 

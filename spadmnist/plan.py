@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import dataset, factory, store
+from . import dataset, factory, large, store
 from .experiment import Experiment
 from .foreign import visible
 from .images import Images
 
 _PROBE = 64  # images a level, at most
-_EVENTS = 2e7  # expected of them; of a larger image some rows are taken
+_EVENTS = 9e6  # as many as a shard has, expected of them; of a larger image some rows are taken
 _NUMBERS = 2**24  # pixels of the images that expectations are taken over, where pixels differ
+_AT_ONCE = 2**20  # numbers whose expectations are taken together: a dry run takes no more memory than a run
 _BESIDES_ENCODING = 1.6  # hashing, writing and synchronising, against simulating and encoding (measured: 1.3 to 2)
 
 
@@ -58,22 +59,29 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
     pixels = images.pixels[:n]
     if pixels.dtype == np.uint8 and _uniform(experiment) and not experiment.wavelengths:
         # every pixel obeys the same law: the histogram of grey levels says it all
-        counted = (
-            np.bincount(pixels[0].ravel(), minlength=256) * n
-            if pixels.strides[0] == 0
-            else np.bincount(pixels.ravel(), minlength=256)
-        )
+        shown = pixels[:1] if pixels.strides[0] == 0 else pixels
+        # image by image: of all of them at once there would be a copy of 8 bytes for each pixel
+        counted = sum(np.bincount(image.ravel(), minlength=256) for _, some in large.blocks(shown) for image in some)
+        counted = np.asarray(counted) * (n // len(shown))
         photons = experiment.photons(level, np.arange(256, dtype=np.uint8)[:, None, None], images.white)
-        row = np.tile(photons, (1, experiment.sensor.layout.pixels))[:, : experiment.sensor.layout.pixels]
-        recorded = _seen(experiment, row)
+        everywhere = np.broadcast_to(photons[:, :1], (256, experiment.sensor.layout.pixels))
+        recorded = np.concatenate([_seen(experiment, np.array(part))[:, 0].copy() for part in _some_of(everywhere)])
         total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
-        return total, float(counted @ recorded[:, 0])
+        return total, float(counted @ recorded)
     step = max(1, n // max(1, min(256, _NUMBERS // pixels[0].size)))
-    some = np.ascontiguousarray(pixels[::step])
-    photons = experiment.photons(level, some, images.white)
-    recorded = _seen(experiment, photons.reshape(-1, experiment.sensor.layout.pixels))
-    share = n / len(some)
-    return float(photons.sum()) * experiment.conditions.exposure * share, float(recorded.sum()) * share
+    photons = recorded = 0.0
+    for part in _some_of(pixels[::step]):
+        here = experiment.photons(level, np.ascontiguousarray(part), images.white)
+        photons += float(here.sum())
+        recorded += float(_seen(experiment, here.reshape(-1, experiment.sensor.layout.pixels)).sum())
+    share = n / len(pixels[::step])
+    return photons * experiment.conditions.exposure * share, recorded * share
+
+
+def _some_of(array: np.ndarray) -> Iterator[np.ndarray]:
+    """Some items after the other, as many as little memory holds of their numbers."""
+    step = max(1, _AT_ONCE // array[0].size)
+    return (array[start : start + step] for start in range(0, len(array), step))
 
 
 def _seen(experiment: Experiment, photons: np.ndarray) -> np.ndarray:

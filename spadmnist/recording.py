@@ -254,9 +254,12 @@ class Recording:
             events = Events(None, self.events.offsets, self.pixels, ticks, tick, end=self.conditions.exposure)
             return replace(self, events=events, tick=tick, _kept={})
         assert self.frames is not None and self.tick is not None
-        stamps, none = np.asarray(self.frames[:]), no_detection(self.conditions.frame_time, tick)
-        whole = np.where(stamps == self.none, none, _whole(stamps * (self.tick / tick), none - 1))
-        return replace(self, frames=whole.astype(unsigned_for(none, "time stamps")), tick=tick, _kept={})
+        none = no_detection(self.conditions.frame_time, tick)
+        frames = np.empty(self.frames.shape, unsigned_for(none, "time stamps"))
+        for start, stamps in self.chunks():
+            whole = _whole(stamps * (self.tick / tick), none - 1)
+            frames[start : start + len(stamps)] = np.where(stamps == self.none, none, whole)
+        return replace(self, frames=frames, tick=tick, _kept={})
 
     def every_other(self, second: bool) -> Recording | None:
         """Every other block of time, one after the other, as a capture half as long; None where it is too short.

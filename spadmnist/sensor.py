@@ -27,6 +27,7 @@ from .readout import Frames, Recorded, counts_type, no_detection, summarised, un
 from .streams import BLOCK, Draws, Streams
 from .window import Window
 
+BYTES_PER_EVENT = 50  # of what is simulated at once (measured: 20 to 70, by the effects that there are)
 _EVENTS_AT_ONCE = 200_000  # expected events of a sub-batch: its buffers stay in the processor's cache
 _MOST_AT_ONCE = 1e8  # expected events that are simulated at once: 4 GB of memory, and more with every effect there is
 _MOST_EVENTS = 2e9  # of an image that is simulated part by part

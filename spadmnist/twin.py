@@ -112,16 +112,23 @@ def _by_stretches(
     sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, frames: int, told: _Told
 ) -> Recording:
     """Frames that stand alone, a stretch of them at a time."""
-    found = []
-    for n, start in enumerate(range(0, capture.conditions.frames, frames)):
-        count = min(frames, capture.conditions.frames - start)
-        part = replace(capture.conditions, frames=count, exposure=count * capture.conditions.frame_period)
+    c, at, tick = capture.conditions, 0, None
+    whole = np.empty(0)
+    for n, start in enumerate(range(0, c.frames, frames)):
+        count = min(frames, c.frames - start)
+        part = replace(c, frames=count, exposure=count * c.frame_period)
         own = Streams(streams.seed, f"{streams.level}/stretch {n}", streams.split, streams.images)
         made = sensor.expose(flux[None], part, own, (capture.modality,))
-        found.append(_recording(sensor, made, 0, replace(capture, conditions=part)))
-        told(count / capture.conditions.frames)
-    whole = np.concatenate([np.asarray(one.frames[:]) for one in found if one.frames is not None])
-    return Recording(capture, sensor.layout, None, whole, found[0].tick, sensor.nominal_dead_time)
+        found = _recording(sensor, made, 0, replace(capture, conditions=part))
+        assert found.frames is not None
+        stretch = np.asarray(found.frames[:])
+        if not start:
+            number = c.count_frames if capture.modality == "counts" else c.frames
+            whole, tick = np.empty((number, *stretch.shape[1:]), stretch.dtype), found.tick
+        whole[at : at + len(stretch)] = stretch
+        at += len(stretch)
+        told(count / c.frames)
+    return Recording(capture, sensor.layout, None, whole, tick, sensor.nominal_dead_time)
 
 
 def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, told: _Told) -> Recording:

@@ -111,6 +111,10 @@ class Executor:
             about: what it is asked, which can be hashed.
         """
 
+    def limited(self, most: int) -> Executor:
+        """The executor that does at most so many tasks at a time on this machine; other machines have their own."""
+        return self
+
     def close(self) -> None:
         """Let go of the workers of other machines."""
 
@@ -228,6 +232,10 @@ class Loky(Executor):
     def __init__(self, jobs: int):
         self.threads = jobs
         self._started = 0
+
+    def limited(self, most: int) -> Executor:
+        # fewer workers are other ones; those that are too many end as the first task is given to the others
+        return self if most >= self.threads else Loky(max(1, most))
 
     @contextlib.contextmanager
     def _opened(self, number: int) -> Iterator[None]:

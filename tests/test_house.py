@@ -25,7 +25,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "compiled"},
     {"import_options"},
-    {"disk", "kernels", "sources", "workers"},
+    {"disk", "kernels", "large", "sources", "workers"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
     {"validated", "scene", "zipped"},
     {"effects", "readout", "remote", "images", "pictures", "positions", "window"},

@@ -86,7 +86,7 @@ def compare(
             progress.advance(max(100 * share - done[0], 0), what)  # what is periodic is simulated once more
             done[0] = max(100 * share, done[0])
 
-        found = comparison.compare(model, data, seed, smallest, workers, progress=told)
+        found = comparison.compare(model, data, seed, smallest, workers, progress=told, say=progress.notice)
         progress.stop()
     _write_answer(json_file, comparison.canonical(found))
     what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files))

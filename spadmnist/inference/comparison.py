@@ -178,6 +178,7 @@ def compare(
     jobs: int | Executor = 2,
     replicates: int = REPLICATES,
     progress: Callable[[str, float], None] | None = None,
+    say: Callable[[str], None] = lambda what: None,
 ) -> Comparison:
     """The goodness of fit of a model to a measurement: every statistic of every capture, and the light levels.
 
@@ -188,13 +189,15 @@ def compare(
         jobs: number of workers of this machine, or an executor.
         replicates: of each capture.
         progress: called with the name of a capture and the share of the work that is done.
+        say: called with a line where fewer workers are used than there are.
     Raises:
-        InputError: where sensor and measurement do not belong together, or nothing can be compared.
+        InputError: where sensor and measurement do not belong together, nothing can be compared, or a replicate of a
+            capture takes too much memory.
     """
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
-        say = progress or (lambda capture, share: None)
-        simulations = Replicates(sensor, measurement, seed, workers, replicates, progress=say)
+        told = progress or (lambda capture, share: None)
+        simulations = Replicates(sensor, measurement, seed, workers, replicates, say, progress=told)
         evaluation, _ = evaluate_start(simulations)
         return comparison_of(simulations, evaluation, tolerance)
 

@@ -17,12 +17,13 @@ import numpy as np
 from .. import twin
 from ..effects import Effect
 from ..effects._traps import Traps
+from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from .candidates import Candidate, templates, with_values
 from .coordinates import Coordinate, Key
 from .light_levels import closed_form, level_for
-from .point_process import DENSE, Bits, Law, Stamps, blur_of
+from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 
 FALL = 3.84  # of twice the log-likelihood, at the ends of a 95 % interval
@@ -30,6 +31,9 @@ EDGE_FALL = 5.99  # the same for an edge sharper than the intervals are dense: i
 _FAR = 100.0  # of the log-likelihood: a start that is lower than the maximum by more is dropped
 _HIGHER = 0.05  # of the log-likelihood: a value that is higher by more shows that a maximum is none
 _ROUGH = 0.3, 0.5  # tolerances of `by_simplex`: near enough for a parabola
+# bytes of the time stamps of all captures and of their gaps: beside the program it keeps within `memory.MOST`
+_HELD = 800_000_000
+_LIKELIHOODS = 2  # that are held at once: of the model, and of the model without a change
 _SHARP = 0.1  # of a lifetime: the blur of the stamps must be smaller
 
 
@@ -101,7 +105,8 @@ class Likelihood:
         self, sensor: Sensor, data: Sequence[Recording], coordinates: Sequence[Coordinate], fixed: Mapping[Key, Any]
     ):
         self.sensor, self.coordinates, self.fixed = sensor, tuple(coordinates), dict(fixed)
-        self.laws = [Stamps(r) if r.modality == "tr" else Bits(r) for r in data]
+        most = _most_gaps(data)
+        self.laws = [Stamps(r, most[r.capture.id]) if r.modality == "tr" else Bits(r) for r in data]
         captures = [r.capture for r in data]
         self.levels, columns, precision = [], [], []
         common = np.zeros(len(data))
@@ -199,6 +204,26 @@ class Likelihood:
         return total
 
 
+def recordings(measurement: Measurement, sensor: Sensor, seen: Mapping[str, float]) -> list[Recording] | str:
+    """The recordings of some captures for `maximise`; the name of what stands in its way where they are too large.
+
+    Args:
+        seen: detections, by capture.
+    """
+    stamps = sum(seen[c.id] for c in measurement.captures if c.id in seen and c.modality == "tr")
+    if 4 * stamps > _HELD:
+        return f"{stamps:.3g} time stamps, which are more than the {_HELD / 4:.0e} that are held at once"
+    return [measurement.recording(id, sensor) for id in seen]
+
+
+def _most_gaps(data: Sequence[Recording]) -> dict[str, float]:
+    """The gaps that the law of each capture may hold: by the number of its stamps."""
+    events = {r.capture.id: r.events for r in data if r.events is not None}
+    room = _HELD - sum(one.stamps[0].nbytes for one in events.values())
+    each = room / BYTES_OF_A_GAP / _LIKELIHOODS / max(1, sum(map(len, events.values())))
+    return {id: max(0.0, each * len(one)) for id, one in events.items()}
+
+
 def maximise(
     sensor: Sensor,
     data: Sequence[Recording],
@@ -219,7 +244,8 @@ def maximise(
         mapped: pixels have rates of their own that are not exactly known; then no coordinate that changes a rate is
             fitted.
     Returns:
-        The estimates; a coordinate that the likelihood does not depend on has its search range as interval.
+        The estimates, or what stands in the way: the time stamps, too, where more of them are close to each other than
+        are held at once. A coordinate that the likelihood does not depend on has its search range as interval.
     """
     coordinates = tuple(d for candidate in candidates for d in candidate.coordinates)
     fixed = {key: value for candidate in candidates for key, value in candidate.fixed}
@@ -240,7 +266,27 @@ def maximise(
         for model in (changed, elsewhere):
             if word := not_in_likelihood(model, one.capture):
                 return word
-    function = Likelihood(sensor, data, coordinates, fixed)
+    try:
+        return _maximum(Likelihood(sensor, data, coordinates, fixed), data, candidates, values, start, errors, mapped)
+    except TooManyGaps:
+        return f"{sum(len(r.events) for r in data if r.events is not None):.3g} time stamps so close to each other"
+
+
+def _maximum(
+    function: Likelihood,
+    data: Sequence[Recording],
+    candidates: Sequence[Candidate],
+    values: Mapping[Key, Any],
+    start: Mapping[Key, float] | None,
+    errors: Mapping[Key, float] | None,
+    mapped: bool,
+) -> MaximumLikelihood | str:
+    """As `maximise`.
+
+    Args:
+        values: of the parameters where nothing better is known.
+    """
+    sensor, coordinates, fixed = function.sensor, function.coordinates, function.fixed
     ends = np.array([d.ends for d in coordinates]).T
     given = {d.key: float(values[d.key]) for d in coordinates}
     widths = {d.key: 0.3 if d.log else 0.1 * (d.ends[1] - d.ends[0]) for d in coordinates}

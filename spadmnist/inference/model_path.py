@@ -16,7 +16,7 @@ from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .error_budget import HeldMaps, Rung, physical_errors
 from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, square, stacked
-from .exact_likelihood import maximise, not_in_likelihood
+from .exact_likelihood import maximise, not_in_likelihood, recordings
 from .gauss_newton import Fit, error_scale, gauss_newton_step
 from .phases import evaluate_start
 from .pixel_maps import HALF_95, map_values
@@ -387,7 +387,9 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
     if any(not_in_likelihood(path.evaluation.sensors.one, capture) for capture in captures):
         return
     replicates.say("the likelihood of the data")
-    data = [measurement.recording(capture.id, replicates.start) for capture in captures]
+    data = recordings(measurement, replicates.start, {id: seen.total for id, seen in replicates.seen.items()})
+    if isinstance(data, str):
+        return
     own = {key for candidate in wanted for key in keys_of(candidate, path)}
     sensor = with_values(replicates.start, {key: x for key, x in path.values.items() if key not in own})
     start = {d.key: float(path.values[d.key]) for d in coordinates}
@@ -399,6 +401,7 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
             errors[coordinate.key] = abs(coordinate.coordinate(v.high) - coordinate.coordinate(v.low)) / (2 * HALF_95)
     mapped = any(step.candidate.carrier for step in path.steps)
     found = maximise(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
+    del data  # the replicates need the memory
     if isinstance(found, str):
         return
     largest_move, failed = 0.0, {block.cell for block in path.failed}

@@ -20,7 +20,7 @@ from .candidates import Candidate, candidates
 from .comparison import comparison_with
 from .coordinates import Key, point_of
 from .evaluation import log_likelihood_ratio
-from .exact_likelihood import MaximumLikelihood, maximise
+from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .model_path import ModelPath, accept, begin, edge_errors, fit_all, material, scale_errors
@@ -80,8 +80,12 @@ def fit_named(
         path = begin(replicates)
         start, wrong = path.evaluation, bool(path.failed)
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))
-        data = [measurement.recording(c.id, replicates.start) for c in measurement.captures if c.mean is None]
-        exact = maximise(replicates.start, data, wanted) if len(data) == len(replicates.seen) else "a mean alone"
+        exact: MaximumLikelihood | str = "a mean alone"
+        if all(capture.mean is None for capture in measurement.captures):
+            totals = {id: seen.total for id, seen in replicates.seen.items()}
+            data = recordings(measurement, replicates.start, totals)
+            exact = data if isinstance(data, str) else maximise(replicates.start, data, wanted)
+            del data  # the replicates need the memory
         if isinstance(exact, str):
             say(f"by simulation, for there is no likelihood of {exact}")
             _by_simulation(path, wanted)

@@ -9,7 +9,8 @@ probability. The tick and the jitter blur the edge at the end of the dead time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,9 @@ DENSE = 4.0  # intervals within the width of an edge, beyond which its estimate 
 _LEAST = 1e-9  # the least probability that an interval ends before the dead time: a wrong stamp is not impossible
 _PROBES = 4096  # events that are stamped to measure the blur, at least
 _LONG = 20.0  # lifetimes after which a trap is empty
+_PIECE = 1 << 20  # gaps that are looked at together
+# of a gap that may be short: itself, its hazard, its kind; and itself once more while the pieces are put together
+BYTES_OF_A_GAP = 8 + 8 + 1 + 8
 _FOLLOWS, _LAST = 1, 2  # kinds of gaps: after another short one; to the end of the exposure
 # (pixels,) rates -> (log-likelihood, its derivative by the rate, minus about the second one), (pixels,) each
 Law = Callable[[np.ndarray], tuple[np.ndarray, ...]]
@@ -214,31 +218,57 @@ def _at_best(hazard, offsets, used, counts, awake, rate):
     return total
 
 
+class TooManyGaps(Exception):
+    """A law would hold more gaps than it may."""
+
+
+def _joined(pieces: list[np.ndarray], dtype: Any) -> np.ndarray:
+    """The pieces one after the other; none of them is there any more."""
+    out, at = np.empty(sum(map(len, pieces)), dtype), 0
+    for k, piece in enumerate(pieces):
+        out[at : at + len(piece)] = piece
+        at += len(piece)
+        pieces[k] = out[:0]
+    return out
+
+
 class Stamps:
     """The law of the time stamps of a capture."""
 
-    def __init__(self, recording: Recording):
+    def __init__(self, recording: Recording, most: float = math.inf):
+        """The law of a recording, which is held: 4 or 8 bytes of each stamp.
+
+        Args:
+            most: gaps that may be held as well, `BYTES_OF_A_GAP` each.
+        """
         assert recording.events is not None
-        self.capture = recording.capture
-        times, offsets = recording.events.times, recording.events.offsets.astype(np.int64)
+        self.capture, self.events, self.most = recording.capture, recording.events, most
+        self.offsets = recording.events.offsets.astype(np.int64)
         self.tick = recording.tick or 0.0
-        self.counts = np.diff(offsets)
+        self.counts = np.diff(self.offsets)
         pixels = len(self.counts)
-        # for each pixel: the gaps between its events, then the one to the end; before its first one nothing has
-        # happened
-        lit = np.flatnonzero(self.counts)
-        self.gaps = np.diff(np.append(times, 0.0))
-        self.gaps[offsets[lit + 1] - 1] = self.capture.conditions.exposure - times[offsets[lit + 1] - 1]
-        self.last = np.zeros(len(times), bool)
-        self.last[offsets[lit + 1] - 1] = True
-        self.first = np.zeros(len(times), bool)
-        self.first[offsets[lit]] = True
-        self.offsets = offsets
         self.reach, self.near = -1.0, (np.zeros(0), np.zeros(0, np.uint8), np.zeros(pixels + 1, np.int64))
         self.hazard, self.used = np.zeros(0), np.zeros(pixels, np.int64)
         self.best = np.zeros(pixels)
         self.given: list[np.ndarray] = []
         self.parts = np.zeros((2, pixels))
+
+    def _gaps(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """(which events, the gaps behind them, s, whether each is the last of its pixel) piece by piece.
+
+        A pixel's last gap reaches to the end of the exposure; before its first event nothing has happened.
+        """
+        count, ends = int(self.offsets[-1]), self.offsets[1:][self.counts > 0] - 1
+        for start in range(0, count, _PIECE):
+            part = slice(start, min(start + _PIECE, count))
+            times = self.events.times_of(slice(part.start, part.stop + 1))
+            number = part.stop - part.start
+            gaps = np.diff(times if len(times) > number else np.append(times, 0.0))
+            at = ends[np.searchsorted(ends, part.start) : np.searchsorted(ends, part.stop)] - part.start
+            last = np.zeros(number, bool)
+            last[at] = True
+            gaps[at] = self.capture.conditions.exposure - times[at]
+            yield part, gaps, last
 
     def rates(self, sensor: Sensor, level: float) -> np.ndarray:
         """The rates of the pixels at a light level, (pixels,), 1/s."""
@@ -252,12 +282,24 @@ class Stamps:
         if reach <= self.reach < 3 * reach:
             return
         self.reach = 1.5 * reach
-        short = self.gaps <= self.reach
-        kinds = np.where(self.last, _LAST, 0).astype(np.uint8)
-        kinds[1:] |= np.where(short[:-1] & ~self.first[1:], _FOLLOWS, 0).astype(np.uint8)
-        kept = np.append(0, np.cumsum(short))
-        self.near = self.gaps[short], kinds[short], kept[self.offsets]
-        self.hazard = np.zeros(len(self.near[0]))
+        short, all_kinds = [], []
+        before, held = False, 0  # is the gap before the piece a short one, and not the last of its pixel?
+        kept = np.zeros(len(self.counts) + 1, np.int64)
+        for part, gaps, last in self._gaps():
+            near = gaps <= self.reach
+            follows = np.append(before, (near & ~last)[:-1])
+            before = bool(near[-1] and not last[-1])
+            kinds = np.where(last, _LAST, 0) | np.where(follows, _FOLLOWS, 0)
+            short.append(gaps[near])
+            all_kinds.append(kinds[near].astype(np.uint8))
+            inside = slice(*np.searchsorted(self.offsets, (part.start, part.stop)))
+            kept[inside] = held + np.append(0, np.cumsum(near))[self.offsets[inside] - part.start]
+            held += len(short[-1])
+            if held > self.most:
+                raise TooManyGaps
+        kept[self.offsets >= self.offsets[-1]] = held
+        self.near = _joined(short, np.float64), _joined(all_kinds, np.uint8), kept
+        self.hazard = np.zeros(held)
 
     def of(self, sensor: Sensor, blur: float, own: bool) -> tuple[float, Law]:
         """(log-likelihood without what depends on the rates, the rest as a law of the rates).
@@ -295,8 +337,12 @@ class Stamps:
             dead: (pixels,) s.
             blur: s.
         """
-        beyond = self.gaps - np.repeat(dead, self.counts)
-        return int(np.count_nonzero(np.abs(beyond[~self.last]) <= self.tick + 2 * blur))
+        dead, number = np.broadcast_to(dead, len(self.counts)), 0
+        for part, gaps, last in self._gaps():
+            pixel = np.searchsorted(self.offsets, np.arange(part.start, part.stop), "right") - 1
+            beyond = gaps - dead[pixel]
+            number += int(np.count_nonzero(np.abs(beyond[~last]) <= self.tick + 2 * blur))
+        return number
 
 
 class Bits:

@@ -24,6 +24,7 @@ from ..sensor import Sensor
 from ..statistics import Statistic, Summary
 from ..streams import Streams
 from ..workers import Executor
+from . import memory
 from .blind_times import ShortestIntervals
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, maps_beside, on_chip, with_values
@@ -38,6 +39,7 @@ TOTALS = ("", "rates")  # the block of the totals of all captures
 FEW = 4  # replicates of each capture that give the difference between two models
 REPLICATES = 96  # replicates of each capture, by default
 _EVENTS_AT_ONCE = 4_000_000  # detections that are simulated at a time, in as many replicates as hold them
+_FEW_EVENTS = 100_000  # detections and bits of frames, of which a replicate takes little memory
 _SCALES = 8  # replicates whose scales are averaged, however many there are
 
 
@@ -291,11 +293,18 @@ class Replicates:
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
         self.simulations, self.budget, self.journal = 0, budget or Budget(), journal
+        self._told: set[int] = set()  # numbers of workers that were told of
         for capture in measurement.captures:
             if capture.mean is not None:
                 self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
-            else:
-                self.seen[capture.id] = ReducedCapture.of(self.recording(capture.id), reduced)
+                continue
+            recording = self.recording(capture.id)
+            total = float(recording.totals.sum())
+            if reduced:  # its replicates have as many detections: what is too large is refused before it is reduced
+                needed = memory.replicate_bytes(self.start, recording.capture, total, total)
+                memory.check(self.start, recording.capture, needed)
+            self.seen[capture.id] = ReducedCapture.of(recording, reduced)
+            del recording  # before the next one is read
 
     def recording(self, id: str) -> Recording:
         """The recording of a capture, with its corrected exposure where there is one."""
@@ -319,8 +328,8 @@ class Replicates:
         other.seen = {}
         for id in (id for id in self.seen if id in ids and self.seen[id].counts is not None):
             whole = self.recording(id)
-            parts = [whole.every_other(second) for second in (False, True)]
-            for name, part, second in zip(halves_of(id), parts, (False, True), strict=True):
+            for name, second in zip(halves_of(id), (False, True), strict=True):
+                part = whole.every_other(second)  # one after the other, so that only one of them is held
                 if part is not None:
                     seen = ReducedCapture.of(part, self.reduced)
                     other.seen[name] = replace(seen, half_of=(replace(whole.capture, tick=whole.tick), second))
@@ -334,6 +343,34 @@ class Replicates:
     def dark(self) -> list[str]:
         """The captures without light."""
         return [id for id, seen in self.seen.items() if seen.capture.light.dark]
+
+    def _bytes(self, sensor: Sensor, id: str, photons: np.ndarray) -> float:
+        """Bytes of one replicate of a capture; 0 where they are few whatever the sensor.
+
+        Raises:
+            InputError: where a replicate takes more than one worker may.
+        """
+        seen = self.seen[id]
+        capture, second = seen.half_of or (seen.capture, None)
+        frames = 0 if capture.modality == "tr" else capture.conditions.frames * self.start.layout.pixels
+        if seen.total + frames < _FEW_EVENTS:
+            return 0.0
+        sensor = InTheDark.of(sensor) if capture.light.dark else sensor
+        needed = memory.bytes_with(sensor, capture, float(photons.max()), second is not None)
+        memory.check(sensor, capture, needed)
+        return needed
+
+    def _limited(self, needed: float) -> Executor:
+        """The workers, as many as may make replicates that take so many bytes at the same time."""
+        number = memory.workers_at_once(needed, self.workers.threads)
+        workers = self.workers.limited(number)
+        if workers.threads < self.workers.threads and workers.threads not in self._told:
+            self._told.add(workers.threads)
+            self.say(
+                f"{workers.threads} of {self.workers.threads} workers are used at a time: a simulated recording of the "
+                f"largest capture takes about {needed / 1e9:.2g} GB of memory"
+            )
+        return workers
 
     def _work(self, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
@@ -361,11 +398,14 @@ class Replicates:
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | str] = [""] * len(wanted)
         names = [self._name(one, pieces, hasty) for one in wanted]
+        most = 0.0  # bytes of a replicate
         for k, (sensors, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
             try:
+                if len(numbers):
+                    most = max(most, self._bytes(sensors.of(id, int(numbers[0])), id, photons))
                 for part in parts:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
                     models = [Packed.of(sensors.of(id, number)) for number in each]
@@ -396,7 +436,7 @@ class Replicates:
                 if self.journal and isinstance(whole, CaptureReplicates):
                     self.journal.keep(names[k], whole)
 
-        self.workers.run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
+        self._limited(most).run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
         return out
 
     def _name(self, wanted: tuple[Model, str, np.ndarray, np.ndarray], pieces: int, hasty: bool) -> str | None:
