@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import functools
 import json
 import os
 import platform
 import re
-import resource
 import secrets
 import shutil
 import socket
@@ -29,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, golden, plugins, reconstruct, store
+from . import config, dataset, disk, document, golden, plugins, reconstruct, store, system
 from .compiled import compiling
 from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
@@ -206,46 +204,36 @@ def locked(root: Path, part: Part | None = None) -> Iterator[None]:
 
     The system frees the locks of a process that is killed. Raises SpadError where another run holds them.
     """
+    if part and not system.SHARED_LOCKS:
+        raise SpadError(f"--part {part}: this system has no lock that several parts can hold; leave it out")
     busy = f"{root}: another run is writing there; wait for it, or choose another folder with -o"
     with contextlib.ExitStack() as held:
-        whole = held.enter_context(_flocked(root, "lock", fcntl.LOCK_SH if part else fcntl.LOCK_EX, busy))
+        whole = held.enter_context(_lock(root, "lock", busy, shared=part is not None))
         if part:
             busy = f"{root}: another run is making part {part} of it; wait for that one"
-            held.enter_context(_flocked(root, f"part-{part.number}-of-{part.of}", fcntl.LOCK_EX, busy))
+            held.enter_context(_lock(root, f"part-{part.number}-of-{part.of}", busy))
         try:
             yield
         finally:
-            with contextlib.suppress(BlockingIOError):  # by other parts, of which one is the last
-                if part:
-                    fcntl.flock(whole, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not part or whole.make_sole():  # of several parts the last one
                 _leave(root)
+    with contextlib.suppress(OSError):  # what is held cannot be removed everywhere
+        os.rmdir(root / STATE)
+        os.rmdir(root)
 
 
-@contextlib.contextmanager
-def _flocked(root: Path, name: str, kind: int, busy: str) -> Iterator[int]:
+def _lock(root: Path, name: str, busy: str, shared: bool = False) -> system.Lock:
     """A lock in the state of a dataset, which is made. Raises SpadError(busy) where another process holds it."""
     state = root / STATE
-    path = state / name
     while True:
         with _writable(root):
             state.mkdir(parents=True, exist_ok=True)
             try:
-                handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                return system.Lock(state / name, shared)
+            except system.Busy:
+                raise SpadError(busy) from None
             except FileNotFoundError:  # the run that ended meanwhile has removed the folder
                 continue
-        try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(handle)
-            raise SpadError(busy) from None
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle), os.stat(path)):
-                break
-        os.close(handle)  # the run that held it has finished and removed it: what is locked is nobody's lock
-    try:
-        yield handle
-    finally:
-        os.close(handle)
 
 
 def _leave(root: Path) -> None:
@@ -404,7 +392,7 @@ def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
 
 def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard], jobs: int) -> int:
     """Bytes that a worker takes. Raises InputError where so many workers at a time do not fit into this machine."""
-    needed, there = memory_per_worker(experiment, splits, shards), _memory_there()
+    needed, there = memory_per_worker(experiment, splits, shards), system.memory()
     if min(jobs, len(shards)) * needed > there:
         fit = there // needed
         do = f"give --jobs {fit}" if fit else "lower the frames, the exposure, the light or the number of pixels"
@@ -418,7 +406,7 @@ def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: S
 def most_workers(experiment: Experiment, splits: Mapping[str, Images], processors: int) -> int:
     """How many workers there may be: one for each processor, as far as memory goes, and one at least."""
     needed = memory_per_worker(experiment, splits, dataset.shards_of(experiment, splits))
-    return max(1, min(processors, _memory_there() // needed))
+    return max(1, min(processors, system.memory() // needed))
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
@@ -438,13 +426,6 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
     return int(_LIBRARIES + scratch + 3 * streams + 1.2 * bits)
-
-
-def _memory_there() -> int:
-    """Bytes that this machine, or the limit that was set for this process, has for all of it."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return whole if limit == resource.RLIM_INFINITY else min(whole, limit)
 
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
@@ -492,8 +473,7 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
     with _writable(root):
         if part is None:
             disk.sweep(disk.temporary(root))
-        with open(root / STATE / "begin", "wb") as file:  # parts begin one after the other
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with system.Lock(root / STATE / "begin", wait=True):  # parts begin one after the other
             if not (root / STATE / "plan.json").exists():
                 # records without a plan are those of a run that has finished
                 shutil.rmtree(root / STATE / "shards", ignore_errors=True)
