@@ -355,15 +355,15 @@ def check_bytes(
 ) -> None:
     """Raise SpadError where this machine makes other bytes than what is there, or than its libraries once made.
 
-    made: the shards that are there and by what each was made, as far as that is known. Where one was made by something
-    else than is here, the config's golden shard must be the known one; where none is known, the first shard of each
-    other maker is made again and compared. again: makes the files of a shard, by their names for `store.put_shard`.
+    made: the shards that are there and by what each was made, as far as that is known. Where one may have been made by
+    something else than is here, the config's golden shard must be the known one; where none is known, the first shard
+    of each such maker is made again and compared. again: makes the files of a shard, named as for `store.put_shard`.
     """
     here = golden.made_by()
     others: dict[str, tuple[Shard, Mapping[str, str] | None]] = {}
     for shard in sorted(made, key=lambda one: one.level is None):  # the originals, in which nothing is drawn, last
         maker = made[shard]
-        if maker is None or any(here.get(name) != version for name, version in maker.items()):
+        if maker is None or not here.items() <= maker.items():  # a finished dataset does not say its processor
             others.setdefault(json.dumps(maker, sort_keys=True), (shard, maker))
     if not others and golden.known()["versions"].items() <= versions().items():
         return
@@ -371,7 +371,7 @@ def check_bytes(
     if golden.check(experiment):
         return
     for shard, maker in others.values():
-        progress.notice("Other versions or another machine made what is there: one shard is made again to compare.")
+        progress.notice("Other versions or another machine may have made what is there: one shard is made again.")
         place = store.location(shard.path, experiment.format)
         for name, data in again(shard).items():
             path = root / (place + name.removeprefix("shard"))
@@ -733,12 +733,13 @@ def add_reconstructions(
                 clear_records(root)  # of the run that made what is here, and was killed at its very end
             else:
                 refuse_other(root, wanted, there)
-        begin(root, wanted)
-        by_path = {s.path: s for s in shards if _record(root, s) is None}
+        begun = plan.exists()  # records without a plan are those of a run that has finished
+        by_path = {s.path: s for s in shards if not begun or _record(root, s) is None}
         job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
         makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s)[1] for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
+        begin(root, wanted)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
         def files_of(shard: Shard) -> dict[str, Files]:
