@@ -328,17 +328,17 @@ def generate(
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted, part)
         greet(workers, experiment)
-        _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
-        made = {s.path: s for s in shards if _is_made(root, s, experiment.format, like)}
+        made = {s: noted for s in shards if (noted := _made(root, s, experiment.format, like)) is not None}
+        _check_space(root, experiment, splits, sum(noted.bytes for noted in made.values()))
 
         def again(shard: Shard) -> dict[str, bytes]:
             return encode_shard(task_of(experiment, job_of(experiment), root, shard, splits[shard.split]))
 
-        check_bytes(root, experiment, {s: _noted(root, s)[1] for s in made.values()}, again, progress)
+        check_bytes(root, experiment, {s: noted.made_by for s, noted in made.items()}, again, progress)
         if part:
             shards = shards[part.number - 1 :: part.of]
-        missing = [s for s in shards if s.path not in made]
+        missing = [s for s in shards if s not in made]
         _make(experiment, splits, root, shards, missing, workers, progress)
         if part:
             return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})
@@ -482,14 +482,16 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
             disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
-def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images]) -> None:
-    """Refuse early where the disk cannot hold what is still to come (a rough, low estimate: half the raw size)."""
+def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images], present: int) -> None:
+    """Refuse early where the disk cannot hold what is still to come (a rough, low estimate: half the raw size).
+
+    present: bytes that are there already.
+    """
     raw = 0.0
     for images in splits.values():
         for level in experiment.levels:
             _, size = dataset.expected_per_image(experiment, level, images)
             raw += size * experiment.wanted(images)
-    present = sum(f.stat().st_size for f in root.rglob("*") if f.is_file())
     free = shutil.disk_usage(root).free
     needed = raw / 4 - present
     if free < needed:
@@ -504,36 +506,50 @@ def _likeness(experiment: Experiment, wanted: Mapping[str, Any]) -> Likeness:
     return Likeness(tuple(wanted["images"]["shape"]), experiment.conditions.frames, experiment.settings.tick)
 
 
-def _is_made(root: Path, shard: Shard, format: str, like: Likeness) -> bool:
-    """Is a shard there as it was made? Its attributes and the sizes of its files say so; its data are not read."""
-    made = _record(root, shard)
-    if made is None or not store.exists(root, shard.path, format):
-        return False
+def _made(root: Path, shard: Shard, format: str, like: Likeness) -> Note | None:
+    """What was noted of a shard that is there as it was made, else None.
+
+    Its attributes and the sizes of its files say so; its data are not read.
+    """
+    noted = _noted(root, shard)
+    if noted.files is None or not store.exists(root, shard.path, format):
+        return None
     reader = shard.reader(root, format, like)
+    base = f"{root}{os.sep}"
     try:
-        sizes = {name: os.lstat(root / name).st_size for name in made}
-        return bool(reader.names) and sizes == {name: facts["bytes"] for name, facts in made.items()}
+        for name, facts in noted.files.items():
+            if os.lstat(base + name).st_size != facts["bytes"]:
+                return None
+        return noted if reader.attributes else None
     except (InputError, OSError, KeyError, TypeError):
-        return False
+        return None
 
 
-def _record(root: Path, shard: Shard) -> Files | None:
-    """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
-    return _noted(root, shard)[0]
+@dataclass(frozen=True)
+class Note:
+    """What is noted of a shard: its files, and by what they were made; None where that is not known."""
+
+    files: Files | None
+    made_by: dict[str, str] | None
+
+    @property
+    def bytes(self) -> int:
+        """Of all its files."""
+        return sum(facts["bytes"] for facts in (self.files or {}).values())
 
 
-def _noted(root: Path, shard: Shard) -> tuple[Files | None, dict[str, str] | None]:
-    """(the digests of a shard's files, by what they were made) as they were noted; None where that is not known."""
+def _noted(root: Path, shard: Shard) -> Note:
+    """What was noted of a shard, as far as that can be read."""
     try:
         found = from_json(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
     except (OSError, ValueError):
-        return None, None
+        return Note(None, None)
     if not isinstance(found, dict):
-        return None, None
+        return Note(None, None)
     if not {"files", "made_by"} <= set(found):  # spadmnist 0.1.0 noted the files alone
-        return found, None
+        return Note(found, None)
     files, made_by = found["files"], found["made_by"]
-    return (files if isinstance(files, dict) else None), (made_by if isinstance(made_by, dict) else None)
+    return Note(files if isinstance(files, dict) else None, made_by if isinstance(made_by, dict) else None)
 
 
 def _make(
@@ -545,7 +561,8 @@ def _make(
     workers: Executor,
     progress: Progress,
 ) -> None:
-    work = {s.path: _work(experiment, splits, s) for s in shards}
+    each = {key: _work(experiment, splits, *key) for key in {(s.level, s.split) for s in shards}}
+    work = {s.path: (s.stop - s.start) * each[s.level, s.split] for s in shards}
     total = sum(work.values())
     progress.start("simulating", total, total - sum(work[s.path] for s in missing))
     by_path = {s.path: s for s in missing}
@@ -592,14 +609,13 @@ def make_shards(
             workers.run(encode_shard, tasks, list(by_path), keep)
 
 
-def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
-    """Rough cost of a shard, in seconds of one core: what the progress bar's time left rests on."""
-    n = shard.stop - shard.start
-    if shard.level is None:
-        return 2e-6 * n
-    images = splits[shard.split]
-    events, size = dataset.expected_per_image(experiment, experiment.level(shard.level), images)
-    return n * (8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size)
+def _work(experiment: Experiment, splits: Mapping[str, Images], level: str | None, split: str) -> float:
+    """Rough cost of an image, in seconds of one core: what the progress bar's time left rests on."""
+    if level is None:
+        return 2e-6
+    images = splits[split]
+    events, size = dataset.expected_per_image(experiment, experiment.level(level), images)
+    return 8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size
 
 
 def job_of(experiment: Experiment) -> Job:
@@ -734,10 +750,10 @@ def add_reconstructions(
             else:
                 refuse_other(root, wanted, there)
         begun = plan.exists()  # records without a plan are those of a run that has finished
-        by_path = {s.path: s for s in shards if not begun or _record(root, s) is None}
+        by_path = {s.path: s for s in shards if not begun or _noted(root, s).files is None}
         job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
-        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s)[1] for s in shards}
+        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s).made_by for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
         begin(root, wanted)
         files = dataset.files_by_shard(manifest["files"], after.format)
@@ -819,7 +835,7 @@ def finish(
     temporary = disk.temporary(root)
     files: Files = {}
     for shard in shards:
-        files |= _record(root, shard) or {}
+        files |= _noted(root, shard).files or {}
     small, groups = small_files(experiment, shards, normalisation)
     files |= store.write_groups(root, groups, experiment.format)
     for name, data in small.items():
