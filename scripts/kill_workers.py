@@ -53,6 +53,8 @@ def main() -> int:
             over.set()
             killer.join()
     seconds = time.monotonic() - started
+    if kills[0] < asked.kills:
+        print(f"Only {kills[0]} of {asked.kills} workers were killed: take more images, or a shorter --every")
     if run.returncode:
         print(f"After {kills[0]} kills in {seconds:.0f} s the run ended with status {run.returncode}")
         return 1
@@ -66,7 +68,8 @@ def kill(site: distributed.LocalCluster, kills: list[int], over: threading.Event
     """Kill a worker now and then, until it is over; kills: how many."""
     rng = random.Random(asked.seed)
     while kills[0] < asked.kills and not over.wait(rng.expovariate(1 / asked.every)):
-        # a nanny does not replace a worker that dies while it starts: that is none of ours
+        # a nanny whose worker dies as it starts replaces none and leaves: another comes, as a batch system sends one
+        site.scale(asked.workers)
         begun = [nanny.process for nanny in site.workers.values() if nanny.process]
         there = [process.pid for process in begun if process.pid and process.status.name == "running"]
         if len(there) > 1:

@@ -12,7 +12,6 @@ import hashlib
 import logging
 import os
 import shutil
-import stat
 import sys
 import tempfile
 import threading
@@ -21,6 +20,8 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
+
+from . import system
 
 
 @contextlib.contextmanager
@@ -45,7 +46,8 @@ with _without("scipy.linalg"):
     from numba.core import event
     from numba.extending import intrinsic
     from numba.misc.appdirs import user_cache_dir
-numba.np.arraymath._HAVE_BLAS = True
+if hasattr(numba.np.arraymath, "_HAVE_BLAS"):  # a name of numba's own, which another one may not have
+    numba.np.arraymath._HAVE_BLAS = True
 
 __all__ = ["compiling", "folder", "for_workers", "intrinsic", "kernel", "types"]
 
@@ -136,7 +138,7 @@ class _Compiling(event.Listener):
 
 
 def _family() -> str:
-    return f"spadmnist-kernels-{os.getuid()}-"
+    return f"spadmnist-kernels-{system.user()}-"
 
 
 def _places() -> Iterator[str | Path]:
@@ -157,8 +159,7 @@ def _usable(found: Path) -> bool:
         new = not os.path.lexists(found)
         with contextlib.suppress(FileExistsError):
             found.mkdir(mode=0o700)
-        facts = found.lstat()
-        if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.getuid() or facts.st_mode & 0o077:
+        if not system.is_private(found.lstat()):
             return False
         with tempfile.TemporaryFile(dir=found) as probe:
             probe.write(bytes(_PROBE))
@@ -175,5 +176,5 @@ def _remove_unused(place: Path) -> None:
     for other in place.glob(f"{_family()}*"):
         with contextlib.suppress(OSError):
             facts = other.lstat()
-            if facts.st_uid == os.getuid() and facts.st_mtime < time.time() - _UNUSED:
+            if system.is_own(facts) and facts.st_mtime < time.time() - _UNUSED:
                 shutil.rmtree(other)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import re
@@ -20,10 +19,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
+from . import system
 from .errors import InputError, SpadError
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
-_LARGE_FILE = 1 << 20  # bytes, from which on a written file is dropped from the page cache
 _SYNCS_AT_ONCE = 4  # threads that synchronise the files of a shard; 8 and 32 were no faster
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
@@ -47,10 +46,10 @@ def commit_file(
         _make_folder(path.parent)
         record = _put(work / "file", [data])
         if sync:
-            _sync(work / "file")
-        os.rename(work / "file", path)
+            system.synchronise(work / "file")
+        os.replace(work / "file", path)
         if sync:
-            _sync(path.parent)
+            system.synchronise(path.parent)
     return record
 
 
@@ -63,8 +62,10 @@ def opened(path: str | os.PathLike[str]) -> IO[bytes]:
     if _HANDED_OVER.fullmatch(os.fspath(path)):
         return open(path, "rb")
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        handle = os.open(path, system.READ | system.NO_WAIT)
     except OSError as error:
+        if os.path.isdir(path):  # which some systems do not open
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path)) from None
         if error.errno == errno.ENXIO:  # nobody listens at a socket, or there is no such device
             raise InputError(f"{path}: is a socket or a device, and only a file is read; name a file") from None
         raise
@@ -112,19 +113,22 @@ def whole(path: str | os.PathLike[str], size: int) -> Iterator[IO[bytes]]:
     part = path.with_name(f".{path.name}.part")
     with writing(path, size):
         _make_folder(path.parent)
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        with open(os.open(part, flags, 0o666), "r+b") as file:
-            if not _own(file, part):
-                raise SpadError(f"{path}: another run is writing it; wait for it, or choose another name with -o")
+        try:
+            lock = system.Lock(part)
+        except system.Busy:
+            raise SpadError(f"{path}: another run is writing it; wait for it, or choose another name with -o") from None
+        with lock:
             try:
-                file.truncate(0)
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
+                flags = system.BOTH | os.O_CREAT | system.NO_LINK | system.NO_WAIT
+                with open(os.open(part, flags, 0o666), "r+b") as file:
+                    file.truncate(0)
+                    yield file
+                    file.flush()
+                    os.fsync(file.fileno())
                 os.replace(part, path)
             finally:
                 part.unlink(missing_ok=True)
-        _sync(path.parent)
+        system.synchronise(path.parent)
 
 
 @contextlib.contextmanager
@@ -142,20 +146,19 @@ def whole_folder(path: str | os.PathLike[str], size: int, resumed: bool = False)
         if os.path.lexists(path):
             raise taken
         _make_folder(part)
-        handle = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise SpadError(f"{path}: another run is writing it; wait for it, or choose another -o") from None
+            lock = system.Lock(part)
+        except system.Busy:
+            raise SpadError(f"{path}: another run is writing it; wait for it, or choose another -o") from None
+        with lock:
             try:
                 if not resumed:
                     _empty(part)
                 yield part
                 for folder, _, names in os.walk(part):
                     for name in names:
-                        _sync(Path(folder, name))
-                    _sync(Path(folder))
+                        system.synchronise(Path(folder, name))
+                    system.synchronise(Path(folder))
                 try:
                     os.rename(part, path)  # over an empty folder at most
                 except OSError as error:
@@ -166,9 +169,7 @@ def whole_folder(path: str | os.PathLike[str], size: int, resumed: bool = False)
                 if not resumed:
                     shutil.rmtree(part, ignore_errors=True)
                 raise
-        finally:
-            os.close(handle)
-        _sync(path.parent)
+        system.synchronise(path.parent)
 
 
 def _empty(folder: Path) -> None:
@@ -182,18 +183,9 @@ def put_file(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
 
 
-def _own(file: IO[bytes], path: Path) -> bool:
-    """Hold an open file alone. False where another process does, or has renamed it meanwhile."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(file.fileno()), os.lstat(path))
-    except (BlockingIOError, FileNotFoundError):
-        return False
-
-
 def read_file(path: str | os.PathLike[str], most: int) -> bytes:
     """A regular file's content. Raises OSError for a link, a pipe and whatever else is no file, or a larger one."""
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    handle = os.open(path, system.READ | system.NO_LINK | system.NO_WAIT)
     with open(handle, "rb") as file:
         facts = os.fstat(file.fileno())
         if not stat.S_ISREG(facts.st_mode):
@@ -268,7 +260,7 @@ def _make_folder(folder: Path) -> None:
     _make_folder(folder.parent)
     with contextlib.suppress(FileExistsError):  # another worker was faster
         os.mkdir(folder)
-    _sync(folder.parent)
+    system.synchronise(folder.parent)
 
 
 def inside(root: Path, relative: str) -> Path:
@@ -289,7 +281,7 @@ def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
     memory for all of them would cost more time than the compression.
     """
     digest, size = hashlib.sha256(), 0
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb") as file:
+    with open(os.open(path, system.WRITE | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
         for piece in pieces:
             digest.update(piece)
             size += len(piece)
@@ -314,22 +306,11 @@ def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
                 os.mkdir(parent)
                 folders.add(parent)
             records[name] = _put(path, pieces)
-            syncs.append(pool.submit(_sync, path))
-        syncs += [pool.submit(_sync, parent) for parent in folders]
+            syncs.append(pool.submit(system.synchronise, path))
+        syncs += [pool.submit(system.synchronise, parent) for parent in folders]
         for sync in syncs:
             sync.result()
     return records
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-        if hasattr(os, "posix_fadvise") and os.fstat(handle).st_size >= _LARGE_FILE:
-            # what is safe on disk need not push others' data out of memory; its pages serve the next shard
-            os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
-    finally:
-        os.close(handle)
 
 
 def install(new: Path, final: Path, aside: Path) -> None:
@@ -346,4 +327,4 @@ def install(new: Path, final: Path, aside: Path) -> None:
         except OSError:
             os.rename(aside, final)
             raise
-    _sync(final.parent)
+    system.synchronise(final.parent)

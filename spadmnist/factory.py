@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import functools
 import json
 import os
 import platform
 import re
-import resource
 import secrets
 import shutil
 import socket
@@ -29,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, golden, plugins, reconstruct, store
+from . import config, dataset, disk, document, golden, plugins, reconstruct, store, system
 from .compiled import compiling
 from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
@@ -206,46 +204,36 @@ def locked(root: Path, part: Part | None = None) -> Iterator[None]:
 
     The system frees the locks of a process that is killed. Raises SpadError where another run holds them.
     """
+    if part and not system.SHARED_LOCKS:
+        raise SpadError(f"--part {part}: this system has no lock that several parts can hold; leave it out")
     busy = f"{root}: another run is writing there; wait for it, or choose another folder with -o"
     with contextlib.ExitStack() as held:
-        whole = held.enter_context(_flocked(root, "lock", fcntl.LOCK_SH if part else fcntl.LOCK_EX, busy))
+        whole = held.enter_context(_lock(root, "lock", busy, shared=part is not None))
         if part:
             busy = f"{root}: another run is making part {part} of it; wait for that one"
-            held.enter_context(_flocked(root, f"part-{part.number}-of-{part.of}", fcntl.LOCK_EX, busy))
+            held.enter_context(_lock(root, f"part-{part.number}-of-{part.of}", busy))
         try:
             yield
         finally:
-            with contextlib.suppress(BlockingIOError):  # by other parts, of which one is the last
-                if part:
-                    fcntl.flock(whole, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not part or whole.make_sole():  # of several parts the last one
                 _leave(root)
+    with contextlib.suppress(OSError):  # what is held cannot be removed everywhere
+        os.rmdir(root / STATE)
+        os.rmdir(root)
 
 
-@contextlib.contextmanager
-def _flocked(root: Path, name: str, kind: int, busy: str) -> Iterator[int]:
+def _lock(root: Path, name: str, busy: str, shared: bool = False) -> system.Lock:
     """A lock in the state of a dataset, which is made. Raises SpadError(busy) where another process holds it."""
     state = root / STATE
-    path = state / name
     while True:
         with _writable(root):
             state.mkdir(parents=True, exist_ok=True)
             try:
-                handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                return system.Lock(state / name, shared)
+            except system.Busy:
+                raise SpadError(busy) from None
             except FileNotFoundError:  # the run that ended meanwhile has removed the folder
                 continue
-        try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(handle)
-            raise SpadError(busy) from None
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle), os.stat(path)):
-                break
-        os.close(handle)  # the run that held it has finished and removed it: what is locked is nobody's lock
-    try:
-        yield handle
-    finally:
-        os.close(handle)
 
 
 def _leave(root: Path) -> None:
@@ -340,17 +328,17 @@ def generate(
             return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
         begin(root, wanted, part)
         greet(workers, experiment)
-        _check_space(root, experiment, splits)
         like = _likeness(experiment, wanted)
-        made = {s.path: s for s in shards if _is_made(root, s, experiment.format, like)}
+        made = {s: noted for s in shards if (noted := _made(root, s, experiment.format, like)) is not None}
+        _check_space(root, experiment, splits, sum(noted.bytes for noted in made.values()))
 
         def again(shard: Shard) -> dict[str, bytes]:
             return encode_shard(task_of(experiment, job_of(experiment), root, shard, splits[shard.split]))
 
-        check_bytes(root, experiment, {s: _noted(root, s)[1] for s in made.values()}, again, progress)
+        check_bytes(root, experiment, {s: noted.made_by for s, noted in made.items()}, again, progress)
         if part:
             shards = shards[part.number - 1 :: part.of]
-        missing = [s for s in shards if s.path not in made]
+        missing = [s for s in shards if s not in made]
         _make(experiment, splits, root, shards, missing, workers, progress)
         if part:
             return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})
@@ -367,15 +355,15 @@ def check_bytes(
 ) -> None:
     """Raise SpadError where this machine makes other bytes than what is there, or than its libraries once made.
 
-    made: the shards that are there and by what each was made, as far as that is known. Where one was made by something
-    else than is here, the config's golden shard must be the known one; where none is known, the first shard of each
-    other maker is made again and compared. again: makes the files of a shard, by their names for `store.put_shard`.
+    made: the shards that are there and by what each was made, as far as that is known. Where one may have been made by
+    something else than is here, the config's golden shard must be the known one; where none is known, the first shard
+    of each such maker is made again and compared. again: makes the files of a shard, named as for `store.put_shard`.
     """
     here = golden.made_by()
     others: dict[str, tuple[Shard, Mapping[str, str] | None]] = {}
     for shard in sorted(made, key=lambda one: one.level is None):  # the originals, in which nothing is drawn, last
         maker = made[shard]
-        if maker is None or any(here.get(name) != version for name, version in maker.items()):
+        if maker is None or not here.items() <= maker.items():  # a finished dataset does not say its processor
             others.setdefault(json.dumps(maker, sort_keys=True), (shard, maker))
     if not others and golden.known()["versions"].items() <= versions().items():
         return
@@ -383,7 +371,7 @@ def check_bytes(
     if golden.check(experiment):
         return
     for shard, maker in others.values():
-        progress.notice("Other versions or another machine made what is there: one shard is made again to compare.")
+        progress.notice("Other versions or another machine may have made what is there: one shard is made again.")
         place = store.location(shard.path, experiment.format)
         for name, data in again(shard).items():
             path = root / (place + name.removeprefix("shard"))
@@ -403,7 +391,7 @@ def check_volume(experiment: Experiment, splits: Mapping[str, Images]) -> None:
 
 def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard], jobs: int) -> int:
     """Bytes that a worker takes. Raises InputError where so many workers at a time do not fit into this machine."""
-    needed, there = memory_per_worker(experiment, splits, shards), _memory_there()
+    needed, there = memory_per_worker(experiment, splits, shards), system.memory()
     if min(jobs, len(shards)) * needed > there:
         fit = there // needed
         do = f"give --jobs {fit}" if fit else "lower the frames, the exposure, the light or the number of pixels"
@@ -417,7 +405,7 @@ def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: S
 def most_workers(experiment: Experiment, splits: Mapping[str, Images], processors: int) -> int:
     """How many workers there may be: one for each processor, as far as memory goes, and one at least."""
     needed = memory_per_worker(experiment, splits, dataset.shards_of(experiment, splits))
-    return max(1, min(processors, _memory_there() // needed))
+    return max(1, min(processors, system.memory() // needed))
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:
@@ -441,13 +429,6 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
     return int(_LIBRARIES + held + scratch + 3 * streams + 1.2 * bits)
-
-
-def _memory_there() -> int:
-    """Bytes that this machine, or the limit that was set for this process, has for all of it."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return whole if limit == resource.RLIM_INFINITY else min(whole, limit)
 
 
 def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
@@ -495,8 +476,7 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
     with _writable(root):
         if part is None:
             disk.sweep(disk.temporary(root))
-        with open(root / STATE / "begin", "wb") as file:  # parts begin one after the other
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with system.Lock(root / STATE / "begin", wait=True):  # parts begin one after the other
             if not (root / STATE / "plan.json").exists():
                 # records without a plan are those of a run that has finished
                 shutil.rmtree(root / STATE / "shards", ignore_errors=True)
@@ -505,14 +485,16 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
             disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
 
 
-def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images]) -> None:
-    """Refuse early where the disk cannot hold what is still to come (a rough, low estimate: half the raw size)."""
+def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images], present: int) -> None:
+    """Refuse early where the disk cannot hold what is still to come (a rough, low estimate: half the raw size).
+
+    present: bytes that are there already.
+    """
     raw = 0.0
     for images in splits.values():
         for level in experiment.levels:
             _, size = dataset.expected_per_image(experiment, level, images)
             raw += size * experiment.wanted(images)
-    present = sum(f.stat().st_size for f in root.rglob("*") if f.is_file())
     free = shutil.disk_usage(root).free
     needed = raw / 4 - present
     if free < needed:
@@ -527,36 +509,50 @@ def _likeness(experiment: Experiment, wanted: Mapping[str, Any]) -> Likeness:
     return Likeness(tuple(wanted["images"]["shape"]), experiment.conditions.frames, experiment.settings.tick)
 
 
-def _is_made(root: Path, shard: Shard, format: str, like: Likeness) -> bool:
-    """Is a shard there as it was made? Its attributes and the sizes of its files say so; its data are not read."""
-    made = _record(root, shard)
-    if made is None or not store.exists(root, shard.path, format):
-        return False
+def _made(root: Path, shard: Shard, format: str, like: Likeness) -> Note | None:
+    """What was noted of a shard that is there as it was made, else None.
+
+    Its attributes and the sizes of its files say so; its data are not read.
+    """
+    noted = _noted(root, shard)
+    if noted.files is None or not store.exists(root, shard.path, format):
+        return None
     reader = shard.reader(root, format, like)
+    base = f"{root}{os.sep}"
     try:
-        sizes = {name: os.lstat(root / name).st_size for name in made}
-        return bool(reader.names) and sizes == {name: facts["bytes"] for name, facts in made.items()}
+        for name, facts in noted.files.items():
+            if os.lstat(base + name).st_size != facts["bytes"]:
+                return None
+        return noted if reader.attributes else None
     except (InputError, OSError, KeyError, TypeError):
-        return False
+        return None
 
 
-def _record(root: Path, shard: Shard) -> Files | None:
-    """The digests of a shard's files as they were noted; None where they were not, or cannot be read."""
-    return _noted(root, shard)[0]
+@dataclass(frozen=True)
+class Note:
+    """What is noted of a shard: its files, and by what they were made; None where that is not known."""
+
+    files: Files | None
+    made_by: dict[str, str] | None
+
+    @property
+    def bytes(self) -> int:
+        """Of all its files."""
+        return sum(facts["bytes"] for facts in (self.files or {}).values())
 
 
-def _noted(root: Path, shard: Shard) -> tuple[Files | None, dict[str, str] | None]:
-    """(the digests of a shard's files, by what they were made) as they were noted; None where that is not known."""
+def _noted(root: Path, shard: Shard) -> Note:
+    """What was noted of a shard, as far as that can be read."""
     try:
         found = from_json(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
     except (OSError, ValueError):
-        return None, None
+        return Note(None, None)
     if not isinstance(found, dict):
-        return None, None
+        return Note(None, None)
     if not {"files", "made_by"} <= set(found):  # spadmnist 0.1.0 noted the files alone
-        return found, None
+        return Note(found, None)
     files, made_by = found["files"], found["made_by"]
-    return (files if isinstance(files, dict) else None), (made_by if isinstance(made_by, dict) else None)
+    return Note(files if isinstance(files, dict) else None, made_by if isinstance(made_by, dict) else None)
 
 
 def _make(
@@ -568,7 +564,8 @@ def _make(
     workers: Executor,
     progress: Progress,
 ) -> None:
-    work = {s.path: _work(experiment, splits, s) for s in shards}
+    each = {key: _work(experiment, splits, *key) for key in {(s.level, s.split) for s in shards}}
+    work = {s.path: (s.stop - s.start) * each[s.level, s.split] for s in shards}
     total = sum(work.values())
     progress.start("simulating", total, total - sum(work[s.path] for s in missing))
     by_path = {s.path: s for s in missing}
@@ -615,14 +612,13 @@ def make_shards(
             workers.run(encode_shard, tasks, list(by_path), keep)
 
 
-def _work(experiment: Experiment, splits: Mapping[str, Images], shard: Shard) -> float:
-    """Rough cost of a shard, in seconds of one core: what the progress bar's time left rests on."""
-    n = shard.stop - shard.start
-    if shard.level is None:
-        return 2e-6 * n
-    images = splits[shard.split]
-    events, size = dataset.expected_per_image(experiment, experiment.level(shard.level), images)
-    return n * (8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size)
+def _work(experiment: Experiment, splits: Mapping[str, Images], level: str | None, split: str) -> float:
+    """Rough cost of an image, in seconds of one core: what the progress bar's time left rests on."""
+    if level is None:
+        return 2e-6
+    images = splits[split]
+    events, size = dataset.expected_per_image(experiment, experiment.level(level), images)
+    return 8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size
 
 
 def job_of(experiment: Experiment) -> Job:
@@ -756,12 +752,13 @@ def add_reconstructions(
                 clear_records(root)  # of the run that made what is here, and was killed at its very end
             else:
                 refuse_other(root, wanted, there)
-        begin(root, wanted)
-        by_path = {s.path: s for s in shards if _record(root, s) is None}
+        begun = plan.exists()  # records without a plan are those of a run that has finished
+        by_path = {s.path: s for s in shards if not begun or _noted(root, s).files is None}
         job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
-        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s)[1] for s in shards}
+        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s).made_by for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
+        begin(root, wanted)
         files = dataset.files_by_shard(manifest["files"], after.format)
 
         def files_of(shard: Shard) -> dict[str, Files]:
@@ -841,7 +838,7 @@ def finish(
     temporary = disk.temporary(root)
     files: Files = {}
     for shard in shards:
-        files |= _record(root, shard) or {}
+        files |= _noted(root, shard).files or {}
     small, groups = small_files(experiment, shards, normalisation)
     files |= store.write_groups(root, groups, experiment.format)
     for name, data in small.items():

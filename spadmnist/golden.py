@@ -36,7 +36,12 @@ _LIBRARIES = ("numpy", "numba", "numcodecs", "h5py")
 
 def versions() -> dict[str, str]:
     """Versions of this program and of the libraries that could decide the bytes of a dataset."""
-    return {"spadmnist": __version__} | {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {"spadmnist": __version__} | {name: _version(name) for name in _LIBRARIES}
+
+
+@lru_cache
+def _version(library: str) -> str:
+    return importlib.metadata.version(library)  # milliseconds, and asked for with every shard
 
 
 @lru_cache(maxsize=1)

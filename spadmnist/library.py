@@ -33,7 +33,7 @@ from .measurement import Measurement
 from .plugins import check_values, discover, load_file
 from .recording import Capture
 from .sensor import Sensor
-from .workers import processors
+from .system import processors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

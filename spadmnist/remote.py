@@ -15,7 +15,6 @@ import hashlib
 import os
 import re
 import secrets
-import stat
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -26,6 +25,7 @@ from urllib.parse import urlsplit
 
 import google_crc32c
 
+from . import system
 from .errors import InputError, SpadError
 from .foreign import quoted, short
 from .sources import PIECE, File, Source, Unreadable, tree
@@ -74,8 +74,7 @@ class Blocks:
                 folder.parent.mkdir(parents=True, exist_ok=True)
                 with contextlib.suppress(FileExistsError):
                     folder.mkdir(mode=0o700)
-                facts = folder.lstat()
-                if not stat.S_ISDIR(facts.st_mode) or facts.st_mode & 0o077 or facts.st_uid != os.geteuid():
+                if not system.is_private(folder.lstat()):
                     self._folder = None
             except OSError:
                 self._folder = None
@@ -85,10 +84,10 @@ class Blocks:
         if self._folder is None:
             return None
         try:
-            handle = os.open(self._folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            handle = os.open(self._folder / name, system.READ | system.NO_LINK)
             with open(handle, "rb") as file:
                 data = file.read(BLOCK + 4)
-                os.utime(handle)
+            os.utime(self._folder / name)  # it is in use
         except OSError:
             return None
         return data[:-4] if len(data) >= 4 and _checksum(data[:-4]) == data[-4:] else None
@@ -106,7 +105,7 @@ class Blocks:
             place.parent.mkdir(mode=0o700, exist_ok=True)
             part = place.with_name(f"{place.name}.{secrets.token_hex(8)}.part")
             try:
-                with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb") as file:
+                with open(os.open(part, system.WRITE | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
                     file.write(data + _checksum(data))
                 os.replace(part, place)
             finally:

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from . import system
 from .errors import InputError
 
 PIECE = 1 << 22  # bytes, of a file that is read from its beginning to its end
@@ -121,7 +122,7 @@ class _LocalFile(File):
         self._handle, self.size = handle, size
 
     def read(self, offset: int, length: int) -> bytes:
-        return os.pread(self._handle, length, offset)
+        return system.read_at(self._handle, offset, length)
 
     def close(self) -> None:
         os.close(self._handle)
@@ -135,7 +136,7 @@ class Local(Source):
         self._root = root
 
     def open(self, file: str) -> File:
-        handle = self._open(file, False)
+        handle = system.open_below(self._root, file.split("/"))
         try:
             status = os.fstat(handle)
             if not stat.S_ISREG(status.st_mode):
@@ -145,19 +146,6 @@ class Local(Source):
             raise
         return _LocalFile(handle, status.st_size)
 
-    def _open(self, file: str, folder: bool) -> int:
-        parts = file.split("/")
-        at = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            for i, part in enumerate(parts):
-                kind = os.O_DIRECTORY if folder or i < len(parts) - 1 else os.O_NONBLOCK  # never wait for a pipe
-                above, at = at, os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | kind, dir_fd=at)
-                os.close(above)
-        except OSError:
-            os.close(at)
-            raise
-        return at
-
     def names(self) -> set[str]:
         found = set()
         for folder, folders, files in os.walk(self._root):
@@ -166,12 +154,7 @@ class Local(Source):
         return found
 
     def folders(self, place: str) -> list[str]:
-        handle = self._open(place, True)
-        try:
-            with os.scandir(handle) as entries:
-                return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
-        finally:
-            os.close(handle)
+        return system.folders_in(self._root, place.split("/"))
 
     def document(self, file: str, most: int) -> bytes:
         handle = self.open(file)

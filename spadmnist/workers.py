@@ -13,14 +13,11 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import fcntl
 import functools
 import math
 import os
 import queue
 import shutil
-import signal
-import sys
 import tempfile
 import warnings
 from collections import Counter, deque
@@ -28,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from . import system
 from .errors import SpadError
 
 Make = Callable[[Sequence[Any]], Iterator[Any]]  # keys -> the task of each, made when it is called for
@@ -44,14 +42,6 @@ _THREADS = (
     *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
     "VECLIB_MAXIMUM_THREADS",
 )
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
 
 
 def executor(jobs: int | Executor) -> Executor:
@@ -261,7 +251,7 @@ class Loky(Executor):
 
         for tracker in (resource_tracker, multiprocessing.resource_tracker):  # may unblock the signal as they start
             tracker.ensure_running()
-        each = str(max(1, processors() // self.threads))
+        each = str(max(1, system.processors() // self.threads))
         options: dict[str, Any] = {
             "timeout": _IDLE,
             "initializer": _start_worker,
@@ -269,16 +259,13 @@ class Loky(Executor):
             "env": {name: os.environ.get(name, each) for name in _THREADS},
         }
         # workers, which this may start, never see Ctrl-C: not while they import what they need, either
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with system.without_interrupt():
             while True:
                 try:
                     return get_reusable_executor(self._started, **options).submit(function, task)
                 except Exception as error:
                     if not self._is_death(error):  # of another task, just now: the next workers are new ones
                         raise
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _is_death(self, error: BaseException) -> bool:
         from loky.process_executor import TerminatedWorkerError
@@ -295,22 +282,18 @@ class Loky(Executor):
             get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
         for process in multiprocessing.active_children():
             if isinstance(process, LokyProcess) and process.pid is not None:  # started before the one that could not be
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(process.pid, signal.SIGKILL)
+                system.kill(process.pid)
                 process.join()
 
 
 def _start_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
-    import ctypes
+    import signal
 
     from .heap import keep_freed_memory
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    if os.getppid() != parent:
-        os._exit(1)
+    system.end_with(parent)
     keep_freed_memory()
 
 
@@ -323,8 +306,8 @@ def _own_place(process: int) -> None:
     held = next(filter(None, map(_made, _places())), None)
     if held is None:
         return
-    folder, handle = held
-    atexit.register(_remove_own, folder, handle, process)  # loky's own come later, and so are called before it
+    folder, lock = held
+    atexit.register(_remove_own, folder, lock, process)  # loky's own come later, and so are called before it
     if _MEMORY.is_dir():
         from loky.backend.synchronize import SemLock
 
@@ -356,7 +339,7 @@ def clear() -> int:
             for entry in list(os.scandir(place)):
                 if entry.name.startswith(_PREFIX) and (held := _held(Path(entry.path))) is not None:
                     _remove(Path(entry.path))
-                    os.close(held)
+                    held.close()
                     count += 1
     return count
 
@@ -366,20 +349,19 @@ def _places(all_of_them: bool = False) -> Iterator[Path]:
     if told := os.environ.get(_PLACE):
         yield Path(told)
     with contextlib.suppress(OSError):
-        space = os.statvfs(_MEMORY)
-        if all_of_them or space.f_frsize * space.f_bavail > _LEAST:
+        if all_of_them or shutil.disk_usage(_MEMORY).free > _LEAST:
             yield _MEMORY
     with contextlib.suppress(OSError):  # there is no folder for temporary files
         yield Path(tempfile.gettempdir())
 
 
-def _made(place: Path) -> tuple[Path, int] | None:
-    """A new folder and the handle that holds it; None where it cannot be made or be held."""
+def _made(place: Path) -> tuple[Path, system.Lock] | None:
+    """A new folder, and its lock; None where it cannot be made or be held."""
     try:
         while True:
             folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=place))
-            if (handle := _held(folder)) is not None:
-                return folder, handle
+            if (lock := _held(folder)) is not None:
+                return folder, lock
             if folder.exists():  # the file system knows no locks
                 folder.rmdir()
                 return None
@@ -387,28 +369,25 @@ def _made(place: Path) -> tuple[Path, int] | None:
         return None
 
 
-def _held(folder: Path) -> int | None:
-    """A handle that holds a folder of this user alone; None where another process does, or it is no such folder."""
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:
+def _held(folder: Path) -> system.Lock | None:
+    """The lock of a folder of this user; None where another process has it, or it is no such folder."""
+    if not system.LOCKS_FOLDERS or folder.is_symlink() or not folder.is_dir():
         return None
     try:
-        facts = os.fstat(handle)
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if facts.st_uid == os.geteuid() and os.path.samestat(facts, os.lstat(folder)):
-            return handle
-    except OSError:
-        pass
-    os.close(handle)
+        lock = system.Lock(folder)
+    except (OSError, system.Busy):
+        return None
+    if lock.is_own():
+        return lock
+    lock.close()
     return None
 
 
-def _remove_own(folder: Path, handle: int, process: int) -> None:
+def _remove_own(folder: Path, lock: system.Lock, process: int) -> None:
     """The end of the process that the folder belongs to; one that divided from it leaves it alone."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
-        os.close(handle)
+        lock.close()
 
 
 def _remove(folder: Path) -> None:

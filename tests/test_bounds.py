@@ -34,6 +34,7 @@ from spadmnist import (
     plan,
     report,
     store,
+    system,
 )
 from spadmnist.dataset import Shard
 from spadmnist.disk import Files
@@ -372,7 +373,7 @@ def test_what_does_not_fit_into_memory_is_refused_alike_before_and_in_a_run(
     images = experiment.load_images(None)
     each = plan.estimate(experiment, images, 2)["memory_per_worker"]
     for there, jobs, do in ((each * 3 // 2, 2, "give --jobs 1"), (each // 2, 1, "lower the frames")):
-        monkeypatch.setattr(factory, "_memory_there", lambda there=there: there)
+        monkeypatch.setattr(system, "memory", lambda there=there: there)
         said = []
         for act in (
             lambda jobs=jobs: plan.estimate(experiment, images, jobs),
@@ -382,15 +383,15 @@ def test_what_does_not_fit_into_memory_is_refused_alike_before_and_in_a_run(
                 act()
             said.append(str(error.value))
         assert said[0] == said[1] and not (tmp_path / "out").exists()
-    monkeypatch.setattr(factory, "_memory_there", lambda: each)
+    monkeypatch.setattr(system, "memory", lambda: each)
     assert plan.estimate(experiment, images, 1)["memory_per_worker"] == each
 
 
 def test_the_limit_of_a_process_is_what_is_there() -> None:
     limit = 3 << 30
     program = (
-        f"import resource\nfrom spadmnist import factory\nresource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit}))\n"
-        "print(factory._memory_there())\n"
+        f"import resource\nfrom spadmnist import system\nresource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit}))\n"
+        "print(system.memory())\n"
     )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert 0 < int(told) <= limit

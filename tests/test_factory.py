@@ -25,7 +25,7 @@ from commands import COMMAND, run, run_anew
 from test_guard import LOSSY_BUS
 
 import spadmnist
-from spadmnist import config, dataset, factory, golden, plugins
+from spadmnist import config, dataset, factory, golden, plugins, reconstruct
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.workers import Serial
@@ -429,6 +429,32 @@ def test_a_new_run_under_other_versions_makes_a_golden_shard_first(
     with pytest.raises(SpadError, match=r"the golden shard of stream 1, encoding 1: .*there numpy 1\.0"):
         make(made[0], tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+def test_methods_are_added_to_a_sealed_dataset_where_the_same_bytes_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sealed dataset does not say its processor: its golden shard decides, and where none is known one of its own."""
+    file = write_config(tmp_path / "c.yaml", levels=LEVELS[:1], methods=METHODS[:2], train=40, test=4)
+    root, known = tmp_path / "out", golden.known()
+    make(file, root)
+    before, said = tree(root), []
+    planted = {**known, "digests": dict.fromkeys(known["digests"], "0" * 64)}
+    with monkeypatch.context() as other:
+        other.setattr(golden, "known", lambda: planted)
+        with pytest.raises(SpadError, match=r"this machine makes other bytes than are there"):
+            factory.add_reconstructions(root, METHODS[2:3], 1)
+    assert_same(root, before)
+    with monkeypatch.context() as other:
+        estimate = reconstruct.Counts.estimate
+        other.setattr(golden, "check", lambda experiment: False)  # nothing is known of this config
+        other.setattr(reconstruct.Counts, "estimate", lambda *asked: estimate(*asked) * (1 + 2e-7))
+        with pytest.raises(SpadError, match=r"reconstruction/counts.*: this machine makes other bytes than are there"):
+            factory.add_reconstructions(root, METHODS[2:3], 1)
+    assert_same(root, before)
+    factory.add_reconstructions(root, METHODS[2:3], 1, Progress(notice=said.append))
+    assert [text for text in said if "one shard is made again" in text]
+    assert tree(root) != before
 
 
 # --- killed from outside ------------------------------------------------------------------------------------------

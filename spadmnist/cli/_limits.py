@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 
-from ..workers import processors
+from ..system import address_space, processors
 
 ALONE = (
     "the system lets this program have no further thread or process (it counts all of this user's); end other "
@@ -29,13 +29,12 @@ def is_alone(error: BaseException | None) -> bool:
 
 def check() -> None:
     """Refuse limits under which numpy cannot be imported: it waits for ever, or ends the program as Ctrl-C would."""
-    import resource
     import threading
 
     from ..errors import SpadError
 
-    space, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if space != resource.RLIM_INFINITY and space < _LEAST_SPACE * 1_000_000:
+    space = address_space()
+    if space is not None and space < _LEAST_SPACE * 1_000_000:
         raise SpadError(
             f"only {space / 1e6:.0f} MB of addresses are allowed (ulimit -v), and the program needs {_LEAST_SPACE} MB "
             "to begin with; raise that limit"

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from ..workers import Executor, executor, processors
+from ..system import processors
+from ..workers import Executor, executor
 from . import _terminal as terminal
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import click
 
 from ..errors import SpadError
 from ..foreign import quoted
-from ..workers import processors
+from ..system import processors
 from . import _options as options
 from . import _terminal as terminal
 from ._group import cli

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..workers import processors
+from ..system import processors
 from . import _options as options
 from . import _terminal as terminal
 from ._group import cli

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import filecmp
 import os
 import re
@@ -11,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import capture_files, dataset, disk, document, units
+from .. import capture_files, dataset, disk, document, system, units
 from ..errors import InputError, SpadError
 from ..events import Layout
 from ..positions import positions_text
@@ -185,16 +184,13 @@ def _laid(tiles: Tiles) -> bytes:
 @contextlib.contextmanager
 def _alone(root: Path) -> Iterator[None]:
     """Hold the folder for writing; the system lets go of it where the process is killed."""
-    with disk.writing(root, 0):
-        handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder") from None
+        with disk.writing(root, 0):
+            lock = system.Lock(Path(os.path.realpath(root)))
+    except system.Busy:
+        raise SpadError(f"{root}: another run is writing there; wait for it, or choose another folder") from None
+    with lock:
         yield
-    finally:
-        os.close(handle)
 
 
 def _check_place(root: Path, captures: Sequence[Capture], layout: Layout) -> None:
