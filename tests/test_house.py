@@ -130,7 +130,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         (
             "matplotlib",
             {
-                *("report/_sheet.py", "pictures.py", "library.py"),
+                *("report/_sheet.py", "pictures.py", "library/answers.py"),
                 *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis", "_pixels")),
             },
         ),
