@@ -626,6 +626,16 @@ def is_from_file(cls: type) -> bool:
     return cls.__module__.startswith(_MODULE)
 
 
+def is_built_in(cls: type) -> bool:
+    """Does a class come with the package?"""
+    return cls.__module__.startswith(f"{__package__}.")
+
+
+def is_own(cls: type) -> bool:
+    """Is a class the user's, and in no file that `load_file` has loaded: in a notebook, a program, another package?"""
+    return not is_built_in(cls) and not is_from_file(cls)
+
+
 def loaded_files() -> dict[Path, str]:
     """The plug-in files loaded by `load_file`, with their texts."""
     return dict(_loaded)
