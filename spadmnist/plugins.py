@@ -455,7 +455,8 @@ class Plugin:
     def __init__(self, **values: Any):
         for key, value in values.items():
             if key not in self.parameters:
-                raise TypeError(f"{self.name} has no parameter {key}.{did_you_mean(key, self.parameters)}")
+                hint = did_you_mean(key, self.parameters) or f" It has {', '.join(self.parameters) or 'none'}."
+                raise TypeError(f"{self.name} has no parameter {key}.{hint}")
             setattr(self, key, value)
 
     @classmethod

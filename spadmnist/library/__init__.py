@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .. import measurement as measurements
 from .. import twin, window
 from ..config import read_sensor
@@ -62,9 +64,10 @@ def simulate(
         InputError: where the light level of a capture is free, or sensor and plan do not belong together.
         SpadError: where something else lies in the folder, or it cannot be written.
     """
+    bar = _bar(progress)
+    _check_seed(seed)
     model = _model(sensor, plugins, crop)
     opened = _plan(plan, model)
-    bar = _bar(progress)
     if folder is not None:
         return measurements.open(twin.simulate(model, opened, folder, seed, bar))
     made = list(twin.twin(model, opened, seed, bar))
@@ -100,11 +103,11 @@ def compare(
     from ..inference import comparison
     from .answers import Comparison
 
-    if tolerance is not None and not 0 < tolerance < 1:
+    if tolerance is not None and not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
         raise InputError(f"tolerance is {tolerance!r}; it is a share of more than 0 and less than 1, 0.005 for 0.5 %")
-    workers = _workers(jobs)
+    workers, bar, done = _workers(jobs), _bar(progress), 0.0
+    _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
-    bar, done = _bar(progress), 0.0
 
     def told(what: str, share: float) -> None:
         nonlocal done
@@ -153,9 +156,10 @@ def diagnose(
 
     if isinstance(max_steps, bool) or max_steps not in range(1, 13):
         raise InputError(f"max_steps is {max_steps!r}; it is a whole number from 1 to 12")
-    seconds, workers = seconds_of(within, quick), _workers(jobs)
+    seconds, workers, say = seconds_of(within, quick), _workers(jobs), _bar(progress).notice
+    _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
-    say, origin = _bar(progress).notice, _origin(sensor, measurement, seed)
+    origin = _origin(sensor, measurement, seed)
     journal = None
     if keep is not None:
         check_place(keep, origin.sensor)
@@ -222,14 +226,11 @@ def fit(
     from ..inference import named_fit
     from .answers import Fit
 
-    lists = {"add": add, "free": free, "per_pixel": per_pixel}
-    for name, given in lists.items():
-        if isinstance(given, str):
-            raise InputError(f"{name} is {given!r}; it is a list of names: {name}=[{given!r}]")
-    workers = _workers(jobs)
+    lists = _names("add", add), _names("free", free), _names("per_pixel", per_pixel)
+    workers, say = _workers(jobs), _bar(progress).notice
+    _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
-    say = _bar(progress).notice
-    found = named_fit.fit_named(model, data, tuple(add), tuple(free), tuple(per_pixel), seed, workers, say)
+    found = named_fit.fit_named(model, data, *lists, seed, workers, say)
     return Fit(found, model, _origin(sensor, measurement, seed))
 
 
@@ -237,6 +238,8 @@ def fit(
 
 
 def _model(sensor: Sensor | PathLike, files: Sequence[PathLike], crop: Crop | None) -> Sensor:
+    if isinstance(files, str | os.PathLike):
+        raise InputError(f"plugins is {str(files)!r}; it is a list of files: plugins=[{str(files)!r}]")
     for file in files:
         load_file(file)
     discover()
@@ -244,15 +247,44 @@ def _model(sensor: Sensor | PathLike, files: Sequence[PathLike], crop: Crop | No
         for effect in sensor.effects:
             check_values(effect)
         model = sensor.resolved()
-    else:
+    elif isinstance(sensor, str | os.PathLike):
         model = read_sensor(sensor)
+    else:
+        raise InputError(f"sensor is of type {type(sensor).__name__}; it is a spadmnist.Sensor or the path of its file")
     if crop is None:
         return model
-    return model.cropped(*(window.parse(crop) if isinstance(crop, str) else crop))
+    ends = window.parse(crop) if isinstance(crop, str) else crop
+    if not (isinstance(ends, tuple) and len(ends) == 2 and all(isinstance(part, slice) for part in ends)):
+        raise InputError(f'crop is {crop!r}; it is "100:150,200:250" or (slice(100, 150), slice(200, 250))')
+    return model.cropped(*ends)
 
 
 def _data(measurement: Measurement | PathLike) -> Measurement:
-    return measurement if isinstance(measurement, Measurement) else measurements.open(measurement)
+    if isinstance(measurement, Measurement):
+        return measurement
+    if isinstance(measurement, str | os.PathLike):
+        return measurements.open(measurement)
+    raise InputError(
+        f"measurement is of type {type(measurement).__name__}; it is a spadmnist.Measurement or its path (of arrays: "
+        "Measurement.from_arrays)"
+    )
+
+
+def _names(name: str, given: Iterable[str]) -> tuple[str, ...]:
+    """The names in a list. Raises InputError where it is none, or holds anything else."""
+    if isinstance(given, str):
+        raise InputError(f"{name} is {given!r}; it is a list of names: {name}=[{given!r}]")
+    names = tuple(given) if isinstance(given, Iterable) else (given,)
+    for one in names:
+        if not isinstance(one, str):
+            raise InputError(f'{name} holds {one!r}; it is a list of names, like "crosstalk" or "dead_time.duration"')
+    return names
+
+
+def _check_seed(seed: int) -> None:
+    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not whole or not 0 <= seed < 1 << 63:
+        raise InputError(f"seed is {seed!r}; it is a whole number from 0 to 2^63 - 1")
 
 
 def _plan(plan: Measurement | PathLike | Sequence[Capture], model: Sensor) -> Measurement:
@@ -260,7 +292,7 @@ def _plan(plan: Measurement | PathLike | Sequence[Capture], model: Sensor) -> Me
         return plan
     if isinstance(plan, str | os.PathLike):
         return measurements.open(plan, planned=True)
-    captures = list(plan)
+    captures = list(plan) if isinstance(plan, Iterable) else [plan]
     wrong = [one for one in captures if not isinstance(one, Capture)]
     if wrong or not captures:
         raise InputError(f"plan: {wrong[0]!r} is not a capture" if wrong else "plan: has no captures")
@@ -286,6 +318,8 @@ def _bar(told: Told | None) -> Progress:
     """A bar of what is called with lines: with one for each per cent more of the work."""
     if told is None or isinstance(told, Progress):
         return told or Progress()
+    if not callable(told):
+        raise InputError(f"progress is {told!r}; it is a function that is called with a line, for example print")
     whole, done, last = 1.0, 0.0, ""
 
     def start(what: str, total: float, begun: float) -> None:
