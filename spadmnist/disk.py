@@ -237,6 +237,15 @@ def writing(place: Path, size: int) -> Iterator[None]:
         raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
 
 
+@contextlib.contextmanager
+def writing_file(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what the system says about a failed write of one file into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise SpadError(f"{path}: cannot be written ({error.strerror or error}); name another file") from None
+
+
 def _amount(size: int) -> str:
     return f"{size} bytes" if size < 10_000 else f"{size / 1e6:.3g} MB"
 

@@ -455,7 +455,8 @@ class Plugin:
     def __init__(self, **values: Any):
         for key, value in values.items():
             if key not in self.parameters:
-                raise TypeError(f"{self.name} has no parameter {key}.{did_you_mean(key, self.parameters)}")
+                hint = did_you_mean(key, self.parameters) or f" It has {', '.join(self.parameters) or 'none'}."
+                raise TypeError(f"{self.name} has no parameter {key}.{hint}")
             setattr(self, key, value)
 
     @classmethod
@@ -624,6 +625,16 @@ def load_file(path: str | Path) -> None:
 def is_from_file(cls: type) -> bool:
     """Does a class come from a file that `load_file` has loaded?"""
     return cls.__module__.startswith(_MODULE)
+
+
+def is_built_in(cls: type) -> bool:
+    """Does a class come with the package?"""
+    return cls.__module__.startswith(f"{__package__}.")
+
+
+def is_own(cls: type) -> bool:
+    """Is a class the user's, and in no file that `load_file` has loaded: in a notebook, a program, another package?"""
+    return not is_built_in(cls) and not is_from_file(cls)
 
 
 def loaded_files() -> dict[Path, str]:

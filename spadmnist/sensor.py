@@ -39,6 +39,14 @@ _NOBODY = np.zeros(0, np.int64)
 _HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more of them is left out
 
 
+def _check_effect(effect: object) -> None:
+    if not isinstance(effect, Effect):
+        what = repr(effect) if isinstance(effect, str | type) else f"an object of type {type(effect).__name__}"
+        raise InputError(
+            f"{what} is not an effect; give one with its values, for example effects.DarkCounts(rate=100.0)"
+        )
+
+
 @dataclass(repr=False)
 class Sensor:
     """Layout, effects and chip seed. The effects' values may still be distributions and files; see `resolved`.
@@ -55,6 +63,10 @@ class Sensor:
     _resolved: bool = field(default=False, repr=False)
     chip: Sensor | None = field(default=None, repr=False)
     window: Window | None = None
+
+    def __post_init__(self) -> None:
+        for effect in self.effects:
+            _check_effect(effect)
 
     def resolved(self) -> Sensor:
         """The same sensor with every map read and every distribution drawn. Raises InputError for a bad map."""
@@ -79,6 +91,7 @@ class Sensor:
 
     def with_effect(self, effect: Effect) -> Sensor:
         """The same sensor with one effect more, resolved. Raises InputError where it lists it, or for a wrong value."""
+        _check_effect(effect)
         if self.effect(effect.name) is not None:
             named = next(iter(effect.parameters), "parameter")
             raise InputError(

@@ -64,12 +64,14 @@ class Executor:
         chances: how often a task may be lost with its worker before it is tried alone.
         local: its workers are processes of this machine.
         shared: its workers see the files of this machine.
+        apart: its workers are other processes.
     """
 
     threads = 1
     chances = 3
     local = True
     shared = True
+    apart = True
 
     def run(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
         """Call `function` on the task of every key, and `done(key, result)` for each, as they end.
@@ -201,6 +203,8 @@ class Executor:
 
 class Serial(Executor):
     """One task after the other, in this process."""
+
+    apart = False
 
     def run(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
         """As `Executor.run`; a task that kills takes this process with it."""

@@ -27,7 +27,7 @@ LAYERS = [
     {"compiled", "import_options"},
     {"disk", "kernels", "large", "sources", "workers"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
-    {"validated", "scene", "zipped"},
+    {"validated", "scene", "zipped", "by_value"},
     {"effects", "readout", "remote", "images", "pictures", "positions", "window"},
     {"gather", "grids", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},
@@ -130,7 +130,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         (
             "matplotlib",
             {
-                *("report/_sheet.py", "pictures.py", "library.py"),
+                *("report/_sheet.py", "pictures.py", "library/answers.py"),
                 *(f"pages/{name}.py" for name in ("_figures", "_comparison", "_diagnosis", "_pixels")),
             },
         ),
@@ -141,6 +141,7 @@ def test_an_effect_can_be_read_alone(file: str) -> None:
         ("pyarrow", {"image_exporters.py"}),
         ("yaml", {"document.py"}),
         ("loky", {"workers.py"}),
+        ("cloudpickle", {"by_value.py"}),
         ("distributed", {"cluster.py"}),
         ("dask", {"cluster.py", "lazy.py"}),
         ("obstore", {"remote.py"}),

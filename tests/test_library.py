@@ -321,3 +321,117 @@ def test_a_diagnosis_gives_the_model_that_it_found(asked: tuple[Any, Any], tmp_p
             assert its == mine if isinstance(mine, str) else np.allclose(its, mine, rtol=1e-5, atol=0)
     with pytest.raises(InputError, match="max_steps is 0"):
         sp.diagnose(model, data, max_steps=0)
+
+
+LAB = {FLAT: np.zeros((40, 3, 5), np.uint8)}
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda s, lab: sp.Measurement.from_arrays(s, LAB), "layout is of type Sensor; .*sensor.layout"),
+        (lambda s, lab: sp.Measurement.from_arrays(s.layout, LAB[FLAT]), "arrays is of type ndarray; it is a dict"),
+        (
+            lambda s, lab: sp.Measurement.from_arrays(s.layout, {FLAT: [[1], [1, 0]]}),
+            "'flat': has lists of several len",
+        ),
+        (lambda s, lab: sp.compare(lab, s), "sensor is of type Measurement; it is a spadmnist.Sensor or the path"),
+        (lambda s, lab: sp.compare(s, LAB[FLAT]), "measurement is of type ndarray; .*Measurement.from_arrays"),
+        (lambda s, lab: sp.compare(s, lab, -1), "seed is -1; it is a whole number from 0"),
+        (lambda s, lab: sp.simulate(s, [FLAT], seed=1.5), "seed is 1.5; it is a whole number"),
+        (lambda s, lab: sp.compare(s, lab, jobs=0), "jobs is 0; it is a whole number of at least 1"),
+        (lambda s, lab: sp.compare(s, lab, tolerance="0.5 %"), "tolerance is '0.5 %'; it is a share"),
+        (lambda s, lab: sp.compare(s, lab, plugins="own.py"), r"plugins is 'own.py'; .*plugins=\['own.py'\]"),
+        (lambda s, lab: sp.compare(s, lab, progress=3), "progress is 3; it is a function"),
+        (lambda s, lab: sp.compare(s, lab, crop=(0, 1)), r"crop is \(0, 1\); it is \"100:150,200:250\""),
+        (lambda s, lab: sp.diagnose(s, lab, crop="0:1,0:2"), "layout has 3 x 5 pixels, but the sensor 1 x 2"),
+        (lambda s, lab: sp.fit(s, lab, add=[sp.effects.Crosstalk]), "add holds <class .*; it is a list of names"),
+        (lambda s, lab: sp.fit(s, lab, free=None), "free holds None; it is a list of names"),
+        (lambda s, lab: s.with_effect("crosstalk"), "'crosstalk' is not an effect; give one with its values"),
+        (lambda s, lab: sp.Sensor(s.layout, [sp.effects.Crosstalk]), "Crosstalk'> is not an effect; give one with"),
+        (lambda s, lab: sp.simulate(s, 7), "plan: 7 is not a capture"),
+    ],
+)
+def test_what_the_functions_cannot_take_is_one_sentence(call: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as error:
+        call(sensor(), sp.Measurement.from_arrays(sensor().layout, LAB))
+    assert "\n" not in str(error.value)
+
+
+def test_a_simulation_to_a_folder_is_the_one_in_memory_and_its_progress_is_told(tmp_path: Path) -> None:
+    said: list[str] = []
+    part = (slice(0, 1), slice(0, 2))
+    made = sp.simulate(sensor(), FLAT, 3, folder=tmp_path / "twin", crop="0:1,0:2", progress=said.append)
+    assert made.folder == tmp_path / "twin" and made.layout.shape == (1, 2)
+    assert np.array_equal(made["flat"].frames, sp.simulate(sensor(), [FLAT], 3, crop=part)["flat"].frames)
+    assert said[-1] == "flat: 100%" and len(set(said)) == len(said)
+
+
+# ---- a diagnosis that is kept -----------------------------------------------------------------------------
+
+
+def found_at(monkeypatch: pytest.MonkeyPatch, values: dict[Any, Any], finished: bool = True) -> list[Any]:
+    """What `model_selection.diagnose` is called with, in place of which one step and the answer are given."""
+    from spadmnist.inference import model_selection, results
+
+    lists: list[Any] = [[], [], [], [], [], [], []]
+    called: list[Any] = []
+
+    def diagnose(*given: Any) -> results.Diagnosis:
+        called.extend(given)
+        keep, journal = given[-2:]
+        keep(results.Diagnosis("s", "lab", "partly_explained", 9.0, 5.0, 1.2, *lists, values=values, finished=False))
+        if journal is not None:
+            journal.folder.mkdir(parents=True)
+            journal.bytes = 1
+        return results.Diagnosis("s", "lab", "explained", 9.0, 1.0, 1.2, *lists, values=values, finished=finished)
+
+    monkeypatch.setattr(model_selection, "diagnose", diagnose)
+    return called
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_folder_keeps_the_diagnosis_so_far_and_the_answer(
+    finished: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from spadmnist.workers import Serial
+
+    said: list[str] = []
+    called = found_at(monkeypatch, {("dark_counts", "rate"): 1500.0}, finished)
+    lab, keep, workers = sp.Measurement.from_arrays(sensor().layout, LAB), tmp_path / "next", Serial()
+    stood: list[str] = []
+    sp.diagnose(sensor(), lab, jobs=workers, keep=keep, on_step=lambda so_far: stood.append(so_far.verdict))
+    assert stood == ["partly_explained"] and workers in called and not (keep / "report.html").exists()
+    found_at(monkeypatch, {("dark_counts", "rate"): 1500.0}, finished)
+    (keep / ".replicates").rmdir() if not finished else None
+    found = sp.diagnose(sensor(), lab, 7, keep=keep, progress=said.append)
+    assert found.file == keep / "sensor.yaml" and not found.unwritten
+    assert sp.read_sensor(found.file).effect("dark_counts").rate == 1500.0
+    page = (keep / "report.html").read_text()
+    assert "<dt>seed</dt><dd>7</dd>" in page
+    assert (keep / ".replicates").exists() is not finished
+    assert any(line.startswith("Not finished: ") for line in said) is not finished
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "sensor.yaml").write_text("mine")
+    with pytest.raises(InputError, match="it is left alone"):
+        sp.diagnose(sensor(), lab, keep=tmp_path / "mine")
+
+
+def test_an_answer_whose_sensor_cannot_be_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found_at(monkeypatch, {})
+    lab = sp.Measurement.from_arrays(sensor().layout, LAB)
+
+    def fails(*_: Any, **__: Any) -> Path:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sensor_file, "save", fails)
+    found = sp.diagnose(sensor(), lab, keep=tmp_path / "kept")  # the search goes on, and its answer is there
+    assert "No space left" in found.unwritten and found.file is None
+    with pytest.raises(
+        SpadError, match=r"the next sensor file was not written: .*No space left on device.*another file"
+    ):
+        found.save(tmp_path / "next")
+    assert "No space left" in (tmp_path / "next" / "report.html").read_text()
+    monkeypatch.undo()
+    found.save(tmp_path / "next")
+    assert found.unwritten == "" and (tmp_path / "next" / "sensor.yaml").exists()

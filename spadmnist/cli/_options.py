@@ -56,6 +56,23 @@ class Readable(click.Path):
         return value if "://" in str(value) else super().convert(value, param, ctx)
 
 
+def output(metavar: str, about: str, required: bool = False) -> Callable[[F], F]:
+    """`--output PLACE`, `-o`; metavar, about: as its help says them."""
+    return click.option("--output", "-o", type=Place(), metavar=metavar, required=required, help=about)
+
+
+def seed(about: str, default: int | None = 0) -> Callable[[F], F]:
+    """`--seed N`; about: its help."""
+    return click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=default, metavar="N", help=about)
+
+
+def images_dir(
+    about: str = "Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
+) -> Callable[[F], F]:
+    """`--images-dir DIR`; about: its help."""
+    return click.option("--images-dir", type=click.Path(path_type=Path), metavar="DIR", help=about)
+
+
 def jobs(command: F) -> F:
     """`--jobs N`."""
     return click.option(
@@ -91,6 +108,13 @@ def as_json(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON.")(command)
 
 
+def json_file(command: F) -> F:
+    """`--json FILE`, as `json_file`."""
+    return click.option("--json", "json_file", type=Place(), metavar="FILE", help="Write the answer to FILE as JSON.")(
+        command
+    )
+
+
 def crop(command: F) -> F:
     """`--crop ROW:ROW,COLUMN:COLUMN`; see `model_of`."""
     return click.option(
@@ -108,14 +132,8 @@ def model_and_measurement(command: F) -> F:
         crop,
         cluster,
         jobs,
-        click.option(
-            "--seed",
-            type=click.IntRange(0, 2**63 - 1),
-            default=0,
-            metavar="N",
-            help="Seed of the simulations.  [default: 0]",
-        ),
-        click.option("--json", "json_file", type=Place(), metavar="FILE", help="Write the answer to FILE as JSON."),
+        seed("Seed of the simulations.  [default: 0]"),
+        json_file,
         click.argument("measurement", type=path),
         click.argument("sensor", type=path),
     ):
@@ -162,19 +180,3 @@ def model_of(sensor: Path, crop: str | None) -> Sensor:
 
     model = config.read_sensor(sensor)
     return model if crop is None else model.cropped(*window.parse(crop))
-
-
-class writing:
-    """Turn a failure to write a file into a sentence."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        from ..errors import SpadError
-
-        if isinstance(error, OSError):
-            raise SpadError(f"{self.path}: cannot be written ({error.strerror or error}); name another file") from None

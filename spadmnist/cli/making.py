@@ -22,13 +22,7 @@ if TYPE_CHECKING:
 
 @cli.verb(10, short_help="Make the dataset of a config.")
 @click.argument("config", type=click.Path(path_type=Path))
-@click.option(
-    "--output",
-    "-o",
-    type=options.Place(),
-    metavar="OUT",
-    help="Folder of the dataset.  [default: the name of the config]",
-)
+@options.output("OUT", "Folder of the dataset.  [default: the name of the config]")
 @click.option(
     "--lux",
     "levels",
@@ -43,12 +37,7 @@ if TYPE_CHECKING:
     metavar="N",
     help="Only the first N images of each split.",
 )
-@click.option(
-    "--images-dir",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
-)
+@options.images_dir()
 @options.jobs
 @options.cluster
 @options.no_shared
@@ -57,13 +46,7 @@ if TYPE_CHECKING:
     metavar="K/N",
     help="Only every N-th shard, from the K-th on, on any machine that sees OUT. Without it the rest is made.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=None,
-    metavar="N",
-    help="Seed, in place of that of the config.",
-)
+@options.seed("Seed, in place of that of the config.", default=None)
 @click.option(
     "--format",
     "format_",
@@ -218,13 +201,7 @@ def init(
     metavar="METHOD",
     help="Method of reconstruction. Repeatable.  [default: all that the readouts allow]",
 )
-@click.option(
-    "--output",
-    "-o",
-    type=options.Place(),
-    metavar="FOLDER",
-    help="Measurement: folder of the images.  [default: NAME-flux, here]",
-)
+@options.output("FOLDER", "Measurement: folder of the images.  [default: NAME-flux, here]")
 @click.option(
     "--sensor",
     type=click.Path(path_type=Path),
@@ -322,12 +299,7 @@ def _reconstruct_measurement(
 @cli.verb(70, short_help="Compare every byte with the manifest; repair.")
 @click.argument("dataset", type=options.Readable(), metavar="DATASET")
 @click.option("--repair", is_flag=True, help="Make the damaged files again.")
-@click.option(
-    "--images-dir",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="For --repair: folder of the images, if the copy in the dataset is damaged.",
-)
+@options.images_dir("For --repair: folder of the images, if the copy in the dataset is damaged.")
 @options.jobs
 @options.cluster
 @options.no_shared

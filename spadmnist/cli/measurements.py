@@ -33,7 +33,7 @@ def inspect(dataset: Path | str, plot: Path | None, as_json: bool) -> None:
     spadmnist inspect out --plot sheet.png
     """
     from .. import dataset as library
-    from .. import measurement, report
+    from .. import disk, measurement, report
     from ..errors import SpadError
 
     if plot is not None and plot.suffix.lower() != ".png":
@@ -54,13 +54,13 @@ def inspect(dataset: Path | str, plot: Path | None, as_json: bool) -> None:
     else:
         terminal.print_lines(report.level_table(manifest))
     if plot is not None:
-        with options.writing(plot):
+        with disk.writing_file(plot):
             report.sheet(library.stored(root), plot, places=report.places_of(manifest, root))
         terminal.say(f"Drawn: {plot}")
 
 
 def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
-    from .. import measurement, report
+    from .. import disk, measurement, report
 
     opened = measurement.open(path, planned=True)
     looks = report.looks(opened, plot is not None)
@@ -72,7 +72,7 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
     if opened.missing:
         terminal.say(f"Not recorded yet: {', '.join(opened.missing)}. Next:  spadmnist import FILE -o {quoted(path)}")
     if plot is not None:
-        with options.writing(plot):
+        with disk.writing_file(plot):
             report.capture_sheet(opened, looks, plot)
         terminal.say(f"Drawn: {plot}")
 
@@ -80,17 +80,8 @@ def _inspect_measurement(path: Path, plot: Path | None, as_json: bool) -> None:
 @cli.verb(60, short_help="Simulate the captures of a measurement with a model.")
 @click.argument("sensor", type=click.Path(path_type=Path))
 @click.argument("measurement", type=click.Path(path_type=Path))
-@click.option(
-    "--output",
-    "-o",
-    type=options.Place(),
-    metavar="OUT",
-    required=True,
-    help="Folder of the simulated measurement.",
-)
-@click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N", help="Seed of the simulation.  [default: 0]"
-)
+@options.output("OUT", "Folder of the simulated measurement.", required=True)
+@options.seed("Seed of the simulation.  [default: 0]")
 @options.crop
 @options.plugin
 @options.as_json
@@ -109,18 +100,16 @@ def simulate(
     spadmnist simulate sensor.yaml lab -o twin
     spadmnist inspect twin --plot twin.png
     """
-    from .. import measurement as library
-    from .. import twin
+    from .. import library
 
-    options.load_plugins(plugin_files)
-    model = options.model_of(sensor, crop)
-    opened = library.open(measurement, planned=True)
     with terminal.progress() as progress:
-        twin.simulate(model, opened, output, seed, progress)
+        made = library.simulate(
+            sensor, measurement, seed, folder=output, crop=crop, plugins=plugin_files, progress=progress
+        )
     if as_json:
-        terminal.print_json({"measurement": str(output), "captures": [c.id for c in opened.captures]})
+        terminal.print_json({"measurement": str(output), "captures": list(made)})
     else:
-        terminal.say(f"Simulated {len(opened.captures)} captures: {output}")
+        terminal.say(f"Simulated {len(made)} captures: {output}")
         terminal.say(f"Look at them:  spadmnist inspect {quoted(output)} --plot {quoted(f'{output.name}.png')}")
 
 
@@ -153,7 +142,7 @@ def _import_option(name: str, declared: Any, about: str) -> click.Option:
 
 @cli.verb(80, "import", cls=_ImportCommand, short_help="Make a measurement from files of other programs.")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@click.option("--output", "-o", type=options.Place(), metavar="MEASUREMENT", help="Folder of the measurement or plan.")
+@options.output("MEASUREMENT", "Folder of the measurement or plan.")
 @click.option("--name", metavar="NAME", help="Name of the measurement.  [default: that of the file or folder]")
 @click.option(
     "--light",
@@ -217,13 +206,7 @@ def import_(
 
 @cli.verb(90, short_help="Write images or captures to files that other programs read.")
 @click.argument("dataset", metavar="DATASET|MEASUREMENT", type=click.Path(path_type=Path))
-@click.option(
-    "--output",
-    "-o",
-    type=options.Place(),
-    metavar="OUT",
-    help="Folder; or the file of one capture; or, with .npz, the file of one level and split.",
-)
+@options.output("OUT", "Folder; or the file of one capture; or, with .npz, the file of one level and split.")
 @click.option(
     "--format",
     "format_",

@@ -42,20 +42,9 @@ _OWN = "spadmnist.options"  # where a context keeps the options of an experiment
 
 @cli.verb(160, "experiment", cls=_ExperimentCommand, short_help="Repeat an experiment of the paper.")
 @click.argument("name", required=False)
-@click.option(
-    "--output",
-    "-o",
-    type=options.Place(),
-    metavar="OUT",
-    help="Folder of the data, the results and the report.",
-)
+@options.output("OUT", "Folder of the data, the results and the report.")
 @click.option("--quick", is_flag=True, help="Fewer images and epochs, for a first answer in minutes.")
-@click.option(
-    "--images-dir",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
-)
+@options.images_dir()
 @options.jobs
 @options.as_json
 def experiment_(

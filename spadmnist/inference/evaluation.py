@@ -135,7 +135,7 @@ def _evaluate(
     n = number or replicates.number
     # evenly spread for any number of them, for the first of them, and for every fourth
     spread = 2 * np.modf((np.arange(n) + 0.5) * _GOLDEN)[0] - 1
-    about, wanted, entries = {}, [], dict[str, str]()
+    about, wanted, entries = {}, [], dict[str, str | None]()
     before = dict(known.made) if known else {}
     evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {})
     for id, seen in replicates.seen.items():

@@ -38,8 +38,8 @@ class Journal:
     @staticmethod
     def name(
         sensors: Iterable[Sensor], seen: ReducedCapture, photons: np.ndarray, numbers: np.ndarray, *more: Any
-    ) -> str:
-        """The name of the replicates of a capture.
+    ) -> str | None:
+        """The name of the replicates of a capture; None where they depend on code that no file holds.
 
         Args:
             sensors: one for all replicates, or one for each.
@@ -50,7 +50,10 @@ class Journal:
         capture, second = seen.half_of or (seen.capture, None)
         digest = hashlib.sha256(np.asarray(photons, float).tobytes() + np.asarray(numbers, np.uint64).tobytes())
         for sensor in sensors:
-            digest.update(replicate_cache.entry_name(sensor, capture, second, *more).encode())
+            name = replicate_cache.entry_name(sensor, capture, second, *more)
+            if name is None:
+                return None
+            digest.update(name.encode())
         return digest.hexdigest()[:32]
 
     def recall(self, name: str | None) -> CaptureReplicates | None:

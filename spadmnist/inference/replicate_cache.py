@@ -7,6 +7,7 @@ damaged, is simulated again. The oldest entries are removed when there are too m
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import json
@@ -24,20 +25,25 @@ from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
-from .replicates import CaptureReplicates
+from .replicates import CaptureReplicates, own_statistics
 
 _MOST_BYTES = 1 << 30  # bytes of all entries together
 
 
-def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str:
-    """The name of the cache entry of a capture under a model.
+def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
+    """The name of the cache entry of a capture under a model; None where it depends on code that no file holds.
 
     Args:
         more: numbers and words that the replicates depend on as well.
     """
+    own = {cls for cls in [*map(type, sensor.effects), *own_statistics()] if plugins.is_own(cls)}
+    texts = [_text(plugins.source_file(cls)) for cls in sorted(own, key=lambda cls: cls.__module__)]
+    if any(cls.__module__ == "__main__" for cls in own) or None in texts:
+        return None
     digest = hashlib.sha256(digest_of_sources().encode())
     for _, text in sorted(plugins.loaded_files().items()):
         digest.update(text.encode())
+    digest.update("".join(filter(None, texts)).encode())
     # of a part of a chip: the whole chip, whose other pixels may matter, and the part's place
     chip = sensor.chip or sensor
     places = None if chip.layout.positions is None else chip.layout.positions.tobytes()
@@ -50,8 +56,19 @@ def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str:
     return digest.hexdigest()[:32]
 
 
-def recall(name: str) -> CaptureReplicates | None:
+@functools.cache
+def _text(file: str) -> str | None:
+    """The text of a module, as it was when this process first needed it; None where it cannot be read."""
+    try:
+        return Path(file).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def recall(name: str | None) -> CaptureReplicates | None:
     """The replicates of an entry; None where no such entry can be read."""
+    if name is None:
+        return None
     path = _folder() / f"{name}.npz"
     try:
         found = unpacked(path.read_bytes())
@@ -61,8 +78,10 @@ def recall(name: str) -> CaptureReplicates | None:
     return found
 
 
-def keep(name: str, made: CaptureReplicates) -> None:
+def keep(name: str | None, made: CaptureReplicates) -> None:
     """Write an entry. An error of the disk is ignored: the cache is no part of the result."""
+    if name is None:
+        return
     folder = _folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

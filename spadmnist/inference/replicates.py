@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import copy
 import functools
-import pickle
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from .. import plugins, twin
+from .. import by_value, plugins, twin
 from ..effects import Conditions
 from ..errors import UNABLE, EffectError, why
 from ..measurement import Measurement
@@ -219,7 +218,7 @@ def _simulate(task: _Task) -> CaptureReplicates | str:
     capture, photons, numbers = task.capture, task.photons, task.numbers
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
-    task.models[0].load_plugins()  # statistics are among them
+    task.models[0].sensor  # noqa: B018  # the user's own statistics come with it
     known = [s for s in statistics_for(capture) if not (task.hasty and s.costly)]
 
     def take(recording: Recording) -> None:
@@ -408,7 +407,7 @@ class Replicates:
                     most = max(most, self._bytes(sensors.of(id, int(numbers[0])), id, photons))
                 for part in parts:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
-                    models = [Packed.of(sensors.of(id, number)) for number in each]
+                    models = [Packed.of(sensors.of(id, number), self.workers.apart) for number in each]
                     rest = self.seed, self.dead, hasty, second
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
@@ -524,31 +523,43 @@ class InTheDark(Sensor):
 
 @dataclass(frozen=True)
 class Packed:
-    """A sensor on its way to a worker, which must load the user's plug-in files before it can unpack it."""
+    """A sensor on its way to a worker, with the user's own statistics.
+
+    A worker must load the user's plug-in files before it can unpack it.
+    """
 
     files: tuple[plugins.Carried, ...]
     packed: bytes
 
     @staticmethod
-    def of(sensor: Sensor) -> Packed:
-        """The packed sensor."""
-        return Packed(plugins.carried(), pickle.dumps(sensor))
+    def of(sensor: Sensor, apart: bool = True) -> Packed:
+        """The packed sensor.
 
-    def load_plugins(self) -> None:
-        """Run the user's plug-in files, where that has not been done in this process."""
-        plugins.load_carried(self.files)
+        Args:
+            apart: it is unpacked in another process.
+        Raises:
+            EffectError: where a class of the user's cannot be sent there.
+        """
+        own = own_statistics()
+        return Packed(plugins.carried(), by_value.packed((sensor, own), apart))
 
     @property
     def sensor(self) -> Sensor:
-        """The unpacked sensor."""
-        self.load_plugins()
+        """The unpacked sensor. The user's plug-in files are run where that has not been done in this process."""
+        plugins.load_carried(self.files)
         return _unpacked(self.packed)
+
+
+def own_statistics() -> list[type[Statistic]]:
+    """The statistics of a notebook or of modules of the user's, which stand neither here nor in a plug-in file."""
+    known = (Statistic.registry.find(name) for name in Statistic.registry)
+    return [cls for cls in known if plugins.is_own(cls)]
 
 
 @functools.lru_cache(maxsize=2)
 def _unpacked(packed: bytes) -> Sensor:
     """The unpacked sensor; only what this program has packed itself is unpacked."""
-    sensor = pickle.loads(packed)
+    sensor, _ = by_value.unpacked(packed)
     assert isinstance(sensor, Sensor)
     return sensor
 
@@ -567,6 +578,6 @@ def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
     try:
         return statistic.reduce(recording)
     except Exception as error:
-        if type(statistic).__module__.startswith(f"{__package__.partition('.')[0]}."):
+        if plugins.is_built_in(type(statistic)):
             raise
         raise plugins.blame(statistic, error) from error

@@ -239,6 +239,10 @@ class Data:
 def measurement_of(layout: Layout, arrays: Mapping[recordings.Capture, Any], name: str) -> Measurement:
     """See `Measurement.from_arrays`."""
     check_name(name, "name")
+    if not isinstance(layout, Layout):
+        raise InputError(f"layout is {_kind(layout)}; it is a spadmnist.Layout, that of a sensor: sensor.layout")
+    if not isinstance(arrays, Mapping):
+        raise InputError(f"arrays is {_kind(arrays)}; it is a dictionary, {{Capture(...): frames}}")
     made: list[Recording] = []
     for capture, data in arrays.items():
         if not isinstance(capture, recordings.Capture):
@@ -268,7 +272,7 @@ def in_memory(name: str, layout: Layout, made: Sequence[Recording | recordings.C
 def _recorded(capture: recordings.Capture, layout: Layout, data: Any) -> Recording:
     if capture.modality == "tr":
         return _stamps(capture, layout, data)
-    frames, (rows, columns) = np.asarray(data), layout.shape
+    frames, (rows, columns) = _array(capture.id, data), layout.shape
     c = capture.conditions
     many = c.count_frames if capture.modality == "counts" else c.frames
     if frames.shape != (many, rows, columns):
@@ -286,6 +290,17 @@ def _recorded(capture: recordings.Capture, layout: Layout, data: Any) -> Recordi
             raise _wrong(capture.id, f"holds values that are no counts of {c.bits} bits, 0 to {c.largest_count}")
         return Recording(capture, layout, None, frames.astype(np.uint16 if c.largest_count > 255 else np.uint8))
     return _first_stamps(capture, layout, frames)
+
+
+def _array(id: str, data: Any) -> np.ndarray:
+    try:
+        return np.asarray(data)
+    except ValueError:
+        raise _wrong(id, "has lists of several lengths; give an array") from None
+
+
+def _kind(value: object) -> str:
+    return f"of type {type(value).__name__}"
 
 
 def _first_stamps(capture: recordings.Capture, layout: Layout, frames: np.ndarray) -> Recording:
@@ -308,7 +323,7 @@ def _first_stamps(capture: recordings.Capture, layout: Layout, frames: np.ndarra
 def _stamps(capture: recordings.Capture, layout: Layout, data: Any) -> Recording:
     if not (isinstance(data, tuple | list) and len(data) == 2):
         raise _wrong(capture.id, "a TR capture needs (times, pixels): two arrays of the same length")
-    times, pixels = (np.asarray(part) for part in data)
+    times, pixels = (_array(capture.id, part) for part in data)
     if times.ndim != 1 or pixels.shape != times.shape:
         raise _wrong(capture.id, f"times have shape {times.shape}, pixels {pixels.shape}; both are (detections,)")
     if pixels.dtype.kind not in "ui" and pixels.size:
