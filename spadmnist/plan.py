@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import dataset, factory, store
+from . import dataset, factory
 from .experiment import Experiment
 from .foreign import visible
 from .images import Images
@@ -101,7 +101,7 @@ def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tu
     started = time.perf_counter()
     made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
     columns = dataset.shard_columns(experiment, made, pixels.shape[1:])
-    size = store.encoded_size(columns, experiment.format)
+    size = experiment.encoding.size(columns)
     return share, time.perf_counter() - started, size
 
 
