@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,7 +32,7 @@ import algorithm1  # noqa: E402
 import plain_numpy  # noqa: E402
 
 import spadmnist  # noqa: E402
-from spadmnist import config, dataset, factory, measurement, reconstruct, store, twin  # noqa: E402
+from spadmnist import config, dataset, factory, measurement, reconstruct, twin  # noqa: E402
 from spadmnist.effects import Conditions, Effect  # noqa: E402
 from spadmnist.errors import SpadError  # noqa: E402
 from spadmnist.events import Layout  # noqa: E402
@@ -343,14 +344,14 @@ def floors(manifest: dict, experiment, splits) -> dict[str, float]:  # type: ign
 def stored(manifest: dict, root: Path) -> dict[str, int]:  # type: ignore[type-arg]
     """Bytes on disk by kind of stream."""
     sizes = {"tr": 0, "qis": 0, "str": 0}
-    for name, facts in manifest["files"].items():
-        for kind, parts in (
-            ("tr", ("/tr/ticks", "/tr/counts")),
-            ("qis", ("/frames/bits",)),
-            ("str", ("/frames/bits", "/frames/ticks")),
-        ):
-            if any(part in name for part in parts):
-                sizes[kind] += facts["bytes"]
+    shards = [name for name in manifest["files"] if name.endswith(".zip")]
+    members = [info for name in shards for info in zipfile.ZipFile(root / name).infolist()]
+    for kind, parts in (
+        ("tr", ("tr/ticks/", "tr/counts/")),
+        ("qis", ("frames/bits/",)),
+        ("str", ("frames/bits/", "frames/ticks/")),
+    ):
+        sizes[kind] += sum(info.file_size for info in members if info.filename.startswith(parts))
     return sizes
 
 
@@ -419,7 +420,7 @@ def writing_share(experiment, splits, folder: Path) -> float:  # type: ignore[no
         made = experiment.simulate_block(experiment.levels[0], shard.split, task.pixels, task.white, task.first)
         images = dataset.reconstruction_columns(experiment, made, (28, 28))
         middle = time.perf_counter()
-        store.write_shard(root, shard.path, dataset.stream_columns(made, (28, 28)) | images, {}, experiment.format)
+        experiment.encoding.write(root, shard.path, dataset.stream_columns(made, (28, 28)) | images, {})
         ratios.append((time.perf_counter() - middle) / (middle - started))
     return statistics.median(ratios[4:])
 

@@ -3,9 +3,8 @@
     out/manifest.json                      every file with its size and SHA-256, and its own digest
     out/config.yaml                        the config with nothing left open
     out/maps/                              maps of the sensor that came from files
-    out/data.zarr/images/<split>/<shard>   the original images and labels
-    out/data.zarr/<level>/<split>/<shard>  streams and reconstructions
-    out/data/...                           the same, one file a shard, with format hdf5
+    out/data/images/<split>/<shard>...     the original images and labels
+    out/data/<level>/<split>/<shard>...    streams and reconstructions
 
 `open` reads a finished dataset, or simulates one on demand from its config: bit for bit the same.
 """
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -30,12 +29,12 @@ from .events import Events
 from .experiment import Experiment, Level, level_of
 from .foreign import from_json, quoted, short
 from .gather import gather, indices_of, join
-from .identity import FORMAT
+from .identity import FORMAT, held
 from .images import Images, cache_folder
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
 from .sources import Source
-from .store import Column, Expected, ShardReader
+from .store import Column, Encoding, Expected, ShardReader
 from .tiles import Tiles, of_facts
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
@@ -73,7 +72,7 @@ class Shard:
         return {"split": self.split, "start": self.start, "stop": self.stop, **level}
 
     def reader(
-        self, root: Path | Source, format: str, like: Likeness, files: Mapping[str, Files] | None = None
+        self, root: Path | Source, encoding: Encoding, like: Likeness, files: Mapping[str, Files] | None = None
     ) -> ShardReader:
         """Reads the shard; a file in its place that is not its own is refused.
 
@@ -84,8 +83,8 @@ class Shard:
         stamps = {"tick_s": like.tick} if like.tick > 0 else {}
         sizes = {"image": n, "event_start": n + 1, "first_event_start": n + 1, "line": n * (pixels // columns)}
         sizes |= {"frame_byte": -(-columns * like.frames // 8), **dict(zip(like.dims, like.shape, strict=True))}
-        # a shard of HDF5 is one file, which changes where reconstructions are added; its attributes do not
-        known = files if format == "zarr" or self.level is None else None
+        # a shard that is one file changes where reconstructions are added; its attributes do not
+        known = files if not encoding.one_file or self.level is None else None
         expected = Expected(
             {
                 "": {"level": None, **self.attributes},
@@ -94,9 +93,9 @@ class Shard:
                 "frames/ticks": stamps,
             },
             sizes,
-            None if known is None else known.get(store.location(self.path, format), {}),
+            None if known is None else known.get(encoding.location(self.path), {}),
         )
-        return ShardReader(root, self.path, format, expected)
+        return encoding.reader(root, self.path, expected)
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,10 @@ class Likeness:
         return ("channel", "y", "x")[-len(self.shape) :]
 
 
-def files_by_shard(files: Files, format: str) -> dict[str, Files]:
+def files_by_shard(files: Files, encoding: Encoding) -> dict[str, Files]:
     """Those of a manifest's files that belong to shards, by the place of the shard."""
     found: dict[str, Files] = {}
-    depth = len(store.location("folder/split/number", format).split("/"))
+    depth = len(encoding.location("folder/split/number").split("/"))
     for name, facts in files.items():
         parts = name.split("/")
         if len(parts) >= depth:
@@ -196,16 +195,33 @@ def image_columns(images: Images, start: int, stop: int) -> dict[str, Column]:
             {"white": float(images.white)},
         )
     }
-    if images.labels is not None:
-        columns["labels"] = Column(np.ascontiguousarray(images.labels[start:stop]), ("image",), "1", "label", "counts")
-    return columns
+    return columns if images.labels is None else columns | {"labels": _labels(images.labels[start:stop])}
+
+
+def _labels(labels: np.ndarray) -> Column:
+    return Column(np.ascontiguousarray(labels), ("image",), "1", "label", "counts", coordinate=True)
 
 
 def shard_columns(experiment: Experiment, recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Column]:
-    """What a shard of a light level holds; shape: as in `stream_columns`."""
+    """What is drawn and made for a shard of a light level; shape: as in `stream_columns`."""
     columns = stream_columns(recorded, shape)
     columns = store.smaller(columns) if experiment.small else columns
     return columns if experiment.on_reading else columns | reconstruction_columns(experiment, recorded, shape)
+
+
+def coordinate_columns(columns: Iterable[str], numbers: range, labels: np.ndarray | None) -> dict[str, Column]:
+    """`image` and `label` for each group that arrays of a shard lie in, which xarray takes for coordinates.
+
+    columns: names of the arrays; numbers: of the images within the split; labels: where there are any. Raises
+    InputError where an array has such a name already.
+    """
+    image = Column(np.array(numbers, np.int64), ("image",), "1", "number of the image in its split", "counts")
+    found = {"image": image} if labels is None else {"image": image, "label": _labels(labels)}
+    groups = {name.rpartition("/")[0] for name in columns}
+    made = {f"{group}/{name}".lstrip("/"): column for group in groups for name, column in found.items()}
+    if taken := sorted(made.keys() & set(columns)):
+        raise InputError(f"{taken[0]}: is the name of a coordinate in every group of a shard; choose another name")
+    return made
 
 
 def stream_columns(recorded: Recorded, shape: tuple[int, ...]) -> dict[str, Column]:
@@ -269,7 +285,7 @@ def _read_causes(reader: ShardReader, group: str, start: int, stop: int, events:
     if not reader.has(f"{group}/cause"):
         return
     if reader.has(f"{group}/starts"):
-        first, last = (int(x) for x in reader.read(f"{group}/starts")[[start, stop]])
+        first, last = (int(x) for x in reader.kept(f"{group}/starts")[[start, stop]])
     else:
         bits = reader.array_attributes("frames/bits")
         before = reader.read("frames/bits", 0, start * bits["lines_per_image"])
@@ -478,7 +494,7 @@ def read_frames(
 def _read_ragged(
     reader: ShardReader, group: str, start: int, stop: int, counts: np.ndarray, pixels: int, tick: float
 ) -> Events:
-    first, last = (int(x) for x in reader.read(f"{group}/starts")[[start, stop]])
+    first, last = (int(x) for x in reader.kept(f"{group}/starts")[[start, stop]])
     offsets = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=offsets[1:])
     _check_stamps(reader, f"{group}/{'ticks' if tick > 0 else 'times'}", first, last, int(offsets[-1]))
@@ -970,7 +986,7 @@ class _Stored:
     def __init__(
         self,
         root: Path | Source,
-        format: str,
+        encoding: Encoding,
         shards: Sequence[Shard],
         originals: Sequence[Shard],
         files: Mapping[str, Files],
@@ -979,8 +995,8 @@ class _Stored:
         on_reading: OnReading | None,
     ):
         self._on_reading = on_reading
-        self._shards = [(s.start, s.stop, s.reader(root, format, like, files)) for s in shards]
-        self._originals = [(s.start, s.stop, s.reader(root, format, like, files)) for s in originals]
+        self._shards = [(s.start, s.stop, s.reader(root, encoding, like, files)) for s in shards]
+        self._originals = [(s.start, s.stop, s.reader(root, encoding, like, files)) for s in originals]
         self._facts = facts
 
     def _pieces(self, shards: Any, start: int, stop: int) -> Iterator[tuple[ShardReader, int, int]]:
@@ -1297,8 +1313,8 @@ def stored(root: Path | Source) -> Dataset:
     levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
     shards = [Shard(**x) for x in manifest["shards"]]
     like = Likeness.of(manifest)
-    shape, format = like.shape, manifest["config"]["output"]["format"]
-    files = files_by_shard(manifest["files"], format)
+    shape, encoding = like.shape, encoding_in(manifest, root)
+    files = files_by_shard(manifest["files"], encoding)
     facts = {
         "shape": shape,
         "pixels": int(np.prod(shape)),
@@ -1314,7 +1330,7 @@ def stored(root: Path | Source) -> Dataset:
         originals = [s for s in shards if s.level is None and s.split == split]
         own = {**facts, "normalisation": manifest["normalisation"][level.text]}
         own |= {"tiles": manifest["images"]["splits"][split].get("tiles"), "size": shape[-2:]}
-        backend = _Stored(root, format, mine, originals, files, like, own, made)
+        backend = _Stored(root, encoding, mine, originals, files, like, own, made)
         readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
         length = manifest["images"]["splits"][split]["images"]
         return Part(length, backend, True, readouts, methods, shape, manifest.get("causes", ()))
@@ -1342,6 +1358,14 @@ def _on_reading(root: Path | Source, manifest: Mapping[str, Any], like: Likeness
             "bring it here and open that"
         )
     return OnReading.of(config.build(document.parse(document.dump(kept), str(root / CONFIG)), root), like)
+
+
+def encoding_in(manifest: Mapping[str, Any], root: Path | Source) -> Encoding:
+    """How the shards of a dataset are written. Raises InputError where this program does not know it."""
+    try:
+        return store.encoding(manifest["config"]["output"]["format"], held(manifest)["encoding"])
+    except InputError as error:
+        raise InputError(f"{root / MANIFEST}: {error}") from None
 
 
 def shards_in(manifest: Mapping[str, Any]) -> list[Shard]:

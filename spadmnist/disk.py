@@ -299,7 +299,7 @@ def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
 
 
 def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
-    """Write new files below a folder that is made here, and synchronise all of it.
+    """Write new files below a folder that is made here, and synchronise all that is in it.
 
     Other threads synchronise a file while the next ones are made, so that the processor does not wait for the disk.
     """
@@ -316,7 +316,7 @@ def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
                 folders.add(parent)
             records[name] = _put(path, pieces)
             syncs.append(pool.submit(system.synchronise, path))
-        syncs += [pool.submit(system.synchronise, parent) for parent in folders]
+        syncs += [pool.submit(system.synchronise, parent) for parent in folders - {folder}]
         for sync in syncs:
             sync.result()
     return records

@@ -18,6 +18,7 @@ from .images import Images, check_size
 from .readout import Recorded
 from .reconstruct import Method, Settings
 from .sensor import Sensor
+from .store import Encoding
 from .streams import Streams
 
 _FROM_FRAMES = 2e9  # expected events of an image from which on its frames are drawn without them, if they stand alone
@@ -67,10 +68,10 @@ class Experiment:
     """Everything that decides what a dataset contains, besides the images.
 
     resolved: the config with all defaults filled in and the sensor in place, as text and numbers: what a manifest
-    keeps. base: the folder that relative paths refer to; name: the file, for messages; limit: images of each split;
-    small: fewer bytes, more slowly; on_reading: reconstructions are not stored, but made when they are read;
-    causes: say of every detection what made it; wavelengths: m, of each channel of colour images, where they differ
-    (the first is that of `conditions`).
+    keeps. base: the folder that relative paths refer to; name: the file, for messages; encoding: how shards are
+    written; limit: images of each split; small: fewer bytes, more slowly; on_reading: reconstructions are not stored,
+    but made when they are read; causes: say of every detection what made it; wavelengths: m, of each channel of colour
+    images, where they differ (the first is that of `conditions`).
     """
 
     name: str
@@ -83,7 +84,7 @@ class Experiment:
     readouts: tuple[str, ...]
     methods: tuple[str, ...]
     sensor: Sensor
-    format: str
+    encoding: Encoding
     small: bool = False
     on_reading: bool = False
     limit: int | None = None
@@ -91,6 +92,11 @@ class Experiment:
     notes: tuple[str, ...] = ()
     wavelengths: tuple[float, ...] = ()
     _photons: dict[tuple[str, int], float] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def format(self) -> str:
+        """Of the shards."""
+        return self.encoding.format
 
     # --- light ---------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from .errors import InputError, SpadError
 from .experiment import Experiment
 from .foreign import from_json
 from .golden import versions
-from .identity import ENCODING, FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other
+from .identity import FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other, written_as
 from .images import Images
 from .reconstruct import median_of_nonzero
 from .sensor import BYTES_PER_EVENT
@@ -51,12 +51,13 @@ _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 class Job:
     """What a worker needs to know to simulate: enough to build the experiment anew, wherever it is.
 
-    maps: (name, content) of the files that the config names.
+    maps: (name, content) of the files that the config names; encoding: of its shards.
     """
 
     config: str
     maps: tuple[tuple[str, bytes], ...]
     plugins: tuple[plugins.Carried, ...]
+    encoding: store.Encoding
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ def _experiment(job: Job) -> Experiment:
             path = Path(folder, name)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        return config.build(document.parse(job.config, "config"), Path(folder))
+        experiment = config.build(document.parse(job.config, "config"), Path(folder))
+    return replace(experiment, encoding=job.encoding)
 
 
 def make_shard(task: Task) -> Files:
@@ -144,16 +146,16 @@ def make_shard(task: Task) -> Files:
     columns, attributes = shard_content(experiment, task)
     if task.run:
         task.run.check()  # once more: nobody waits for a worker that was given up
-    files = store.write_shard(task.root, task.shard.path, columns, attributes, experiment.format)
+    files = experiment.encoding.write(task.root, task.shard.path, columns, attributes)
     note(Path(task.root), task.shard, files)
     return files
 
 
 def encode_shard(task: Task) -> dict[str, bytes]:
-    """Simulate and encode one shard; its files, for `store.put_shard`."""
+    """Simulate and encode one shard; its files, for `Encoding.put`."""
     experiment = _experiment(task.job)
     columns, attributes = shard_content(experiment, task)
-    return _joined(store.encoded(task.shard.path, columns, attributes, experiment.format))
+    return _joined(experiment.encoding.encoded(task.shard.path, columns, attributes))
 
 
 def _joined(files: Mapping[str, Iterable[bytes]]) -> dict[str, bytes]:
@@ -169,17 +171,27 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     """(columns, attributes) of a shard."""
     shard = task.shard
     attributes: dict[str, Any] = shard.attributes
-    skip = shard.start - task.first
+    skip, end = shard.start - task.first, shard.stop - task.first
     if shard.level is None:
         images = Images(task.pixels, task.labels, task.white)
-        return dataset.image_columns(images, skip, skip + shard.stop - shard.start), attributes
+        return _described(experiment, shard, dataset.image_columns(images, skip, end), None), attributes
     level = experiment.level(shard.level)
     recorded = experiment.simulate_block(level, shard.split, task.pixels, task.white, task.first)
-    if (skip, shard.stop - task.first) != (0, len(task.pixels)):
-        recorded = recorded.images(skip, shard.stop - task.first)
+    if (skip, end) != (0, len(task.pixels)):
+        recorded = recorded.images(skip, end)
     shape = task.pixels.shape[1:]
-    columns = dataset.shard_columns(experiment, recorded, shape)
+    labels = None if task.labels is None else task.labels[skip:end]
+    columns = _described(experiment, shard, dataset.shard_columns(experiment, recorded, shape), labels)
     return columns, {**attributes, "statistics": json.dumps(dataset.statistics(experiment, recorded))}
+
+
+def _described(
+    experiment: Experiment, shard: Shard, columns: dict[str, store.Column], labels: np.ndarray | None
+) -> dict[str, store.Column]:
+    """The columns of a shard with their coordinates, where the encoding has any."""
+    if not experiment.encoding.coordinates:
+        return columns
+    return columns | dataset.coordinate_columns(columns, range(shard.start, shard.stop), labels)
 
 
 def _record_path(root: Path, shard: Shard) -> Path:
@@ -319,17 +331,22 @@ def generate(
     workers = executor(jobs)
     if workers.local:
         check_memory(experiment, splits, shards, workers.threads)
+    kept, finished = _there(root)
+    experiment = written_as(experiment, kept) if kept else experiment
     wanted = identity(experiment, splits)
-    if _check_place(root, wanted):
+    refuse_other(root, wanted, kept or wanted)
+    if finished:
         tidy(root)
-        return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
+        return Outcome(root, 0, 0, time.monotonic() - started, kept)
     with locked(root, part):
-        if _check_place(root, wanted):  # another run has finished it meanwhile
-            return Outcome(root, 0, 0, time.monotonic() - started, dataset.read_manifest(root)[0])
+        kept, finished = _there(root)  # another run has begun or finished it meanwhile
+        refuse_other(root, wanted, kept or wanted)
+        if finished:
+            return Outcome(root, 0, 0, time.monotonic() - started, kept)
         begin(root, wanted, part)
         greet(workers, experiment)
         like = _likeness(experiment, wanted)
-        made = {s: noted for s in shards if (noted := _made(root, s, experiment.format, like)) is not None}
+        made = {s: noted for s in shards if (noted := _made(root, s, experiment.encoding, like)) is not None}
         _check_space(root, experiment, splits, sum(noted.bytes for noted in made.values()))
 
         def again(shard: Shard) -> dict[str, bytes]:
@@ -357,7 +374,7 @@ def check_bytes(
 
     made: the shards that are there and by what each was made, as far as that is known. Where one may have been made by
     something else than is here, the config's golden shard must be the known one; where none is known, the first shard
-    of each such maker is made again and compared. again: makes the files of a shard, named as for `store.put_shard`.
+    of each such maker is made again and compared. again: makes the files of a shard, by their names for `Encoding.put`.
     """
     here = golden.made_by()
     others: dict[str, tuple[Shard, Mapping[str, str] | None]] = {}
@@ -372,7 +389,7 @@ def check_bytes(
         return
     for shard, maker in others.values():
         progress.notice("Other versions or another machine may have made what is there: one shard is made again.")
-        place = store.location(shard.path, experiment.format)
+        place = experiment.encoding.location(shard.path)
         for name, data in again(shard).items():
             path = root / (place + name.removeprefix("shard"))
             there = b""
@@ -431,17 +448,19 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
     return int(_LIBRARIES + held + scratch + 3 * streams + 1.2 * bits)
 
 
-def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
-    """Is the dataset there and finished? Refuse a folder that holds something else, before anything is written."""
+def _there(root: Path) -> tuple[dict[str, Any], bool]:
+    """(the manifest or the plan of what is there, is it finished?); without a plan, nothing is there yet.
+
+    Refuses a folder that holds something else, before anything is written.
+    """
     disk.check_outside(root)
     with _writable(root):
         if not root.exists():
-            return False
+            return {}, False
         if not root.is_dir():
             raise SpadError(f"{root} is a file; choose another place with -o")
         if (root / MANIFEST).exists():
-            refuse_other(root, wanted, dataset.read_manifest(root)[0])
-            return True
+            return dataset.read_manifest(root)[0], True
         content = set(os.listdir(root))
         plan = root / STATE / "plan.json"
         if not plan.exists():
@@ -450,9 +469,8 @@ def _check_place(root: Path, wanted: dict[str, Any]) -> bool:
                     f"{root} is not empty and holds no dataset (there is {sorted(content)[0]}); "
                     "choose another folder with -o"
                 )
-            return False
-    refuse_other(root, wanted, _plan(root))
-    return False
+            return {}, False
+    return _plan(root), False
 
 
 def _plan(root: Path) -> dict[str, Any]:
@@ -509,15 +527,15 @@ def _likeness(experiment: Experiment, wanted: Mapping[str, Any]) -> Likeness:
     return Likeness(tuple(wanted["images"]["shape"]), experiment.conditions.frames, experiment.settings.tick)
 
 
-def _made(root: Path, shard: Shard, format: str, like: Likeness) -> Note | None:
+def _made(root: Path, shard: Shard, encoding: store.Encoding, like: Likeness) -> Note | None:
     """What was noted of a shard that is there as it was made, else None.
 
     Its attributes and the sizes of its files say so; its data are not read.
     """
     noted = _noted(root, shard)
-    if noted.files is None or not store.exists(root, shard.path, format):
+    if noted.files is None or not encoding.exists(root, shard.path):
         return None
-    reader = shard.reader(root, format, like)
+    reader = shard.reader(root, encoding, like)
     base = f"{root}{os.sep}"
     try:
         for name, facts in noted.files.items():
@@ -601,7 +619,7 @@ def make_shards(
 
     def keep(path: str, files: dict[str, bytes]) -> None:
         size = sum(map(len, files.values()))
-        made = store.put_shard(root, path, {name: [data] for name, data in files.items()}, experiment.format, size)
+        made = experiment.encoding.put(root, path, {name: [data] for name, data in files.items()}, size)
         note(root, by_path[path], made)
         done(path, made)
 
@@ -624,7 +642,7 @@ def _work(experiment: Experiment, splits: Mapping[str, Images], level: str | Non
 def job_of(experiment: Experiment) -> Job:
     """The experiment, for workers."""
     resolved, maps = portable(experiment)
-    return Job(document.dump(resolved), tuple(maps.items()), plugins.carried())
+    return Job(document.dump(resolved), tuple(maps.items()), plugins.carried(), experiment.encoding)
 
 
 def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: Images, run: Run | None = None) -> Task:
@@ -632,7 +650,8 @@ def task_of(experiment: Experiment, job: Job, root: Path, shard: Shard, images: 
     block = experiment.sensor.block if shard.level is not None else 1
     first = shard.start // block * block
     last = min(-(-shard.stop // block) * block, len(images))
-    labels = None if images.labels is None or shard.level is not None else images.labels[first:last]
+    labelled = images.labels is not None and (shard.level is None or experiment.encoding.coordinates)
+    labels = images.labels[first:last] if labelled and images.labels is not None else None
     return Task(job, os.path.abspath(root), shard, images.some(first, last), labels, images.white, first, run)
 
 
@@ -693,23 +712,25 @@ def add_methods(addition: Addition) -> tuple[str, Files]:
     if addition.run:
         addition.run.check()
     root, shard = Path(addition.root), addition.shard
-    reader = shard.reader(root, experiment.format, addition.like, addition.files)
+    encoding = experiment.encoding
+    reader = shard.reader(root, encoding, addition.like, addition.files)
     recorded, shape = dataset.read_shard(reader, experiment)
     columns = dataset.reconstruction_columns(experiment, recorded, shape, addition.methods)
-    files = store.append_columns(root, shard.path, columns, experiment.format)
+    labels = next((reader.read(name) for name in reader.names if name.endswith("/label")), None)
+    files = encoding.append(root, shard.path, _described(experiment, shard, columns, labels))
     return shard.path, files
 
 
 def _as_read(root: Path, shard: Shard, experiment: Experiment, like: Likeness) -> dict[str, bytes]:
     """The files of a shard, made again from its own streams; see `check_bytes`."""
-    reader = shard.reader(root, experiment.format, like)
+    reader = shard.reader(root, experiment.encoding, like)
     columns = {name: reader.column(name) for name in reader.names}
     if shard.level is not None:
         recorded, shape = dataset.read_shard(reader, experiment)
         stored = () if experiment.on_reading else experiment.methods
         methods = [method for method in stored if reader.has(f"reconstruction/{method}")]
         columns |= dataset.reconstruction_columns(experiment, recorded, shape, methods)
-    return _joined(store.encoded(shard.path, columns, reader.attributes, experiment.format))
+    return _joined(experiment.encoding.encoded(shard.path, columns, reader.attributes))
 
 
 def add_reconstructions(
@@ -723,7 +744,9 @@ def add_reconstructions(
     Returns (methods that were added, manifest). An interrupted run is taken up by the same call. jobs: see `generate`.
     """
     workers, manifest = executor(jobs), dataset.intact_manifest(root)
+    encoding = dataset.encoding_in(manifest, root)
     before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
+    before = replace(before, encoding=encoding)
     if before.on_reading:
         raise InputError(
             f"{root}: its flux images are made when they are read (output.reconstructions: on_reading), and none is "
@@ -741,7 +764,7 @@ def add_reconstructions(
         tidy(root)
         return [], manifest
     after = before.with_methods((*before.methods, *new))
-    refuse_other(root, {**held(manifest), "stream": STREAM, "encoding": ENCODING}, manifest)
+    refuse_other(root, {**held(manifest), "stream": STREAM}, manifest)
     wanted = {**held(manifest), "config": portable(after)[0], "plugins": plugin_sources(after)}
     shards = dataset.shards_in(manifest)
     with locked(root):
@@ -759,19 +782,19 @@ def add_reconstructions(
         makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s).made_by for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
         begin(root, wanted)
-        files = dataset.files_by_shard(manifest["files"], after.format)
+        files = dataset.files_by_shard(manifest["files"], encoding)
 
         def files_of(shard: Shard) -> dict[str, Files]:
-            place = store.location(shard.path, after.format)
+            place = encoding.location(shard.path)
             return {place: files.get(place, {})}
 
         def done(path: str, result: tuple[str, Files]) -> None:
-            known = files.get(store.location(path, after.format), {})
+            known = files.get(encoding.location(path), {})
             note(root, by_path[path], known | result[1])
             progress.advance(1, path)
 
         for path in [p for p, s in by_path.items() if s.level is None]:
-            note(root, by_path[path], files.get(store.location(path, after.format), {}))
+            note(root, by_path[path], files.get(encoding.location(path), {}))
             del by_path[path]
         progress.start("reconstructing", len(shards), len(shards) - len(by_path))
         if by_path:
@@ -792,7 +815,7 @@ def add_reconstructions(
 def _normalise(arguments: tuple[Path, Job, Likeness, list[Shard], str]) -> float | None:
     root, job, like, shards, method = arguments
     experiment = _experiment(job)
-    readers = [(shard.reader(root, experiment.format, like), shard.stop - shard.start) for shard in shards]
+    readers = [(shard.reader(root, experiment.encoding, like), shard.stop - shard.start) for shard in shards]
     if not experiment.on_reading:
         return median_of_nonzero(lambda: (reader.read(f"reconstruction/{method}") for reader, _ in readers))
     made = OnReading.of(experiment, like)
@@ -840,7 +863,7 @@ def finish(
     for shard in shards:
         files |= _noted(root, shard).files or {}
     small, groups = small_files(experiment, shards, normalisation)
-    files |= store.write_groups(root, groups, experiment.format)
+    files |= experiment.encoding.write_groups(root, groups)
     for name, data in small.items():
         if name not in files:
             files[name] = disk.commit_file(root / name, data, temporary)
@@ -854,7 +877,7 @@ def finish(
         "normalisation": normalisation,
         **({"causes": list(experiment.sensor.causes)} if experiment.causes else {}),
         "statistics": statistics_of(
-            root, experiment.format, [x.text for x in experiment.levels], experiment.methods, like, shards, files
+            root, experiment.encoding, [x.text for x in experiment.levels], experiment.methods, like, shards, files
         ),
         "files": files,
     }
@@ -876,7 +899,7 @@ def small_files(
     for shard in shards:
         groups.setdefault(shard.folder, _level_attributes(experiment, shard, normalisation))
         groups.setdefault(f"{shard.folder}/{shard.split}", {"split": shard.split})
-    return files | store.group_files(groups, experiment.format), groups
+    return files | experiment.encoding.groups(groups), groups
 
 
 def config_text(resolved: dict[str, Any]) -> str:
@@ -900,7 +923,7 @@ def _level_attributes(
 
 def statistics_of(
     root: Path | Source,
-    format: str,
+    encoding: store.Encoding,
     levels: Sequence[str],
     methods: Sequence[str],
     like: Likeness,
@@ -912,7 +935,7 @@ def statistics_of(
     They are added up from what each shard says of itself. Raises InputError where one of them cannot be read.
     """
     pixels = int(np.prod(like.shape))
-    by_shard = dataset.files_by_shard(files, format)
+    by_shard = dataset.files_by_shard(files, encoding)
     out: dict[str, Any] = {level: {} for level in levels}
     for shard in shards:
         if shard.level is None:
@@ -923,8 +946,8 @@ def statistics_of(
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels
-        reader = shard.reader(root, format, like)
-        place = store.location(shard.path, format)
+        reader = shard.reader(root, encoding, like)
+        place = encoding.location(shard.path)
         try:
             told = from_json(reader.attributes["statistics"])
             for readout, numbers in told.items():
@@ -939,8 +962,7 @@ def statistics_of(
                 f"{root / place}: what it says of its own detections is "
                 "damaged; remove it and type the same command again"
             ) from None
-        for name, facts in by_shard.get(place, {}).items():
-            kind = name[len(place) :].strip("/").split("/")[0] if format == "zarr" else "all"
+        for kind, size in reader.kinds(by_shard.get(place, {})).items():
             kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
-            total["bytes"][kind] = total["bytes"].get(kind, 0) + facts["bytes"]
+            total["bytes"][kind] = total["bytes"].get(kind, 0) + size
     return out

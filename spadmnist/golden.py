@@ -23,7 +23,7 @@ import numpy as np
 from . import __version__, config, dataset, plugins, reconstruct, store
 from .errors import SpadError
 from .experiment import Experiment, Level
-from .identity import ENCODING, STREAM, portable
+from .identity import STREAM, portable
 from .images import Images
 
 KNOWN = Path(__file__).with_suffix(".json")
@@ -94,6 +94,7 @@ def key(experiment: Experiment) -> str:
     resolved, maps = portable(experiment)
     scene = {name: value for name, value in resolved["scene"].items() if name not in ("images", "lux", "irradiance")}
     kept = {name: value for name, value in resolved.items() if name not in ("seed", "limit")}
+    kept |= {"encoding": experiment.encoding.number} if experiment.encoding.number > 1 else {}
     of = {**kept, "scene": scene, "maps": {name: hashlib.sha256(data).hexdigest() for name, data in maps.items()}}
     return hashlib.sha256(dataset.canonical(of)).hexdigest()
 
@@ -116,7 +117,9 @@ def digest(experiment: Experiment) -> str:
     pixels = pixels[: max(1, min(IMAGES, int(_BYTES / size)))]
     made = experiment.simulate_block(_LIGHT, "golden", pixels, white, 0)
     columns = dataset.shard_columns(experiment, made, shape)
-    files = store.encoded("golden", columns, {}, experiment.format)
+    if experiment.encoding.coordinates:
+        columns |= dataset.coordinate_columns(columns, range(len(pixels)), np.arange(len(pixels), dtype=np.uint8))
+    files = experiment.encoding.encoded("golden", columns, {})
     sums = hashlib.sha256()
     for name, pieces in sorted(files.items()):
         data = b"".join(pieces)
@@ -135,26 +138,26 @@ def known() -> dict[str, Any]:
 
 
 def check(experiment: Experiment) -> bool:
-    """Is it known of this config, and not only of quick.yaml in its format, that the same bytes are made here?
+    """Is it known of this config, and not only of quick.yaml in its encoding, that the same bytes are made here?
 
     Raises SpadError where others are.
     """
     digests = known()["digests"]
     own = has_golden(experiment) and key(experiment) in digests
-    tried = experiment if own else _shipped(experiment.format)
+    tried = experiment if own else _shipped(experiment.encoding)
     if digest(tried) != digests[key(tried)]:
-        what = f"{tried.name}: the golden shard of stream {STREAM}, encoding {ENCODING}"
+        what = f"{tried.name}: the golden shard of stream {STREAM}, encoding {tried.encoding.number}"
         raise other_bytes(what, known()["versions"])
     return own
 
 
-def _shipped(format: str | None = None) -> Experiment:
-    return config.read(config.shipped("quick.yaml"), format=format)
+def _shipped(encoding: store.Encoding) -> Experiment:
+    return replace(config.read(config.shipped("quick.yaml"), format=encoding.format), encoding=encoding)
 
 
 @lru_cache(maxsize=1)
 def _quick() -> str:
-    return digest(_shipped())
+    return digest(_shipped(store.encoding("zarr")))
 
 
 def answer(about: object) -> tuple[str, str]:

@@ -10,12 +10,13 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import plugins, reconstruct
+from . import plugins, reconstruct, store
 from .errors import SpadError
 from .experiment import Experiment
 from .images import Images
@@ -23,7 +24,6 @@ from .positions import positions_text
 
 FORMAT = "spadmnist-dataset/1"
 STREAM = 1  # raised when any number is drawn otherwise
-ENCODING = 1  # raised when the same numbers are written as other bytes
 POSITIONS = "maps/layout.positions.csv"
 
 
@@ -34,7 +34,7 @@ def identity(experiment: Experiment, splits: Mapping[str, Images]) -> dict[str, 
     return {
         "format": FORMAT,
         "stream": STREAM,
-        "encoding": ENCODING,
+        "encoding": experiment.encoding.number,
         "config": resolved,
         "images": {
             "shape": list(any_split.pixels.shape[1:]),
@@ -59,6 +59,18 @@ def held(kept: Mapping[str, Any]) -> dict[str, Any]:
     keys = ("format", "stream", "encoding", "config", "images", "maps", "plugins")
     kept = {"stream": 1, "encoding": 1, **kept}
     return {key: kept.get(key) for key in keys}
+
+
+def written_as(experiment: Experiment, kept: Mapping[str, Any]) -> Experiment:
+    """The experiment with the encoding of what a manifest or a plan holds, which a run goes on with.
+
+    Raises InputError where that one is not known here.
+    """
+    config = kept.get("config")
+    output = config.get("output") if isinstance(config, dict) else None
+    if not isinstance(output, dict) or output.get("format") != experiment.format:
+        return experiment  # it is another dataset
+    return replace(experiment, encoding=store.encoding(experiment.format, held(kept)["encoding"]))
 
 
 def refuse_other(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any]) -> None:

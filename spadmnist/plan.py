@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import dataset, factory, large, store
+from . import dataset, factory, large
 from .experiment import Experiment
 from .foreign import visible
 from .images import Images
@@ -69,13 +69,13 @@ def _expected(experiment: Experiment, level: Any, images: Images, n: int) -> tup
         total = float(counted @ photons[:, 0]) * experiment.conditions.exposure
         return total, float(counted @ recorded)
     step = max(1, n // max(1, min(256, _NUMBERS // pixels[0].size)))
-    photons = recorded = 0.0
+    lit = seen = 0.0
     for part in _some_of(pixels[::step]):
         here = experiment.photons(level, np.ascontiguousarray(part), images.white)
-        photons += float(here.sum())
-        recorded += float(_seen(experiment, here.reshape(-1, experiment.sensor.layout.pixels)).sum())
+        lit += float(here.sum())
+        seen += float(_seen(experiment, here.reshape(-1, experiment.sensor.layout.pixels)).sum())
     share = n / len(pixels[::step])
-    return photons * experiment.conditions.exposure * share, recorded * share
+    return lit * experiment.conditions.exposure * share, seen * share
 
 
 def _some_of(array: np.ndarray) -> Iterator[np.ndarray]:
@@ -109,7 +109,7 @@ def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tu
     started = time.perf_counter()
     made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
     columns = dataset.shard_columns(experiment, made, pixels.shape[1:])
-    size = store.encoded_size(columns, experiment.format)
+    size = experiment.encoding.size(columns)
     return share, time.perf_counter() - started, size
 
 

@@ -10,7 +10,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +89,10 @@ def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
     """Are the manifest's statistics those that its shards, which are as they were made, say of themselves?"""
     config, levels = manifest["config"], [level["text"] for level in manifest["levels"]]
     like, shards, files = dataset.Likeness.of(manifest), dataset.shards_in(manifest), manifest["files"]
-    format, methods = config["output"]["format"], config["reconstruct"]
+    methods = config["reconstruct"]
     try:
-        told = factory.statistics_of(root, format, levels, methods, like, shards, files)
+        encoding = dataset.encoding_in(manifest, root)
+        told = factory.statistics_of(root, encoding, levels, methods, like, shards, files)
     except InputError:
         return False
     return told == manifest["statistics"]
@@ -186,8 +187,8 @@ def repair(
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
             again = shards
         else:
-            hurt = dataset.files_by_shard({name: {} for name in bad}, experiment.format)
-            again = [s for s in shards if store.location(s.path, experiment.format) in hurt]
+            hurt = dataset.files_by_shard({name: {} for name in bad}, experiment.encoding)
+            again = [s for s in shards if experiment.encoding.location(s.path) in hurt]
         did += _set_aside(root, damage.extra)
         remade, lines = _remake(experiment, splits, root, again, manifest, workers, progress)
         did += lines
@@ -227,7 +228,7 @@ def _check_asked(
         if name in small or any(_is_asked(name, s, experiment, labelled) for s in shards):
             wrong = wrong or f"it does not list {name}, which its config asks for"
     for name in sorted(bad - small):
-        if not any(_belongs(name, s, experiment.format) for s in shards):
+        if not any(_belongs(name, s, experiment.encoding) for s in shards):
             wrong = wrong or f"it lists {name}, which its config does not ask for"
     if MANIFEST in bad:
         wrong = wrong or "its statistics are not those of its shards"
@@ -239,8 +240,8 @@ def _check_asked(
 
 def _is_asked(name: str, shard: Shard, experiment: Experiment, labelled: bool) -> bool:
     """Is it a file of an array that a config asks a shard to hold? Nothing else has such a place and such a name."""
-    place = store.location(shard.path, experiment.format)
-    if experiment.format == "hdf5":
+    place = experiment.encoding.location(shard.path)
+    if experiment.encoding.one_file:
         return name == place
     group, _, rest = name.removeprefix(f"{place}/").partition("/")
     if name == group or not name.startswith(f"{place}/") or not _ARRAY_FILE.search(name):
@@ -257,7 +258,10 @@ _ARRAY_FILE = re.compile(r"/(zarr\.json|c(\.0)+)$")
 def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did: list[str]) -> Experiment:
     """From the manifest where it is intact, else from the config file. did: where lines on what was done go."""
     if manifest is None:
-        return config.read(root / CONFIG)
+        experiment = config.read(root / CONFIG)
+        # the shards that are there say how they are written
+        likely = max(store.encodings(experiment.format), key=lambda one: (one.count(root), one.number))
+        return replace(experiment, encoding=likely)
     text = factory.config_text(manifest["config"])
     lost = [name for name in manifest["maps"] if name in {*damage.changed, *damage.missing}]
     beyond = [name for name in lost if name != POSITIONS]
@@ -268,7 +272,8 @@ def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did
             did += _clear_way(root, POSITIONS)
             disk.commit_file(root / POSITIONS, manifest["maps"][POSITIONS]["text"].encode(), disk.temporary(root))
             did.append(f"made again: {POSITIONS}")
-    return config.build(document.parse(text, str(root / CONFIG)), root)
+    made = config.build(document.parse(text, str(root / CONFIG)), root)
+    return replace(made, encoding=dataset.encoding_in(manifest, root))
 
 
 def _images(
@@ -285,13 +290,13 @@ def _images(
     bad = {*damage.changed, *damage.missing}
     if manifest is not None and images_dir is None and experiment.sensor.block == 1:
         own = [s for s in dataset.shards_in(manifest) if s.level is None]
-        if not any(_belongs(name, s, experiment.format) for s in own for name in bad):
+        if not any(_belongs(name, s, experiment.encoding) for s in own for name in bad):
             splits: dict[str, Images] = {}
             like = dataset.Likeness.of(manifest)
-            files = dataset.files_by_shard(manifest["files"], experiment.format)
+            files = dataset.files_by_shard(manifest["files"], experiment.encoding)
             for split in dict.fromkeys(s.split for s in own):
                 mine = [s for s in own if s.split == split]
-                readers = [s.reader(root, experiment.format, like, files) for s in mine]
+                readers = [s.reader(root, experiment.encoding, like, files) for s in mine]
                 pixels = np.concatenate([r.read("pixels") for r in readers])
                 labelled = readers[0].has("labels")
                 labels = np.concatenate([r.read("labels") for r in readers]) if labelled else None
@@ -303,8 +308,8 @@ def _images(
     return experiment.load_images(images_dir)
 
 
-def _belongs(name: str, shard: Shard, format: str) -> bool:
-    place = store.location(shard.path, format)
+def _belongs(name: str, shard: Shard, encoding: store.Encoding) -> bool:
+    place = encoding.location(shard.path)
     return name == place or name.startswith(place + "/")
 
 

@@ -6,9 +6,9 @@ or stands there twice, and one that does not lie where the zip says are refused.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-import struct
 import threading
 import zipfile
 import zlib
@@ -16,8 +16,9 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
+from . import archive
+from .archive import BadArchive
 from .errors import InputError
-from .foreign import short
 from .sources import File, Source, Unreadable, tree
 
 _MOST_INFLATED = 200  # times; manifests deflate 4 to 10 times, shards hardly, deflate itself ends at 1032
@@ -39,11 +40,11 @@ def is_zip(path: Path) -> bool:
 
 
 class _Member(File):
-    """Of a zip, as it is stored: a range of the zip's file."""
+    """Of a zip, as it is stored: a range of the zip's file; all of it where no range is given."""
 
-    def __init__(self, path: Path, start: int, size: int):
+    def __init__(self, path: Path, start: int = 0, size: int | None = None):
         self._file = open(path, "rb", buffering=0)  # noqa: SIM115 - closed by `close`
-        self._start, self.size = start, size
+        self._start, self.size = start, os.fstat(self._file.fileno()).st_size if size is None else size
 
     def read(self, offset: int, length: int) -> bytes:
         length = max(0, min(length, self.size - offset))
@@ -85,10 +86,10 @@ class Zip(Source):
     def _read(self) -> dict[str, zipfile.ZipInfo]:
         """The members by their names, below the folder of the manifest."""
         try:
-            with zipfile.ZipFile(self._path) as file:
-                listed = [info for info in file.infolist() if not info.is_dir()]
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, EOFError, struct.error) as error:
-            raise self._no(f"cannot be read as a zip ({short(str(error), 200)})") from None
+            with contextlib.closing(_Member(self._path)) as file:
+                listed = archive.members(file)
+        except BadArchive as error:
+            raise self._no(str(error)) from None
         except OSError as error:
             raise InputError(f"{self}: cannot be read: {error.strerror or error}") from error
         if len(listed) > _MEMBERS:
@@ -97,14 +98,7 @@ class Zip(Source):
         if not tops:
             raise self._no("is not a zip of a dataset: it has no manifest.json")
         above = tops[0].removesuffix("manifest.json")
-        members: dict[str, zipfile.ZipInfo] = {}
-        for info in listed:
-            if info.filename.startswith(above):
-                name = info.filename.removeprefix(above)
-                if name in members:
-                    raise self._no(f"holds {short(name, 200)} twice")
-                members[name] = info
-        return members
+        return {i.filename.removeprefix(above): i for i in listed if i.filename.startswith(above)}
 
     def _no(self, problem: str) -> InputError:
         return InputError(f"{self}: {problem}; give the zip of a folder that spadmnist generate made")
@@ -116,14 +110,12 @@ class Zip(Source):
         info = self._members.get(file)
         if info is None:
             raise FileNotFoundError(file)
-        if info.flag_bits & 1:
-            raise self._bad(f"{file} is encrypted")
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise self._bad(f"{file} is compressed by method {info.compress_type}, and stored and deflated are read")
+        try:
+            archive.check_member(info, compressed=True)
+        except BadArchive as error:
+            raise self._bad(str(error)) from None
         if info.compress_type == zipfile.ZIP_STORED:
-            if info.compress_size != info.file_size:
-                raise self._bad(f"{file} has two sizes")
-            return _Member(self._path, self._start(file, info), info.file_size)
+            return _Member(self._path, self._start(info), info.file_size)
         if info.file_size > _FREE + _MOST_INFLATED * info.compress_size:
             raise self._bad(
                 f"{file} inflates {info.compress_size:,} bytes to {info.file_size:,}, and at most {_MOST_INFLATED} "
@@ -137,19 +129,15 @@ class Zip(Source):
             self._inflated.move_to_end(file)
             return _Bytes(self._inflated[file])
 
-    def _start(self, file: str, info: zipfile.ZipInfo) -> int:
-        """Where a member's bytes begin. What stands before them has a length of its own."""
-        with open(self._path, "rb") as zipped:
-            zipped.seek(info.header_offset)
-            head = zipped.read(30)
-            start = info.header_offset + 30 + sum(struct.unpack("<HH", head[26:30])) if len(head) == 30 else 0
-            end = zipped.seek(0, os.SEEK_END)
-        if head[:4] != b"PK\x03\x04" or start + info.compress_size > end:
-            raise self._bad(f"{file} does not lie where the zip says")
-        return start
+    def _start(self, info: zipfile.ZipInfo) -> int:
+        try:
+            with contextlib.closing(_Member(self._path)) as file:
+                return archive.start(file, info)
+        except BadArchive as error:
+            raise self._bad(str(error)) from None
 
     def _inflate(self, file: str, info: zipfile.ZipInfo) -> bytes:
-        member = _Member(self._path, self._start(file, info), info.compress_size)
+        member = _Member(self._path, self._start(info), info.compress_size)
         try:
             inflate = zlib.decompressobj(-zlib.MAX_WBITS)
             data = inflate.decompress(member.read(0, info.compress_size), info.file_size + 1)

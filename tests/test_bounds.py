@@ -350,17 +350,17 @@ def test_levels_are_not_compared_with_each_other(tmp_path: Path, monkeypatch: py
         config.read(tmp_path / "many.yaml")
 
 
-@pytest.mark.parametrize("format", ["zarr", "hdf5"])
-def test_every_file_has_its_shard(format: str) -> None:
+@pytest.mark.parametrize("encoding", store.Encoding.every.values(), ids=str)
+def test_every_file_has_its_shard(encoding: store.Encoding) -> None:
     shards = [Shard("5 mlux", folder, split, k, 0, 1) for folder in ("a", "ab") for split in ("x", "y") for k in (0, 1)]
     files: Files = {name: {} for name in ("spadmnist.yaml", "data.zarr/zarr.json", "data.zarr/a/zarr.json")}
     for shard in shards:
-        place = store.location(shard.path, format)
-        names = [place] if format == "hdf5" else [f"{place}/zarr.json", f"{place}/tr/c.0"]
+        place = encoding.location(shard.path)
+        names = [place] if encoding.one_file else [f"{place}/zarr.json", f"{place}/tr/c.0"]
         files |= {name: {} for name in names}
-    found = dataset.files_by_shard(files, format)
+    found = dataset.files_by_shard(files, encoding)
     for shard in shards:
-        place = store.location(shard.path, format)
+        place = encoding.location(shard.path)
         assert list(found[place]) == [n for n in files if n == place or n.startswith(f"{place}/")]
         assert found[place]
 

@@ -534,7 +534,7 @@ def test_a_read_only_disk(made: tuple[Path, Path], disk: Path) -> None:
     shutil.copytree(made[1], disk / "out")
     shutil.copy(made[0], disk / "c.yaml")
     shutil.copytree(made[1], disk / "hurt")
-    next((disk / "hurt").rglob("labels/c.0")).write_bytes(b"")
+    next((disk / "hurt").rglob("images/train/*.zip")).write_bytes(b"")
     remount(disk, "ro")
     before = tree(disk)
     for arguments in (
@@ -606,7 +606,7 @@ def test_names_with_blanks_and_of_any_alphabet(made: tuple[Path, Path], tmp_path
     assert run("verify", "a b", cwd=home).returncode == 0
     assert run("inspect", "a b", "--plot", "ü b.png", cwd=home).returncode in (0, 2)
     expected = tree(home / "a b")
-    next((home / "a b").rglob("frames/bits/c*")).write_bytes(b"x")
+    next((home / "a b").rglob("2560_mlux/train/*.zip")).write_bytes(b"x")
     assert_sentence(run("verify", "a b", "--repair", cwd=home), "dimmer")
     repaired = run("verify", "a b", "--repair", *plugin, cwd=home)
     assert repaired.returncode == 0, repaired

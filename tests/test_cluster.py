@@ -25,6 +25,7 @@ from test_factory import METHODS, assert_same, assert_sentence, descendants, mak
 from spadmnist import config, factory, golden, plugins, verify
 from spadmnist.errors import SpadError
 from spadmnist.inference.comparison import canonical, compare
+from spadmnist.store import Encoding
 from spadmnist.workers import Serial
 
 distributed = pytest.importorskip("distributed", reason="the cluster's library is not installed")
@@ -105,8 +106,8 @@ def test_workers_that_share_no_files_send_the_same_bytes(
     many: tuple[Path, Path], site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent = []
-    put = factory.store.put_shard
-    monkeypatch.setattr(factory.store, "put_shard", lambda *given: sent.append(given[1]) or put(*given))
+    put = Encoding.put
+    monkeypatch.setattr(Encoding, "put", lambda *given: sent.append(given[2]) or put(*given))
     with Cluster(site.address, shared=False) as apart:
         on(apart, many[0], tmp_path / "out")
     assert_same(tmp_path / "out", tree(many[1]))
@@ -118,7 +119,7 @@ def test_reconstruct_and_repair_on_a_cluster(many: tuple[Path, Path], cluster: C
     on(cluster, few, tmp_path / "out")
     factory.add_reconstructions(tmp_path / "out", METHODS[2:], cluster)
     assert_same(tmp_path / "out", tree(many[1]))
-    hurt = next((tmp_path / "out" / "data.zarr").rglob("c.0"))
+    hurt = next((tmp_path / "out" / "data").rglob("*.zip"))
     hurt.write_bytes(b"damaged")
     assert verify.repair(tmp_path / "out", verify.verify(tmp_path / "out"), cluster)
     assert_same(tmp_path / "out", tree(many[1]))
@@ -225,7 +226,7 @@ def test_no_scheduler_there(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_the_command_line_says_it_in_one_sentence(more: list[str], said: str, tmp_path: Path) -> None:
     assert_sentence(run("generate", write_config(tmp_path / "c.yaml"), "-o", tmp_path / "out", *more), said)
-    assert not (tmp_path / "out" / "data.zarr").exists()
+    assert not (tmp_path / "out" / "data").exists()
 
 
 def test_the_command_line_makes_the_same_bytes(many: tuple[Path, Path], site: Site, tmp_path: Path) -> None:
@@ -267,7 +268,7 @@ def test_a_worker_that_makes_other_bytes_is_refused(
     ) as told:
         on(cluster, many[0], tmp_path / "out")
     assert golden.processor() in str(told.value)
-    assert not (tmp_path / "out" / "data.zarr").exists()
+    assert not (tmp_path / "out" / "data").exists()
 
 
 def test_a_worker_without_the_shared_folder(

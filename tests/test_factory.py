@@ -14,7 +14,9 @@ import signal
 import subprocess
 import textwrap
 import time
+import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ import spadmnist
 from spadmnist import config, dataset, factory, golden, plugins, reconstruct
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
+from spadmnist.store import Encoding
 from spadmnist.workers import Serial
 
 METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
@@ -84,10 +87,12 @@ def make(
     root: Path,
     jobs: int = 1,
     progress: Progress = Progress(),  # noqa: B008
+    encoding: Encoding | None = None,
     **changes: Any,
 ) -> factory.Outcome:
-    """`spadmnist generate`, in this process."""
+    """`spadmnist generate`, in this process; encoding: another than that of new datasets."""
     experiment = config.read(file, **changes)
+    experiment = replace(experiment, encoding=encoding or experiment.encoding)
     return factory.generate(experiment, experiment.load_images(), root, jobs, progress)
 
 
@@ -190,14 +195,16 @@ def test_nothing_of_the_run_stays(made: tuple[Path, Path]) -> None:
     """No state, lock, temporary file, path, host, user or time."""
     _, root = made
     names = tree(root)
-    top = {"config.yaml", "manifest.json", "data.zarr" if (root / "data.zarr").exists() else "data"}
-    assert {name.split("/")[0] for name in names} == top
+    assert {name.split("/")[0] for name in names} == {"config.yaml", "manifest.json", "data"}
     private = [str(root.parent), str(Path.cwd()), str(Path.home())]
     private += [word for word in (platform.node(),) if len(word) > 3]
     for name, content in names.items():
         assert isinstance(content, bytes), name
         for word in private:
             assert word.encode() not in content, f"{name} holds {word}"
+        if name.endswith(".zip"):
+            with zipfile.ZipFile(root / name) as zipped:
+                assert {info.date_time for info in zipped.infolist()} == {(1980, 1, 1, 0, 0, 0)}, name
         if name.endswith((".json", ".yaml")):
             assert not re.search(rb"20[0-9][0-9]-[01][0-9]-[0-3][0-9]", content), name
             assert str(time.localtime().tm_year).encode() not in re.sub(rb"[0-9a-f]{64}|: [0-9]+", b"", content)
@@ -372,7 +379,7 @@ def made_elsewhere(root: Path, plant: bool) -> None:
         noted["made_by"] |= {"numpy": "1.0", "processor": "an abacus"}
         record.write_text(json.dumps(noted))
         if plant and "images" not in record.parts:
-            path = root / next(name for name in noted["files"] if not name.endswith("zarr.json"))
+            path = root / next(iter(noted["files"]))
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 1
             path.write_bytes(content)
@@ -426,7 +433,7 @@ def test_a_new_run_under_other_versions_makes_a_golden_shard_first(
     make(made[0], tmp_path / "out", limit=4)
     planted = dict.fromkeys(known["digests"], "0" * 64)
     monkeypatch.setattr(golden, "known", lambda: {"digests": planted, "versions": {"numpy": "1.0"}})
-    with pytest.raises(SpadError, match=r"the golden shard of stream 1, encoding 1: .*there numpy 1\.0"):
+    with pytest.raises(SpadError, match=r"the golden shard of stream 1, encoding [12]: .*there numpy 1\.0"):
         make(made[0], tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
@@ -460,19 +467,11 @@ def test_methods_are_added_to_a_sealed_dataset_where_the_same_bytes_are_made(
 # --- killed from outside ------------------------------------------------------------------------------------------
 
 
-def assert_whole_shards(root: Path, expected: dict[str, bytes | str], format: str) -> None:
+def assert_whole_shards(root: Path, expected: dict[str, bytes | str]) -> None:
     """Every shard that is in its place is complete."""
-    base, depth = ("data.zarr", 4) if format == "zarr" else ("data", 4)
-    there = tree(root)
-    shards = {"/".join(n.split("/")[:depth]) for n in there if n.startswith(f"{base}/") and n.count("/") >= depth - 1}
-    for shard in shards:
-        if shard.endswith("zarr.json"):
-            continue
-        mine = {n: c for n, c in there.items() if n == shard or n.startswith(f"{shard}/")}
-        theirs = {n: c for n, c in expected.items() if n == shard or n.startswith(f"{shard}/")}
-        if "empty folder" in mine.values() and len(mine) == 1:
-            continue  # a folder above shards
-        assert mine == theirs, f"{shard} is not complete"
+    for name, content in tree(root).items():
+        if name.startswith("data/") and content != "empty folder":
+            assert content == expected.get(name), f"{name} is not complete"
 
 
 @contextlib.contextmanager
@@ -572,8 +571,8 @@ def kill_and_resume(file: Path, root: Path, expected: dict[str, bytes | str], ki
                 if whom != "worker":
                     process.wait(10)
                     assert wait_for(lambda family=family: not alive(family), 4), alive(family)
-                    if (root / "data.zarr").exists():
-                        assert_whole_shards(root, expected, "zarr")
+                    if (root / "data").exists():
+                        assert_whole_shards(root, expected)
             if process.wait(60) == 0 and not (root / ".spadmnist").exists():
                 assert_same(root, expected)
                 shutil.rmtree(root)
@@ -614,7 +613,7 @@ def test_interrupted_by_a_signal(number: int, status: int, whom: str, many: tupl
     if number == signal.SIGINT:
         assert "the same command" in said
     assert not (root / "manifest.json").exists()
-    assert_whole_shards(root, tree(many[1]), "zarr")
+    assert_whole_shards(root, tree(many[1]))
     outcome = make(many[0], root)
     assert outcome.kept >= 2
     assert_same(root, tree(many[1]))
@@ -648,7 +647,7 @@ def test_a_task_that_kills_its_worker_is_named_and_the_others_finish(tmp_path: P
         f"{level}/{split}"
         for level in ("images", "5_mlux", "160_mlux", "2560_mlux")
         for split in ("train", "test")
-        if not (tmp_path / "out" / "data.zarr" / level / split / "00000").exists()
+        if not any((tmp_path / "out" / "data" / level / split).glob("00000*"))
     }
     assert missing == {"160_mlux/train"}, "the others were not finished"
 
@@ -724,14 +723,15 @@ def test_a_run_that_waited_for_the_end_of_another_one_does_nothing(
 ) -> None:
     """It looked before the other one had finished, and takes the lock after."""
     root = tmp_path / "out"
-    check = factory._check_place
+    look = factory._there
 
-    def meanwhile(*arguments: Any) -> None:
-        check(*arguments)
-        monkeypatch.setattr(factory, "_check_place", check)
+    def meanwhile(place: Path) -> Any:
+        found = look(place)
+        monkeypatch.setattr(factory, "_there", look)
         make(made[0], root)
+        return found
 
-    monkeypatch.setattr(factory, "_check_place", meanwhile)
+    monkeypatch.setattr(factory, "_there", meanwhile)
     outcome = make(made[0], root)
     assert_same(root, tree(made[1]))
     assert outcome.made == 0

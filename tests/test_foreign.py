@@ -220,7 +220,7 @@ def test_files_of_a_dataset_nested_too_deeply(depth: int, tmp_path: Path) -> Non
     root = tmp_path / "out"
     file = write_config(tmp_path / "c.yaml", train=2, test=1)
     make(file, root)
-    arrays = sorted(root.rglob("zarr.json"))
+    arrays = sorted(root.rglob("*.zip"))
     for path in (arrays[-1], root / "manifest.json", root / ".spadmnist" / "plan.json"):
         before = path.read_bytes() if path.exists() else b""
         path.parent.mkdir(exist_ok=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,19 @@ import pytest
 from spadmnist import config, document, golden
 from spadmnist.errors import SpadError
 from spadmnist.experiment import Experiment
+from spadmnist.store import Encoding, encoding
 
 CONFIGS = sorted(path.name for path in config.shipped("quick.yaml").parent.glob("*.yaml"))
 
 
 def experiments() -> dict[str, Experiment]:
-    """Every config that is shipped, in each format."""
+    """Every config that is shipped, in each encoding."""
     found = {}
     for name in CONFIGS:
         if not name.endswith("_sensor.yaml"):
-            for format in ("zarr", "hdf5"):
-                found[f"{name} {format}"] = config.read(config.shipped(name), format=format)
+            for one in Encoding.every.values():
+                made = config.read(config.shipped(name), format=one.format)
+                found[f"{name} {one}"] = replace(made, encoding=one)
     return found
 
 
@@ -66,9 +69,10 @@ def test_what_is_not_known_is_told_from_what_is(monkeypatch: pytest.MonkeyPatch)
     other = quick("rate: 100 Hz", "rate: 101 Hz")
     assert golden.key(other) != golden.key(quick()) != golden.key(quick(format="hdf5"))
     assert golden.check(quick()) and not golden.check(other)
-    assert golden.key(golden._shipped("hdf5")) == golden.key(
-        quick(format="hdf5")
-    )  # what is tried where nothing is known
+    # what is tried where nothing is known
+    assert golden.key(golden._shipped(encoding("hdf5"))) == golden.key(quick(format="hdf5"))
+    older = replace(quick(), encoding=encoding("zarr", 1))
+    assert golden.key(older) != golden.key(quick()) and golden.check(older)
     planted = dict.fromkeys(golden.known()["digests"], "0" * 64)
     monkeypatch.setattr(golden, "known", lambda: {"digests": planted, "versions": {"numpy": "1.0", "h5py": "2.0"}})
     for experiment in (quick(), other):

@@ -18,7 +18,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ import pytest
 
 import spadmnist
 from spadmnist import config, document, factory, plugins
+from spadmnist.store import Encoding
 
 ROOT = Path(__file__).parents[1]
 KNOWN = Path(__file__).parent / "data" / "guard.json"
@@ -132,7 +133,9 @@ class LossyBus(Effect, stage="readout"):
 
 @dataclass(frozen=True)
 class Made:
-    """A dataset to be made: a shipped config or one that stands above, by format; the first images of each split."""
+    """A dataset to be made: a shipped config or one that stands above, by the encodings that it is made in (`NAMED`);
+    the first images of each split.
+    """
 
     config: str
     formats: tuple[str, ...]
@@ -141,12 +144,14 @@ class Made:
 
 
 DATASETS = {
-    "quick": Made("quick.yaml", ("zarr", "hdf5")),
+    "quick": Made("quick.yaml", ("zarr", "zarr/2", "hdf5")),
     "spad_mnist": Made("spad_mnist.yaml", ("zarr",), limit=100, mnist=True),
-    "device": Made(DEVICE, ("zarr", "hdf5")),
+    "device": Made(DEVICE, ("zarr", "zarr/2", "hdf5")),
     "binary": Made(BINARY, ("hdf5",)),
-    "counter": Made(COUNTER, ("zarr",)),
+    "counter": Made(COUNTER, ("zarr", "zarr/2")),
 }
+# encoding 1 of a format has the format's name, which it had when there was no other
+NAMED = {one.format if one.number == 1 else str(one): one for one in Encoding.every.values()}
 CASES = [(name, format) for name, made in DATASETS.items() for format in made.formats]
 
 
@@ -160,15 +165,16 @@ OURS = {"config.yaml", GROUPS}  # text that no library encodes
 @functools.cache
 def digests(name: str, format: str) -> tuple[Digests, Digests]:
     """(of what is read, of the files) of a dataset that today's program makes."""
-    made = DATASETS[name]
+    made, written = DATASETS[name], NAMED[format]
     with tempfile.TemporaryDirectory() as folder:
         if "lossy_bus" in made.config:
             (Path(folder) / "lossy_bus.py").write_text(LOSSY_BUS)
             plugins.load_file(Path(folder) / "lossy_bus.py")
         if made.config.endswith(".yaml"):
-            experiment = config.read(ROOT / "configs" / made.config, format=format, limit=made.limit)
+            experiment = config.read(ROOT / "configs" / made.config, format=written.format, limit=made.limit)
         else:
-            experiment = config.build(document.parse(made.config, name), Path(folder), format=format)
+            experiment = config.build(document.parse(made.config, name), Path(folder), format=written.format)
+        experiment = replace(experiment, encoding=written)
         images = experiment.load_images(MNIST if made.mnist else None)
         manifest = factory.generate(experiment, images, Path(folder) / "out", 1).manifest
         return values_of(Path(folder) / "out"), files_of(manifest)
@@ -219,7 +225,7 @@ def add(digest: Any, value: str | np.ndarray) -> None:
 
 
 def files_of(manifest: dict[str, Any]) -> Digests:
-    """By array (Zarr) or level (HDF5) for the shards, else by file. No file of the manifest's list holds a version."""
+    """By array (zarr/1) or level for the shards, else by file. No file of the manifest's list holds a version."""
     found: dict[str, Any] = defaultdict(hashlib.sha256)
     for name, facts in sorted(manifest["files"].items()):
         array = re.fullmatch(r"data\.zarr/([^/]+)/[^/]+/\d{5}/(.+)/(?:zarr\.json|c\.[\d.]+)", name)

@@ -17,6 +17,7 @@ import sys
 import textwrap
 import time
 import warnings
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -28,12 +29,15 @@ import xarray as xr
 import zarr
 from zarr.core.group import GroupMetadata
 from zarr.core.metadata.v3 import ArrayV3Metadata
+from zarr.storage import ZipStore
 
-from spadmnist import disk, store
+from spadmnist import disk
 from spadmnist.errors import InputError, SpadError
-from spadmnist.store import Column, ShardReader, append_columns, exists, location, write_groups, write_shard
+from spadmnist.store import Column, Encoding, ShardReader, chunks, encoding
+from spadmnist.store.hdf5 import _decode as decode_hdf5
 
-FORMATS = ["zarr", "hdf5"]
+ENCODINGS = list(Encoding.every.values())
+CONTAINER, FOLDER, HDF5 = encoding("zarr", 2), encoding("zarr", 1), encoding("hdf5", 1)
 IMAGE = ("image", "y", "x")
 
 
@@ -82,6 +86,14 @@ def tree(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
+def members(place: Path) -> dict[str, bytes]:
+    """The files of a shard: a folder, or a zip."""
+    if place.is_dir():
+        return tree(place)
+    with zipfile.ZipFile(place) as zipped:
+        return {info.filename: zipped.read(info) for info in zipped.infolist()}
+
+
 def digests(root: Path) -> dict[str, dict[str, object]]:
     return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in tree(root).items()}
 
@@ -100,15 +112,15 @@ def check(reader: ShardReader, columns: dict[str, Column]) -> None:
 
 
 # --- round trips -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("format", FORMATS)
-def test_what_is_written_is_read_back(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_what_is_written_is_read_back(tmp_path: Path, format: Encoding) -> None:
     columns = some_columns() | more_columns()
-    assert not exists(tmp_path, "5mlux/train/0000", format)
-    files = write_shard(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES, format)
-    assert exists(tmp_path, "5mlux/train/0000", format)
+    assert not format.exists(tmp_path, "5mlux/train/0000")
+    files = format.write(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES)
+    assert format.exists(tmp_path, "5mlux/train/0000")
     assert files == digests(tmp_path)
     assert list(disk.temporary(tmp_path).iterdir()) == []
-    reader = ShardReader(tmp_path, "5mlux/train/0000", format)
+    reader = format.reader(tmp_path, "5mlux/train/0000")
     check(reader, columns)
     assert reader.attributes == ATTRIBUTES
     check(pickle.loads(pickle.dumps(reader)), columns)
@@ -118,10 +130,10 @@ def test_what_is_written_is_read_back(tmp_path: Path, format: str) -> None:
         reader.read("tr/ticks", 3, 900)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint64", "int64", "float32", "float64", ">u4"])
 @pytest.mark.parametrize("shape", [(0,), (1,), (10,), (12, 2), (0, 3), (4, 0)])
-def test_types_and_shapes(tmp_path: Path, format: str, dtype: str, shape: tuple[int, ...]) -> None:
+def test_types_and_shapes(tmp_path: Path, format: Encoding, dtype: str, shape: tuple[int, ...]) -> None:
     data = np.random.default_rng(3).integers(0, 200, shape).astype(dtype)
     if dtype == "uint64" and data.size:
         data.flat[0] = 2**64 - 1
@@ -137,17 +149,24 @@ def test_types_and_shapes(tmp_path: Path, format: str, dtype: str, shape: tuple[
         for codec in ("ticks", "counts", "bits", "floats")
         if codec == "ticks" or len(shape) == 1
     }
-    write_shard(tmp_path, "s", columns, {}, format)
-    reader = ShardReader(tmp_path, "s", format)
+    format.write(tmp_path, "s", columns, {})
+    reader = format.reader(tmp_path, "s")
     for name in columns:
         assert np.array_equal(reader.read(name), data)
         assert reader.shape(name) == shape
 
 
-def test_zarr_python_reads_the_same(tmp_path: Path) -> None:
+def opened(place: Path) -> Path | ZipStore:
+    """A shard for zarr-python."""
+    return place if place.is_dir() else ZipStore(place)
+
+
+@pytest.mark.parametrize("format", [CONTAINER, FOLDER], ids=str)
+def test_zarr_python_reads_the_same(tmp_path: Path, format: Encoding) -> None:
     columns = some_columns() | more_columns()
-    write_shard(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES, "zarr")
-    group = zarr.open_group(tmp_path / "data.zarr/5mlux/train/0000", mode="r", use_consolidated=False)
+    format.write(tmp_path, "5mlux/train/0000", columns, ATTRIBUTES)
+    place = tmp_path / format.location("5mlux/train/0000")
+    group = zarr.open_group(opened(place), mode="r", use_consolidated=False)
     assert dict(group.attrs) == ATTRIBUTES
     for name, column in columns.items():
         array = group[name]
@@ -157,14 +176,17 @@ def test_zarr_python_reads_the_same(tmp_path: Path) -> None:
         assert dict(array.attrs) == {**column.attributes, "units": column.unit, "long_name": column.about}
 
 
-def test_metadata_is_what_zarr_python_itself_would_write(tmp_path: Path) -> None:
-    write_shard(tmp_path, "s", some_columns() | more_columns(), ATTRIBUTES, "zarr")
-    for name, text in tree(tmp_path / "data.zarr").items():
+@pytest.mark.parametrize("format", [CONTAINER, FOLDER], ids=str)
+def test_metadata_is_what_zarr_python_itself_would_write(tmp_path: Path, format: Encoding) -> None:
+    format.write(tmp_path, "s", some_columns() | more_columns(), ATTRIBUTES)
+    for name, text in members(tmp_path / format.location("s")).items():
         if not name.endswith("zarr.json"):
             continue
         document = json.loads(text)
         if document["node_type"] == "group":
+            within = document.pop("consolidated_metadata", None)  # which repeats the others
             assert GroupMetadata.from_dict(dict(document)).to_dict() == document
+            assert (within is not None) == (format is CONTAINER and name == "zarr.json")
             continue
         again = json.loads(json.dumps(ArrayV3Metadata.from_dict(dict(document)).to_dict()))
         if document["data_type"] in ("uint8", "int8"):  # one byte has no order: zarr-python leaves that out
@@ -180,9 +202,9 @@ def test_xarray_opens_it_without_a_warning(tmp_path: Path) -> None:
         "5mlux": {"lux": 0.005},
         "5mlux/train": {},
     }
-    files = write_groups(tmp_path, groups, "zarr")
+    files = FOLDER.write_groups(tmp_path, groups)
     for i in range(2):
-        files |= write_shard(tmp_path, f"5mlux/train/000{i}", columns, ATTRIBUTES, "zarr")
+        files |= FOLDER.write(tmp_path, f"5mlux/train/000{i}", columns, ATTRIBUTES)
     assert files == digests(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -198,7 +220,7 @@ def test_xarray_opens_it_without_a_warning(tmp_path: Path) -> None:
 
 def test_hdf5_has_dimension_scales(tmp_path: Path) -> None:
     columns = some_columns() | more_columns()
-    write_shard(tmp_path, "s", columns, ATTRIBUTES, "hdf5")
+    HDF5.write(tmp_path, "s", columns, ATTRIBUTES)
     with h5py.File(tmp_path / "data/s.h5") as file:
         assert file.attrs["level"] == b"2560 mlux" and list(file.attrs["readouts"]) == [b"tr", b"qis"]
         for name, column in columns.items():
@@ -214,7 +236,7 @@ def test_hdf5_has_dimension_scales(tmp_path: Path) -> None:
 def test_xarray_opens_hdf5_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("h5netcdf", reason="xarray reads HDF5 with h5netcdf, which is not installed")
     columns = some_columns() | more_columns()
-    write_shard(tmp_path, "s", columns, ATTRIBUTES, "hdf5")
+    HDF5.write(tmp_path, "s", columns, ATTRIBUTES)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         part = xr.open_dataset(tmp_path / "data/s.h5", engine="h5netcdf", group="tr")
@@ -222,22 +244,22 @@ def test_xarray_opens_hdf5_without_a_warning(tmp_path: Path) -> None:
 
 
 # --- the same bytes ----------------------------------------------------------------------------------------
-@pytest.mark.parametrize("format", FORMATS)
-def test_same_input_same_bytes(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_same_input_same_bytes(tmp_path: Path, format: Encoding) -> None:
     """In another process, with other thread counts, a second later and in another order of the columns."""
     program = textwrap.dedent(
         """
         import sys
         sys.path.insert(0, sys.argv[1])
         from test_store import ATTRIBUTES, some_columns
-        from spadmnist.store import write_shard
+        from spadmnist.store import Encoding
         columns = some_columns(300)
         if sys.argv[4] == "reversed":
             columns = dict(reversed(columns.items()))
-        write_shard(sys.argv[2], "s", columns, ATTRIBUTES, sys.argv[3])
+        Encoding.every[sys.argv[3]].write(sys.argv[2], "s", columns, ATTRIBUTES)
         """
     )
-    write_shard(tmp_path / "here", "s", some_columns(300), ATTRIBUTES, format)
+    format.write(tmp_path / "here", "s", some_columns(300), ATTRIBUTES)
     time.sleep(1.1)
     for threads, order in (("1", "as is"), ("4", "reversed")):
         command = [
@@ -246,7 +268,7 @@ def test_same_input_same_bytes(tmp_path: Path, format: str) -> None:
             program,
             str(Path(__file__).parent),
             str(tmp_path / threads),
-            format,
+            str(format),
             order,
         ]
         environment = os.environ | {"BLOSC_NTHREADS": threads, "TZ": "Asia/Tokyo"}
@@ -254,26 +276,26 @@ def test_same_input_same_bytes(tmp_path: Path, format: str) -> None:
         assert tree(tmp_path / threads) == tree(tmp_path / "here")
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_appending_is_writing_all_at_once(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_appending_is_writing_all_at_once(tmp_path: Path, format: Encoding) -> None:
     first, more = some_columns(), more_columns()
-    write_shard(tmp_path / "once", "s", first | more, ATTRIBUTES, format)
-    files = write_shard(tmp_path / "twice", "s", first, ATTRIBUTES, format)
-    files |= append_columns(tmp_path / "twice", "s", more, format)
+    format.write(tmp_path / "once", "s", first | more, ATTRIBUTES)
+    files = format.write(tmp_path / "twice", "s", first, ATTRIBUTES)
+    files |= format.append(tmp_path / "twice", "s", more)
     assert tree(tmp_path / "twice") == tree(tmp_path / "once")
     assert files == digests(tmp_path / "twice")
-    append_columns(tmp_path / "twice", "s", more, format)  # again: the same is replaced by the same
+    format.append(tmp_path / "twice", "s", more)  # again: the same is replaced by the same
     assert tree(tmp_path / "twice") == tree(tmp_path / "once")
     assert list(disk.temporary(tmp_path / "twice").iterdir()) == []
     with pytest.raises(ValueError, match=r"dimension 'image' has size 7 in .* and 9 in"):
-        append_columns(tmp_path / "twice", "s", {"frames/other": more_columns(9)["frames/sum"]}, format)
+        format.append(tmp_path / "twice", "s", {"frames/other": more_columns(9)["frames/sum"]})
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_writing_again_replaces(tmp_path: Path, format: str) -> None:
-    write_shard(tmp_path / "a", "s", some_columns(9) | more_columns(9), {}, format)
-    write_shard(tmp_path / "a", "s", some_columns(), {}, format)
-    write_shard(tmp_path / "b", "s", some_columns(), {}, format)
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_writing_again_replaces(tmp_path: Path, format: Encoding) -> None:
+    format.write(tmp_path / "a", "s", some_columns(9) | more_columns(9), {})
+    format.write(tmp_path / "a", "s", some_columns(), {})
+    format.write(tmp_path / "b", "s", some_columns(), {})
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
@@ -305,7 +327,7 @@ def test_a_column_that_cannot_be_stored(tmp_path: Path, change: dict[str, object
         "codec": "floats",
     }
     with pytest.raises(ValueError, match=message):
-        write_shard(tmp_path, "s", {"x": Column(**(fields | change))}, {}, "zarr")  # type: ignore[arg-type]
+        FOLDER.write(tmp_path, "s", {"x": Column(**(fields | change))}, {})  # type: ignore[arg-type]
     assert tree(tmp_path) == {}
 
 
@@ -313,27 +335,27 @@ def test_names_that_cannot_be_stored(tmp_path: Path) -> None:
     good = Column(np.zeros(3), ("a",), "1", "x", "floats")
     for name in ("", "..", "a/../b", "/a", ".a", "a//b", "zarr.json", "a\nb", "a.", "ä"):
         with pytest.raises(ValueError, match="cannot be a name on disk"):
-            write_shard(tmp_path, "s", {name: good}, {}, "zarr")
+            FOLDER.write(tmp_path, "s", {name: good}, {})
         with pytest.raises(ValueError, match="cannot be a name on disk"):
-            write_shard(tmp_path, name, {"x": good}, {}, "zarr")
+            FOLDER.write(tmp_path, name, {"x": good}, {})
     for columns in (
         {"a": Column(np.zeros((3, 3)), ("a", "b"), "1", "x", "floats")},
         {"x": good, "x/y": good},
     ):
         with pytest.raises(ValueError, match="rename one of them"):
-            write_shard(tmp_path, "s", columns, {}, "zarr")
-    with pytest.raises(ValueError, match="'tiff' is not a format"):
-        write_shard(tmp_path, "s", {"x": good}, {}, "tiff")
+            FOLDER.write(tmp_path, "s", columns, {})
+    with pytest.raises(InputError, match="'tiff' is not a format; choose one of zarr, hdf5"):
+        encoding("tiff")
 
 
 # --- damage ------------------------------------------------------------------------------------------------
 @pytest.mark.slow
-@pytest.mark.parametrize("format", FORMATS)
-def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: Encoding) -> None:
     """Flipped bits, cut files and missing files: reading refuses, or gives exactly what was written; the hash
     shows it in any case."""
     columns = some_columns() | more_columns()
-    files = write_shard(tmp_path, "s", columns, ATTRIBUTES, format)
+    files = format.write(tmp_path, "s", columns, ATTRIBUTES)
     rng = random.Random(4)
     refused = 0
     for trial in range(400):
@@ -350,7 +372,7 @@ def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: str) -> No
             path.write_bytes(damaged)
         assert not path.exists() or hashlib.sha256(path.read_bytes()).hexdigest() != files[name]["sha256"]
         try:
-            reader = ShardReader(tmp_path, "s", format)
+            reader = format.reader(tmp_path, "s")
             for column in reader.names:
                 data = reader.read(column)
                 assert column not in columns or np.array_equal(data, columns[column].data)
@@ -358,19 +380,19 @@ def test_random_damage_never_gives_wrong_data(tmp_path: Path, format: str) -> No
             refused += 1
             assert "spadmnist verify" in str(error) and str(tmp_path) in str(error)
         path.write_bytes(before)
-    check(ShardReader(tmp_path, "s", format), columns)
+    check(format.reader(tmp_path, "s"), columns)
     # The others hit what no reader looks at: texts, padding, and in a small HDF5 file mostly empty space.
-    assert refused > (200 if format == "zarr" else 100)
+    assert refused > (200 if format is FOLDER else 100)
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_every_flip_in_data_is_refused(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_every_flip_in_data_is_refused(tmp_path: Path, format: Encoding) -> None:
     column = Column(np.arange(1000, dtype=np.uint32), ("event",), "10 ps", "times", "ticks", 400)
-    file = next(name for name in write_shard(tmp_path, "s", {"a": column}, {}, format) if name[-1] in "05")
-    path = tmp_path / file
+    files = format.write(tmp_path, "s", {"a": column}, {})
+    path = tmp_path / next(name for name in files if not name.endswith(".json"))
     before = path.read_bytes()
-    places = [(at, size) for at, size in ShardReader(tmp_path, "s", format)._array("a").places]
-    reader = ShardReader(tmp_path, "s", format)
+    places = [(at, size) for at, size in format.reader(tmp_path, "s")._array("a").places]
+    reader = format.reader(tmp_path, "s")
     reader.read("a")
     for at, size in places:
         for position in range(at, at + size, 7):
@@ -381,22 +403,24 @@ def test_every_flip_in_data_is_refused(tmp_path: Path, format: str) -> None:
                 reader.read("a")
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_links_are_refused(tmp_path: Path, format: str) -> None:
-    write_shard(tmp_path / "out", "a/s", some_columns(), {}, format)
-    where = tmp_path / "out" / ("data.zarr" if format == "zarr" else "data")
-    inside = ["a/s/tr/ticks/c.0", "a/s/tr/ticks", "a/s/tr", "a/s", "a"] if format == "zarr" else ["a/s.h5", "a"]
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_links_are_refused(tmp_path: Path, format: Encoding) -> None:
+    format.write(tmp_path / "out", "a/s", some_columns(), {})
+    where = tmp_path / "out" / format.folder
+    inside = ["a/s.zarr.zip", "a"] if format is CONTAINER else ["a/s.h5", "a"]
+    if format is FOLDER:
+        inside = ["a/s/tr/ticks/c.0", "a/s/tr/ticks", "a/s/tr", "a/s", "a"]
     for name in inside:
         shutil.move(where / name, tmp_path / "elsewhere")
         (where / name).symlink_to(tmp_path / "elsewhere")
         with pytest.raises(InputError, match="symbolic link"):
-            ShardReader(tmp_path / "out", "a/s", format).read("tr/ticks")
+            format.reader(tmp_path / "out", "a/s").read("tr/ticks")
         if name == "a":
             with pytest.raises(SpadError, match="symbolic link"):
-                write_shard(tmp_path / "out", "a/t", some_columns(), {}, format)
+                format.write(tmp_path / "out", "a/t", some_columns(), {})
         (where / name).unlink()
         shutil.move(tmp_path / "elsewhere", where / name)
-    ShardReader(tmp_path / "out", "a/s", format).read("tr/ticks")
+    format.reader(tmp_path / "out", "a/s").read("tr/ticks")
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious/file").touch()
     shutil.rmtree(disk.temporary(tmp_path / "out"))
@@ -412,23 +436,23 @@ def bomb(kind: str) -> tuple[bytes, str]:
     if kind == "zstd":
         return numcodecs.zstd.compress(zeros, 1, True), "floats"
     packed = numcodecs.blosc.compress(zeros, b"zstd", 1, numcodecs.blosc.BITSHUFFLE, 0, 4)
-    return packed + store._crc32c(packed), "ticks"
+    return packed + chunks.crc32c(packed), "ticks"
 
 
 @pytest.mark.parametrize("kind", ["zstd", "blosc"])
 def test_a_bomb_is_refused_before_it_grows(tmp_path: Path, kind: str) -> None:
     chunk, codec = bomb(kind)
     column = Column(np.arange(1000, dtype=np.uint32), ("event",), "1", "numbers", codec)
-    write_shard(tmp_path, "s", {"a": column}, {}, "zarr")
+    FOLDER.write(tmp_path, "s", {"a": column}, {})
     table = struct.pack("<QQ", 0, len(chunk))
-    (tmp_path / "data.zarr/s/a/c.0").write_bytes(chunk + table + store._crc32c(table))
+    (tmp_path / "data.zarr/s/a/c.0").write_bytes(chunk + table + chunks.crc32c(table))
     program = textwrap.dedent(
         """
         import sys
         from pathlib import Path
         from spadmnist.errors import InputError
-        from spadmnist.store import ShardReader
-        reader = ShardReader(sys.argv[1], "s", "zarr")
+        from spadmnist.store import encoding
+        reader = encoding("zarr", 1).reader(sys.argv[1], "s")
         try:
             reader.read("a")
         except InputError as error:
@@ -450,13 +474,13 @@ def test_an_hdf5_bomb_is_refused_before_it_grows(tmp_path: Path) -> None:
 
     data = bytes(Fletcher32().encode(zlib.compress(bytes(1 << 26), 1)))
     into = np.empty(4000, np.uint8)
-    with pytest.raises(store._Damaged, match="does not have the 4000 bytes"):
-        store._decode_hdf5(data, into, 4)
+    with pytest.raises(chunks.Damaged, match="does not have the 4000 bytes"):
+        decode_hdf5(data, into, 4)
 
 
 def test_hostile_descriptions_are_refused(tmp_path: Path) -> None:
     column = Column(np.arange(1000, dtype=np.uint32), ("event",), "1", "numbers", "ticks", 100)
-    write_shard(tmp_path, "s", {"a": column}, {}, "zarr")
+    FOLDER.write(tmp_path, "s", {"a": column}, {})
     path = tmp_path / "data.zarr/s/a/zarr.json"
     text = path.read_text()
     document = json.loads(text)
@@ -474,15 +498,15 @@ def test_hostile_descriptions_are_refused(tmp_path: Path) -> None:
     for key, value in [(key, value) for key, values in wrong_values.items() for value in values]:
         path.write_text(json.dumps(document | {key: value}))
         with pytest.raises(InputError, match=r"zarr\.json: "):
-            ShardReader(tmp_path, "s", "zarr").read("a")
+            FOLDER.reader(tmp_path, "s").read("a")
     for wrong in ("", "[]", "[" * 100_000, "{", "nonsense", "9" * 5000, " " * (2 << 20), '{"shape": NaN}'):
         path.write_text(wrong)
         with pytest.raises(InputError, match=r"zarr\.json: "):
-            ShardReader(tmp_path, "s", "zarr").read("a")
+            FOLDER.reader(tmp_path, "s").read("a")
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(InputError, match="not a file"):
-        ShardReader(tmp_path, "s", "zarr").read("a")
+        FOLDER.reader(tmp_path, "s").read("a")
 
 
 def test_hostile_hdf5_is_refused(tmp_path: Path) -> None:
@@ -540,10 +564,10 @@ def test_hostile_hdf5_is_refused(tmp_path: Path) -> None:
         with h5py.File(path, "w") as file:
             make(file)
         with pytest.raises(InputError, match=r"s\.h5: .*spadmnist verify"):
-            ShardReader(tmp_path, "s", "hdf5").read("a")
+            HDF5.reader(tmp_path, "s").read("a")
     path.write_bytes(b"not HDF5")
     with pytest.raises(InputError, match=r"s\.h5: .*HDF5 cannot read it"):
-        ShardReader(tmp_path, "s", "hdf5").read("a")
+        HDF5.reader(tmp_path, "s").read("a")
 
 
 # --- the disk ----------------------------------------------------------------------------------------------
@@ -576,26 +600,29 @@ def test_a_file_among_the_users_own_leaves_nothing_beside_it(tmp_path: Path) -> 
     assert path.read_bytes() == b"mine" and os.listdir(tmp_path) == ["answer.json"]
 
 
-@pytest.mark.parametrize("format", ["zarr", pytest.param("hdf5", marks=pytest.mark.slow)])
-def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
+SLOWLY = [pytest.param(one, marks=pytest.mark.slow) for one in (FOLDER, HDF5)]
+
+
+@pytest.mark.parametrize("format", [CONTAINER, *SLOWLY], ids=str)
+def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: Encoding) -> None:
     program = textwrap.dedent(
         """
         import sys
         sys.path.insert(0, sys.argv[1])
         from test_store import ATTRIBUTES, more_columns, some_columns
-        from spadmnist.store import append_columns, write_shard
+        from spadmnist.store import Encoding
         columns, more = some_columns(40), more_columns(40)
         print("ready", flush=True)
         for i in range(100000):
-            write_shard(sys.argv[2], f"s{i % 3}", columns, ATTRIBUTES, sys.argv[3])
-            append_columns(sys.argv[2], f"s{i % 3}", more, sys.argv[3])
+            Encoding.every[sys.argv[3]].write(sys.argv[2], f"s{i % 3}", columns, ATTRIBUTES)
+            Encoding.every[sys.argv[3]].append(sys.argv[2], f"s{i % 3}", more)
         """
     )
     columns, more = some_columns(40), more_columns(40)
     rng = random.Random(5)
     whole = 0
     for _ in range(4):
-        command = [sys.executable, "-c", program, str(Path(__file__).parent), str(tmp_path), format]
+        command = [sys.executable, "-c", program, str(Path(__file__).parent), str(tmp_path), str(format)]
         writer = subprocess.Popen(command, stdout=subprocess.PIPE)
         assert writer.stdout is not None
         writer.stdout.readline()
@@ -604,16 +631,16 @@ def test_kill_9_leaves_none_or_a_whole_one(tmp_path: Path, format: str) -> None:
         writer.wait()
         writer.stdout.close()
         for i in range(3):
-            if exists(tmp_path, f"s{i}", format):
+            if format.exists(tmp_path, f"s{i}"):
                 whole += 1
-                reader = ShardReader(tmp_path, f"s{i}", format)
+                reader = format.reader(tmp_path, f"s{i}")
                 present = {name: c for name, c in (columns | more).items() if name in reader.names}
                 assert set(columns) <= set(present)
                 check(reader, present)
     assert whole
     disk.sweep(disk.temporary(tmp_path))
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {".spadmnist", "data.zarr" if format == "zarr" else "data"}
+    assert names == {".spadmnist", format.folder}
 
 
 def random_shard(size: int) -> dict[str, Column]:
@@ -621,8 +648,8 @@ def random_shard(size: int) -> dict[str, Column]:
     return {"a": Column(data, ("event",), "1", "noise", "ticks", 1 << 14)}
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_a_full_disk(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_a_full_disk(tmp_path: Path, format: Encoding) -> None:
     if os.geteuid() != 0:
         pytest.skip("mounting a small tmpfs needs root")
     place = tmp_path / "disk"
@@ -630,35 +657,35 @@ def test_a_full_disk(tmp_path: Path, format: str) -> None:
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place], capture_output=True).returncode:
         pytest.skip("mounting a tmpfs is not allowed here")
     try:
-        write_shard(place, "first", random_shard(200_000), {}, format)
+        format.write(place, "first", random_shard(200_000), {})
         before = tree(place)
         with pytest.raises(SpadError) as caught:
-            write_shard(place, "second", random_shard(2_000_000), {}, format)
+            format.write(place, "second", random_shard(2_000_000), {})
         assert str(caught.value) == (
-            f"{place / store.location('second', format)}: cannot write up to 2 MB here: "
+            f"{place / format.location('second')}: cannot write up to 2 MB here: "
             "No space left on device; free some space (or choose another place with -o) and type the same "
             "command again; what is complete is kept"
         )
         with pytest.raises(SpadError, match="free some space"):
-            append_columns(place, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000), format)
+            format.append(place, "first", {"b": random_shard(2_000_000)["a"]} | random_shard(2_000_000))
         with pytest.raises(SpadError, match="free some space"):
             disk.commit_file(place / "manifest.json", os.urandom(2_000_000), disk.temporary(place))
         assert tree(place) == before and list(disk.temporary(place).iterdir()) == []
-        assert not exists(place, "second", format)
+        assert not format.exists(place, "second")
     finally:
         subprocess.run(["umount", place], check=True)
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_a_limit_on_file_size(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+def test_a_limit_on_file_size(tmp_path: Path, format: Encoding) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
         with pytest.raises(SpadError, match=r"up to 2 MB here: File too large; raise the limit .* is kept"):
-            write_shard(tmp_path, "s", random_shard(2_000_000), {}, format)
+            format.write(tmp_path, "s", random_shard(2_000_000), {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert not exists(tmp_path, "s", format) and tree(tmp_path) == {}
+    assert not format.exists(tmp_path, "s") and tree(tmp_path) == {}
 
 
 @pytest.mark.parametrize("code", [errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO])
@@ -667,16 +694,16 @@ def test_other_failures_of_the_disk(tmp_path: Path, code: int, monkeypatch: pyte
         raise OSError(code, os.strerror(code))
 
     (tmp_path / ".spadmnist/tmp").mkdir(parents=True)
-    (tmp_path / "data.zarr").mkdir()
+    (tmp_path / "data").mkdir()
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(SpadError, match=rf"s: cannot write .*{os.strerror(code)}; .* is kept"):
-        write_shard(tmp_path, "s", some_columns(), {}, "zarr")
+    with pytest.raises(SpadError, match=rf"s\.zarr\.zip: cannot write .*{os.strerror(code)}; .* is kept"):
+        CONTAINER.write(tmp_path, "s", some_columns(), {})
     assert tree(tmp_path) == {}
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
 def test_all_of_a_shard_is_on_the_disk_before_it_is_in_its_place(
-    tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, format: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[tuple[str, str]] = []
     sync, rename = os.fsync, os.rename
@@ -693,25 +720,27 @@ def test_all_of_a_shard_is_on_the_disk_before_it_is_in_its_place(
 
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(os, "rename", renamed)
-    write_shard(tmp_path, "s", some_columns(), {}, format)
+    format.write(tmp_path, "s", some_columns(), {})
     at = next(i for i, (what, _) in enumerate(done) if what == "rename")
     new = Path(done[at][1])
-    place = tmp_path / location("s", format)
-    there = {str(new / path.relative_to(place)) for path in place.rglob("*")} | {str(new), str(new.parent)}
+    place = tmp_path / format.location("s")
+    there = {str(new / path.relative_to(place)) for path in place.rglob("*")} | {str(new)}
     assert there <= {path for what, path in done[:at] if what == "sync"}
-    assert ("sync", str(place.parent)) in done[at:]
+    assert [path for what, path in done[at:] if what == "sync"] == [str(place.parent)]
+    if format.one_file:  # the file is synchronised once
+        assert [path for _, path in done[:at] if path.startswith(str(new))] == [str(new)]
 
 
 def test_a_name_that_is_too_long(tmp_path: Path) -> None:
     with pytest.raises(SpadError, match="name too long; choose a place with a shorter name"):
-        write_shard(tmp_path, "s" * 300, some_columns(), {}, "zarr")
+        FOLDER.write(tmp_path, "s" * 300, some_columns(), {})
 
 
 def test_a_reader_works_after_a_fork(tmp_path: Path) -> None:
     columns = some_columns()
-    for format in FORMATS:
-        write_shard(tmp_path, "s", columns, {}, format)
-        reader = ShardReader(tmp_path, "s", format)
+    for format in ENCODINGS:
+        format.write(tmp_path, "s", columns, {})
+        reader = format.reader(tmp_path, "s")
         reader.read("tr/ticks", 0, 3)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # other tests have started threads

@@ -294,7 +294,7 @@ def test_a_config_with_the_micro_sign(sign: str, tmp_path: Path) -> None:
     factory.generate(experiment, experiment.load_images(), tmp_path / "out", 1)
     assert not verify.verify(tmp_path / "out")
     assert document.read(tmp_path / "out" / "config.yaml").value["scene"]["lux"] == [f"5 {sign}lux", "5 lux"]
-    assert {p.name for p in (tmp_path / "out" / "data.zarr").iterdir() if p.is_dir()} == {"5_ulux", "5_lux", "images"}
+    assert {p.name for p in (tmp_path / "out" / "data").iterdir() if p.is_dir()} == {"5_ulux", "5_lux", "images"}
     stored, live = spadmnist.open(tmp_path / "out"), spadmnist.open(tmp_path / "out" / "config.yaml")
     assert stored.levels == live.levels == (f"5 {sign}lux", "5 lux")
     for spelling in ("5 ulux", *(f"5 {other}lux" for other in MICRO)):

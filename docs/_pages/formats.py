@@ -6,7 +6,6 @@ Files are listed by making a small dataset and a small measurement and looking i
 from __future__ import annotations
 
 import inspect
-import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import spadmnist
-from spadmnist import capture_files, config, document, factory
+from spadmnist import capture_files, config, dataset, document, factory, store
 from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.comparison import Check, Comparison
 from spadmnist.inference.light_levels import Nuisance
@@ -95,16 +94,20 @@ def page() -> str:
     """The page of the formats."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        dataset, measurement = _dataset(place / "dataset"), _measurement(place / "measurement")
+        arrays, measurement = _dataset(place / "dataset"), _measurement(place / "measurement")
     return md.page(
         "Formats",
         "## A dataset",
-        "A dataset is a folder. Each light level and split is cut into shards. A shard is a Zarr group, or one HDF5 "
-        "file with the same arrays. `manifest.json` lists every file with its size and SHA-256. Its own `sha256` is "
-        "the identity of the dataset. `stream` and `encoding` number what draws and what writes the bytes. "
-        "`provenance` holds the versions by which the dataset was finished. It is no part of the identity, and has "
-        "its own digest.",
-        dataset,
+        "A dataset is a folder. Each light level and split is cut into shards. A shard is one file: a zip that holds "
+        "a Zarr v3 group, its members stored, or an HDF5 file. `manifest.json` lists every file with its size and "
+        "SHA-256. Its own `sha256` is the identity of the dataset. `stream` and `encoding` number what draws and what "
+        "writes the bytes. `provenance` holds the versions by which the dataset was finished. It is no part of the "
+        "identity, and has its own digest.",
+        "Shards lie in these places. All encodings are read, verified, repaired and gone on with; a new dataset has "
+        "the newest of its format.",
+        _encodings(),
+        "Arrays of a Zarr shard. `image` and `label` are coordinates of each group; other encodings have none.",
+        arrays,
         "## A measurement",
         "A measurement is a folder with `measurement.yaml` ([its keys](measurement.md)) and one HDF5 file a capture.",
         _rest_of(capture_files.__doc__),
@@ -132,16 +135,24 @@ def _dataset(place: Path) -> str:
     experiment = config.build(document.parse(_DATASET, "config"), Path())
     factory.generate(experiment, experiment.load_images(), place, 1)
     rows = []
-    for path in sorted(place.rglob("zarr.json")):
-        facts = json.loads(path.read_text())
-        if facts["node_type"] != "array":
-            continue
-        named = facts.get("attributes", {})
-        where = path.parent.relative_to(place / "data.zarr").as_posix()
-        dims = ", ".join(name or "" for name in facts.get("dimension_names") or [])
-        about = str(named.get("long_name", ""))
-        rows.append([md.literal(where), md.plain(about), facts["data_type"], f"({dims})", str(named.get("units", ""))])
-    return md.table(("array in `data.zarr`", "what it is", "type", "dimensions", "unit"), rows)
+    for shard in dataset.shards_of(experiment, experiment.load_images()):
+        reader = experiment.encoding.reader(place, shard.path)
+        for name in reader.names:
+            where = f"{shard.folder}/{shard.split}: {name}"
+            dims = ", ".join(reader.dims(name))
+            facts = (reader.dtype(name).name, f"({dims})", reader.unit(name))
+            rows.append([md.literal(where), md.plain(reader.about(name)), *facts])
+    return md.table(("array of a shard", "what it is", "type", "dimensions", "unit"), rows)
+
+
+def _encodings() -> str:
+    """A table of the places of shards."""
+    rows = []
+    for format in store.FORMATS:
+        for one in store.encodings(format):
+            what = "a folder of files" if not one.one_file else "one file"
+            rows.append([format, str(one.number), md.literal(one.location("LEVEL/SPLIT/NUMBER")), what])
+    return md.table(("format", "encoding", "place of a shard", ""), rows)
 
 
 def _measurement(place: Path) -> str:

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from .. import document
+from .. import document, store
 from ..document import Document, Path_
 from ..errors import ConfigError, InputError, did_you_mean
 from ..experiment import Experiment
@@ -160,7 +160,7 @@ def build(
         readouts=tuple(r for r in READOUTS if r in recording.readouts),
         methods=methods,
         sensor=described.resolved,
-        format=parts["output"].format,
+        encoding=store.encoding(parts["output"].format),
         small=parts["output"].compression == "small",
         on_reading=parts["output"].reconstructions == "on_reading",
         limit=parts["limit"],
@@ -204,7 +204,7 @@ def of_sensor(
     if reader.problems or not (conditions and found[0] and found[1]):
         raise ConfigError(reader.problems)
     readouts = tuple(r for r in READOUTS if r in found[1].readouts)
-    made = (seed, known, found[0].images, conditions, readouts, tuple(methods), sensor, "zarr")
+    made = (seed, known, found[0].images, conditions, readouts, tuple(methods), sensor, store.encoding("zarr"))
     several = tuple(map(float, found[0].wavelengths)) if len(found[0].wavelengths) > 1 else ()
     return Experiment("Simulated", {}, Path(), *made, wavelengths=several)
 
