@@ -56,7 +56,7 @@ def check_member(info: zipfile.ZipInfo, compressed: bool) -> None:
 
 def start(file: File, info: zipfile.ZipInfo) -> int:
     """Where a member's bytes begin. What stands before them has a length of its own. Raises BadArchive."""
-    head = file.read(info.header_offset, 30)
+    head = file.read(info.header_offset, 30) if info.header_offset >= 0 else b""  # a damaged directory may say so
     begin = info.header_offset + 30 + sum(struct.unpack("<HH", head[26:30])) if len(head) == 30 else 0
     if head[:4] != b"PK\x03\x04" or begin + info.compress_size > file.size:
         raise BadArchive(f"{short(info.filename, 200)} does not lie where the zip says")

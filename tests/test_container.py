@@ -156,6 +156,13 @@ def test_a_hostile_zip_is_refused(tmp_path: Path) -> None:
     del inner["tr"]
     refused({**held, "zarr.json": json.dumps(document).encode()}, "not the description of a shard")
     refused({**held, "tr/ticks/c.0": held["tr/ticks/c.0"][:-1]}, "tr/ticks: its table of chunks is damaged")
+    CONTAINER.write(tmp_path, "s", some_columns(), ATTRIBUTES)
+    content = path.read_bytes()
+    end = content.rindex(b"PK\x05\x06") + 16  # where the directory begins: later than that, members lie before the file
+    at = struct.unpack_from("<I", content, end)[0] + 10**6
+    path.write_bytes(content[:end] + struct.pack("<I", at) + content[end + 4 :])
+    with pytest.raises(InputError, match=r"s\.zarr\.zip: .*spadmnist verify"):
+        CONTAINER.reader(tmp_path, "s").read("tr/ticks")
     for data in (b"", b"PK", bytes(1000), struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 9, 9, 9, 9, 0)):
         path.write_bytes(data)
         with pytest.raises(InputError, match="cannot be read as a zip"):
