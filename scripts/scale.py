@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import math
 import resource
 import shutil
@@ -82,7 +81,7 @@ class Stub:
     def __init__(self, most: float):
         self.most, self.done, self.seconds = most, 0, 0.0
         self.began = self.processor = 0.0
-        self._files: dict[str, bytes] = {}
+        self._columns: dict[str, store.Column] = {}
 
     def __call__(self, task: factory.Task) -> disk.Files:
         started = time.perf_counter()
@@ -95,26 +94,22 @@ class Stub:
         if shard.level is None:
             files = REAL(task)
         else:
-            columns, attributes = factory.shard_content(experiment, task) if not self._files else ({}, {})
-            if not self._files:
-                encoded = store.encoded(shard.path, columns, attributes, experiment.format)
-                self._files = {name: b"".join(pieces) for name, pieces in encoded.items()}
+            if not self._columns:
+                self._columns, attributes = factory.shard_content(experiment, task)
                 self._told = attributes["statistics"]
-            files = self._written(task, experiment.format)
+            files = self._written(task, experiment.encoding)
         self.seconds += time.perf_counter() - started
         return files
 
-    def _written(self, task: factory.Task, format: str) -> disk.Files:
-        place = store.location(task.shard.path, format)
-        head = json.loads(self._files["shard/zarr.json"])
-        head["attributes"] |= {**task.shard.attributes, "statistics": self._told}
+    def _written(self, task: factory.Task, encoding: store.Encoding) -> disk.Files:
+        path, attributes = task.shard.path, {**task.shard.attributes, "statistics": self._told}
         made: disk.Files = {}
-        for name, data in self._files.items():
-            path = Path(task.root, place + name.removeprefix("shard"))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            data = json.dumps(head).encode() if name == "shard/zarr.json" else data
-            path.write_bytes(data)
-            made[place + name.removeprefix("shard")] = {"bytes": len(data), "sha256": "0" * 64}
+        for name, pieces in encoding.encoded(path, self._columns, attributes).items():
+            name, data = encoding.location(path) + name.removeprefix("shard"), b"".join(pieces)
+            place = Path(task.root, name)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(data)
+            made[name] = {"bytes": len(data), "sha256": "0" * 64}
         factory.note(Path(task.root), task.shard, made)
         return made
 

@@ -72,9 +72,9 @@ def test_a_folder_of_another_user_is_not_used(places: dict[str, Path], monkeypat
     first = compiled.folder()
     assert first is not None
     compiled.folder.cache_clear()
-    family, user = compiled._family(), os.getuid()
+    family, user = compiled._family(), os.geteuid()
     monkeypatch.setattr(compiled, "_family", lambda: family)
-    monkeypatch.setattr(os, "getuid", lambda: user + 1)
+    monkeypatch.setattr(os, "geteuid", lambda: user + 1)
     assert compiled.folder() is None
 
 
