@@ -388,7 +388,8 @@ def check_bytes(
     if golden.check(experiment):
         return
     for shard, maker in others.values():
-        progress.notice("Other versions or another machine may have made what is there: one shard is made again.")
+        if maker is None or any(here.get(name) != value for name, value in maker.items()):
+            progress.notice("Other versions or another machine may have made what is there: one shard is made again.")
         place = experiment.encoding.location(shard.path)
         for name, data in again(shard).items():
             path = root / (place + name.removeprefix("shard"))
