@@ -35,7 +35,7 @@ _FOLDER = getattr(os, "O_DIRECTORY", 0)
 _FOLDERS_OPEN = hasattr(os, "O_DIRECTORY")  # a folder can be opened, locked and synchronised
 
 SHARED_LOCKS = _fcntl is not None  # several processes can hold one lock
-LOCKS_FOLDERS = _fcntl is not None and _FOLDERS_OPEN  # a folder itself is held, and no file beside it
+LOCKS_FOLDERS = _fcntl is not None and _FOLDERS_OPEN  # whether a folder itself can be locked
 
 _KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # which is as hard where there is no SIGKILL
 _PDEATHSIG = 1  # of prctl: the signal that comes when the parent ends
@@ -52,8 +52,8 @@ class Busy(Exception):
 class Lock:
     """A file or a folder that this process holds; the system lets go of it where the process is killed.
 
-    With `fcntl` it is a lock of the path itself. Without, it is one of a file beside it (filelock), which bars nobody
-    when its process has ended.
+    With `fcntl` the path itself is locked. Without it, a file in the same folder is locked (filelock); it locks nobody
+    out once its process has ended.
 
     Args:
         path: a folder that is there, or a file, which is made where there is none. A link is refused.

@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +19,17 @@ import pytest
 from spadmnist.errors import SpadError
 from spadmnist.workers import Executor, Loky, Serial
 
+sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+import scale
+
 
 class Death(Exception):
     """A worker of the stand-in has died."""
 
 
-class StandIn(Executor):
+class StandIn(scale.StandIn):
     threads = 4
-
-    def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(task))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+    local = Executor.local
 
     def _is_death(self, error: BaseException) -> bool:
         return isinstance(error, Death)

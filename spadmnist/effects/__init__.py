@@ -29,6 +29,8 @@ is simulated part by part, where all effects that draw count their draws and no 
 Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
 it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
 of its mean; an arrival effect gets the part of the rate that it acts on. And `influence()`, how far its events reach.
+With `by_pixel = True` on the class, closed forms of a part of a chip are computed for that part alone: set it where
+`apply` of rates and `expected_rate` give each pixel a value that depends on that pixel alone.
 """
 
 from __future__ import annotations

@@ -31,7 +31,8 @@ EDGE_FALL = 5.99  # the same for an edge sharper than the intervals are dense: i
 _FAR = 100.0  # of the log-likelihood: a start that is lower than the maximum by more is dropped
 _HIGHER = 0.05  # of the log-likelihood: a value that is higher by more shows that a maximum is none
 _ROUGH = 0.3, 0.5  # tolerances of `by_simplex`: near enough for a parabola
-# bytes of the time stamps of all captures and of their gaps: beside the program it keeps within `memory.MOST`
+# bytes of the time stamps and gaps of all captures, at most; more is fitted by simulation. Chosen so that they and the
+# program together take less than `memory.MOST`
 _HELD = 800_000_000
 _LIKELIHOODS = 2  # that are held at once: of the model, and of the model without a change
 _SHARP = 0.1  # of a lifetime: the blur of the stamps must be smaller

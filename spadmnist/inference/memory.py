@@ -14,8 +14,8 @@ from ..sensor import BYTES_PER_EVENT, Sensor
 # bytes that all processes take together with one worker or two; chosen so that a computer of 4 GB has room for it
 MOST = 1_500_000_000
 _EACH = MOST // 2  # bytes more for each worker beyond two: who asks for many has the memory for them
-# bytes of the process that has the workers (measured: 220 to 350 MB), and of a worker beside its replicate: the program
-# and what it keeps of freed memory (measured: 90 to 400 MB)
+# bytes of the main process (220 to 350 MB were measured), and of a worker without its replicate: the program and freed
+# memory that it keeps (90 to 400 MB were measured)
 _PROGRAM, _WORKER = 350_000_000, 300_000_000
 _EVENTS_AT_ONCE = 4e6  # events that are simulated at once: of several small replicates, or of a part of a large one
 _ORDERED = 1 << 24  # detections whose order in time is held at once, 8 bytes each

@@ -169,7 +169,7 @@ def diagnose(
             say(f"Going on: {journal.folder} holds {journal.bytes / 1e6:.0f} MB of an earlier run's replicates")
 
     def saved(so_far: Diagnosis) -> None:
-        """An error is told, and the search goes on."""
+        """Save the diagnosis so far. An error is reported, and the search goes on."""
         if keep is None:
             return
         try:

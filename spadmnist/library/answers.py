@@ -75,7 +75,7 @@ def _check_sensor(out: Path, sensor: Path | None) -> None:
 
 
 def _beside_report(out: Path) -> bool:
-    """Is it the sensor file of a diagnosis, whose report lies beside it?"""
+    """Whether a file is the `sensor.yaml` of a folder that holds the report of a diagnosis."""
     return out.name == SENSOR and (out.parent / pages.FILES["diagnosis"]).exists()
 
 
@@ -205,10 +205,13 @@ class _Found:
         return place
 
     def write_sensor(self, file: PathLike) -> Path | None:
-        """Write the next sensor file with its maps beside it; the file, or None where it cannot be written.
+        """Write the next sensor file, and its maps into the same folder.
 
-        `unwritten` then says why: the answer stays, whatever the error is. Of a sensor that was read from a file the
-        next one is that file, its comments kept.
+        A sensor that was read from a file keeps the comments of that file. Where nothing can be written, `unwritten`
+        says why, and the answer is kept.
+
+        Returns:
+            The file; None where it cannot be written.
         """
         out, notes = Path(file), results.notes(self.found)
         self.found.file, self.found.unwritten = None, ""

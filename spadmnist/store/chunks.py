@@ -19,7 +19,7 @@ CODECS: dict[str, tuple[str, str, int, int]] = {
     "counts": ("blosc", "zstd", 1, 0),  # smaller than level 3 here, in half the time
     "bits": ("zstd", "", 1, 0),  # packed frames; a shuffle would make them larger
     "floats": ("zstd", "", 2, 0),  # few distinct values; a shuffle would hide that
-    # in fewer bytes (640 images at 2560 mlux: size and time beside those of the fast ones)
+    # `compression: small`: size and encoding time relative to the default (measured on 640 images at 2560 mlux)
     "ticks, small": ("blosc", "zstd", 1, 1 << 18),  # -2.1 %, 1.8 times; level 3 has 0.1 % less, in twice that time
     "bits, small": ("zstd", "", 9, 0),  # -2.2 %, 6 times; level 12 has 0.1 % less
     "floats, small": ("zstd", "", 5, 0),  # -9 %, 3 times

@@ -3,8 +3,8 @@
     out/data/<path>.zarr.zip
 
 `zarr.storage.ZipStore` opens it as it is. Members are stored: first the chunks of each array, then what describes the
-arrays and groups, last the description of the shard. That one holds all others (consolidated metadata), and it lies
-beside the zip's directory, so that the end of the file is enough to know what is in it.
+arrays and groups, last the description of the shard. The last one holds all others (consolidated metadata). It comes
+directly before the zip's directory, so that one read of the end of the file gives both.
 """
 
 from __future__ import annotations
@@ -18,17 +18,24 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from .. import archive
 from ..archive import BadArchive
 from ..disk import Files
 from ..foreign import from_json
 from ..sources import PIECE, File
-from .chunks import decode
 from .columns import Column, check_columns, check_tree, group_of
-from .shards import Array, Encoding, ShardReader
-from .zarr import chunk_file, chunked, described, document_of, group_document, groups_above, placed, table_size
+from .shards import Array, Encoding
+from .zarr import (
+    ZarrReader,
+    chunk_file,
+    chunked,
+    described,
+    document_of,
+    group_document,
+    groups_above,
+    placed,
+    table_size,
+)
 
 _LARGEST_JSON = 1 << 22  # bytes of the description of a shard; 30 arrays take 30 kB
 _END = 1 << 16  # bytes at the end of a shard that are asked for at once: directory and description of 40 arrays
@@ -53,7 +60,7 @@ class _Content:
     members: dict[str, zipfile.ZipInfo]
 
 
-class _Reader(ShardReader):
+class _Reader(ZarrReader):
     _content: _Content | None = None
 
     def _opened(self) -> _Content:
@@ -101,9 +108,6 @@ class _Reader(ShardReader):
         array = replace(array, coordinate=name in content.coordinates)
         self._compare(name, array.attributes, array)
         return array
-
-    def _decode(self, raw: bytes, array: Array, into: np.ndarray) -> None:
-        decode(raw, array.codec, into)
 
     def kinds(self, files: Files) -> dict[str, int]:
         found: dict[str, int] = {}

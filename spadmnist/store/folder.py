@@ -14,19 +14,26 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..disk import Files, inside, install, put_tree, workspace, writing
 from ..foreign import from_json
-from .chunks import decode
 from .columns import Column, check_attributes, check_columns, check_tree
-from .shards import Array, Encoding, Missing, ShardReader
-from .zarr import chunk_file, chunked, described, document_of, group_document, groups_above, placed, table_size
+from .shards import Array, Encoding, Missing
+from .zarr import (
+    ZarrReader,
+    chunk_file,
+    chunked,
+    described,
+    document_of,
+    group_document,
+    groups_above,
+    placed,
+    table_size,
+)
 
 _LARGEST_JSON = 1 << 20  # bytes
 
 
-class _Reader(ShardReader):
+class _Reader(ZarrReader):
     def _find_names(self) -> Iterator[str]:
         self._compare_shard()
         return self._walk()
@@ -103,9 +110,6 @@ class _Reader(ShardReader):
                 raise self._refuse(array.file, str(error)) from None
         self._compare(name, array.attributes, array)
         return array
-
-    def _decode(self, raw: bytes, array: Array, into: np.ndarray) -> None:
-        decode(raw, array.codec, into)
 
     def kinds(self, files: Files) -> dict[str, int]:
         found: dict[str, int] = {}

@@ -177,7 +177,7 @@ def _array(dataset: Any, file: str) -> Array:
     attributes = _get_attributes(dataset)
     if not all(type(attributes.get(key)) is str for key in ("units", "long_name")):
         raise Damaged(f"{where} has no units or no long_name")
-    # The names are text of our own beside the scales: HDF5's library for these crashes on some damaged files.
+    # Read from an attribute, not from the dimension scales, whose library crashes on some damaged files
     dims = tuple(attributes.pop("dimension_names", ()))
     if len(dims) != len(shape) or not all(type(dim) is str for dim in dims):
         raise Damaged(f"{where} has no names for its dimensions")

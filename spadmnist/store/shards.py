@@ -169,7 +169,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Expected:
-    """What is known of a shard before it is read. Another shard in its place is told by it.
+    """What is known of a shard before it is read. It shows that another shard lies in its place.
 
     attributes: by array, those of the shard itself under ""; None stands for one that must not be there.
     sizes: of dimensions, by name. files: what is known of each file, or None where nothing is; one that is not listed

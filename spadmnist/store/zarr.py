@@ -15,12 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from .chunks import CODECS, crc32c, encode
+from .chunks import CODECS, crc32c, decode, encode
 from .columns import NAME, TYPES, Column, rows_of
-from .shards import Array
+from .shards import Array, ShardReader
 
 _CRC = {"name": "crc32c"}
 _LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+
+
+class ZarrReader(ShardReader):
+    """A reader of arrays whose chunks are compressed as Zarr says."""
+
+    def _decode(self, raw: bytes, array: Array, into: np.ndarray) -> None:
+        decode(raw, array.codec, into)
 
 
 def group_document(attributes: Mapping[str, Any]) -> dict[str, Any]:
