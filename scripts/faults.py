@@ -129,7 +129,7 @@ def _damaged(base: Path) -> list[Damaged]:
     (base / "plan.yaml").write_text(PLAN)
     in_this_process("simulate", base / "sensor.yaml", base / "plan.yaml", "-o", lab)
     return [
-        Damaged("dataset zarr", base / "zarr" / "all", rounds=1),
+        Damaged("dataset zarr", base / "zarr" / "all", rounds=10),
         Damaged("dataset hdf5", base / "hdf5" / "all", rounds=8),
         Damaged("measurement", lab, rounds=10, dataset=False),
     ]
