@@ -258,7 +258,7 @@ def learning(images_dir: Path | None, folder: Path, quick: bool) -> list[Row]:
 REDUCE = """\
 import sys
 from spadmnist import config, measurement
-from spadmnist.inference.replicates import statistics_for
+from spadmnist.inference.reduction import statistics_for
 data = measurement.open(sys.argv[2])
 recording = data.recording("flat", config.read_sensor(sys.argv[1]))
 for statistic in statistics_for(recording.capture):

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
+from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
+from spadmnist.inference.conclusion import Notes, verdict_of
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.elimination import drop_mimics, drop_needless, in_vain
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.experiment_design import _apart, between
 from spadmnist.inference.map_trials import unseen_maps
 from spadmnist.inference.model_path import begin
-from spadmnist.inference.model_selection import _alternatives, _Notes, _verdict, diagnose
+from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.replicates import TOTALS, Replicates
 from spadmnist.inference.results import Step, canonical
 from spadmnist.inference.score_test import ScoreTest, p_of_best, score_test
@@ -245,14 +247,14 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     best, near, third = (Trial(c, {}, Signature({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
 
     def told(**other: Any) -> list[tuple[str, bool]]:
-        found = _alternatives(quiet(replicates), evaluation, best, [], [best, replace(near, **other)])
+        found = alternatives(quiet(replicates), evaluation, best, [], [best, replace(near, **other)])
         return [(a["effect"], a["confused"]) for a in found]
 
     assert told(gain=93.0) == [("slow_afterpulsing", True)]
     assert told(gain=88.0) == [("slow_afterpulsing", False)]
     assert told(residuals=foul) == [("slow_afterpulsing", False)]
     assert told(residuals=None) == [("slow_afterpulsing", False)]  # never fitted
-    many = _alternatives(quiet(replicates), evaluation, best, [], [best, near, near, third])
+    many = alternatives(quiet(replicates), evaluation, best, [], [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
     # where chance makes pixels odd, by that model's own scatter
     own = with_residuals(evaluation, {})
@@ -276,7 +278,7 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     two = [
         replace(near, candidate=change_of(replicates, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")
     ]
-    assert [a["change"] for a in _alternatives(quiet(replicates), evaluation, best, [], [best, *two])] == [
+    assert [a["change"] for a in alternatives(quiet(replicates), evaluation, best, [], [best, *two])] == [
         "set",
         "per_pixel",
     ]
@@ -319,7 +321,7 @@ def test_verdicts(lab):
     step, some = object(), [object()]
 
     def verdict(left: Any, setup: bool = False, rival: Trial | None = None) -> str:
-        return _verdict(path, left, _Notes([{}] * setup, setup, rival=rival))
+        return verdict_of(path, left, Notes([{}] * setup, setup, rival=rival))
 
     assert verdict([]) == "adequate"
     assert verdict([], setup=True) == "setup"

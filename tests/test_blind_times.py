@@ -15,8 +15,9 @@ from spadmnist.effects import Conditions, Effect, parameter
 from spadmnist.events import Events, Layout
 from spadmnist.inference.blind_times import ShortestIntervals, Width, likelihoods, width_of
 from spadmnist.inference.candidates import candidates, with_values
+from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.map_fits import fit_maps, light_levels_of
+from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.pixel_maps import by_counts
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.score_test import p_of_map

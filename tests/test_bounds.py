@@ -46,7 +46,7 @@ from spadmnist.import_options import Said
 from spadmnist.importers import detections, light
 from spadmnist.importers.captures import import_files
 from spadmnist.importers.frames import Npz, Tif
-from spadmnist.inference.replicates import statistics_for
+from spadmnist.inference.reduction import statistics_for
 from spadmnist.readout import Recorded
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.statistics import _order

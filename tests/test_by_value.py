@@ -18,7 +18,7 @@ from spadmnist import by_value
 from spadmnist.effects import Effect
 from spadmnist.errors import EffectError
 from spadmnist.inference import replicate_cache
-from spadmnist.inference.replicates import Packed
+from spadmnist.inference.models import Packed
 from spadmnist.plugins import parameter
 
 PROGRAM = '''
@@ -28,7 +28,8 @@ import sys
 import numpy as np
 
 import spadmnist as sp
-from spadmnist.inference.replicates import Model, Replicates
+from spadmnist.inference.models import Model
+from spadmnist.inference.replicates import Replicates
 from spadmnist.statistics import Statistic, Summary
 from spadmnist.workers import executor
 

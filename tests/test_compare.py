@@ -21,8 +21,9 @@ from spadmnist.inference.comparison import Comparison, canonical, compare, table
 from spadmnist.inference.evaluation import Evaluation, evaluate, misfits
 from spadmnist.inference.light_levels import CaptureNull, _score
 from spadmnist.inference.null_distribution import learn
+from spadmnist.inference.reduction import ReducedCapture
 from spadmnist.inference.replicate_cache import recall
-from spadmnist.inference.replicates import ReducedCapture, Replicates
+from spadmnist.inference.replicates import Replicates
 from spadmnist.measurement import Measurement
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor

@@ -19,9 +19,9 @@ from spadmnist.events import Events, Layout
 from spadmnist.inference import candidates
 from spadmnist.inference.candidates import on_chip, with_values
 from spadmnist.inference.coordinates import Key
+from spadmnist.inference.models import InTheDark
 from spadmnist.inference.point_process import blur_of
 from spadmnist.inference.replicate_cache import entry_name
-from spadmnist.inference.replicates import InTheDark
 from spadmnist.plugins import Distribution
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor

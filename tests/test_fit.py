@@ -16,6 +16,7 @@ from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.inference.candidates import candidates, with_values
 from spadmnist.inference.coordinates import Coordinate, point_of
+from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import Evaluation, evaluate, square, stacked
 from spadmnist.inference.exact_likelihood import MaximumLikelihood, maximise
 from spadmnist.inference.gauss_newton import (
@@ -27,10 +28,11 @@ from spadmnist.inference.gauss_newton import (
     profile_intervals,
 )
 from spadmnist.inference.held_out import captures_needed, leave_one_capture_out, optimism
-from spadmnist.inference.map_fits import fit_maps, light_levels_of
+from spadmnist.inference.map_fits import fit_maps
+from spadmnist.inference.models import Model
 from spadmnist.inference.named_fit import _named, fit_named
 from spadmnist.inference.pixel_maps import PixelMap, map_values, summary
-from spadmnist.inference.replicates import TOTALS, Model, Replicates
+from spadmnist.inference.replicates import TOTALS, Replicates
 from spadmnist.inference.results import sentence
 from spadmnist.recording import Capture, Light
 from spadmnist.streams import Streams

@@ -12,8 +12,9 @@ from tinylab import bench_of
 from spadmnist import pages
 from spadmnist.errors import SpadError
 from spadmnist.inference import (
+    alternatives,
     experiment_design,
-    map_fits,
+    map_models,
     model_path,
     model_selection,
     time_blocks,
@@ -151,7 +152,7 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
 
 
 FAILING: dict[str, tuple[Any, str, bool]] = {
-    "alternative": (model_selection, "_alternative", True),
+    "alternative": (alternatives, "_alternative", True),
     "placebo": (model_selection, "placebo_of", True),
     "chance": (model_selection, "p_of_best", False),
     "weighing": (model_selection, "compare_by_squares", False),
@@ -202,7 +203,7 @@ def test_a_map_that_cannot_be_made_is_none(lab, monkeypatch) -> None:
     def fails(*_: Any) -> Any:
         raise FloatingPointError("no map")
 
-    monkeypatch.setattr(map_fits, "models_with_maps", fails)
+    monkeypatch.setattr(map_models, "models_with_maps", fails)
     assert map_trials_of(look, evaluation, {}) == []
     assert look.untried and all("no map" in entry["why"] for entry in look.untried)
     assert {entry["where"] for entry in look.untried} == {"making a map"}

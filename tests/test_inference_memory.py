@@ -145,7 +145,7 @@ def test_a_model_whose_replicates_are_too_large_cannot_be_simulated(
     replicates = bench_of(labs(tmp_path)(light=2000), 2)
     monkeypatch.setattr("spadmnist.inference.replicates._FEW_EVENTS", 0)
     monkeypatch.setattr(memory, "check", _refuse)
-    from spadmnist.inference.replicates import Model
+    from spadmnist.inference.models import Model
 
     numbers = np.arange(2, dtype=np.uint64)
     (made,) = replicates.simulate([(Model.same(replicates.start), "flat", np.full(2, 1e6), numbers)])

@@ -12,9 +12,10 @@ import spadmnist
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.inference.candidates import candidates, maps_beside, with_values
+from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.light_levels import closed_form
-from spadmnist.inference.map_fits import fit_maps, light_levels_of
+from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.pixel_maps import _DOUBT, PixelMap, pattern_tests
 from spadmnist.inference.replicates import Replicates
 from spadmnist.sensor import Sensor

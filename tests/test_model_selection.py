@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
+from spadmnist.inference.alternatives import alternatives
+from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import point_of
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
 from spadmnist.inference.findings import mimicked
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.model_path import ModelPath, _bounded, begin, sharpen
-from spadmnist.inference.model_selection import _added, _alternatives, _another, _Notes, _or_confused
+from spadmnist.inference.model_selection import _added, _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.ranking import _share_of_counts, gain_against, least_probable
 from spadmnist.inference.replicates import TOTALS
@@ -82,7 +84,7 @@ def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monk
     monkeypatch.setattr("spadmnist.inference.model_selection._by_setup", lambda *_: pytest.fail("the set-up was asked"))
     monkeypatch.setattr(look, "scan", lambda *_, **__: [])
     monkeypatch.setattr("spadmnist.inference.model_selection._added", lambda *_: False)
-    assert not _another(path, _Notes([], False))
+    assert not _another(path, Notes([], False))
 
 
 def test_an_edge_that_drowns_all_else_is_tried_weaker(lab):
@@ -188,7 +190,7 @@ def looked_closer(path: ModelPath, monkeypatch: pytest.MonkeyPatch, added: Any) 
     monkeypatch.setattr("spadmnist.inference.model_selection._stands_out", stands_out)
     monkeypatch.setattr("spadmnist.inference.model_selection._added", added)
     monkeypatch.setattr(path.scan, "scan", lambda *_, **__: [])
-    return before, closer, _another(path, _Notes([], False))
+    return before, closer, _another(path, Notes([], False))
 
 
 def test_after_a_closer_look_that_led_to_nothing_the_model_is_as_it_was(lab, monkeypatch):
@@ -240,7 +242,7 @@ def test_what_looks_the_same_is_named_with_what_tells(lab):
     path = begin(bench_of(lab()))
     step = of("jitter", path.evaluation, path.replicates, intervals=30.0)
     path.steps.append(step)
-    beside = _Notes([], False)
+    beside = Notes([], False)
     assert _or_confused(path, beside) == "confused"
     assert step.alternatives[0]["what"] == "a dead time that differs from event to event"
     (told,) = beside.advice
@@ -248,7 +250,7 @@ def test_what_looks_the_same_is_named_with_what_tells(lab):
     assert told["separates"] == ["jitter", step.alternatives[0]["what"]]
     assert mimic(step.candidate) is not None
     path.steps = [of("crosstalk", path.evaluation, path.replicates, intervals=30.0)]
-    assert _or_confused(path, _Notes([], False)) == "explained"
+    assert _or_confused(path, Notes([], False)) == "explained"
 
 
 def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
@@ -283,7 +285,7 @@ def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, mon
     monkeypatch.setattr("spadmnist.inference.model_selection.fit_trial", lambda replicates, evaluation, one: one)
     monkeypatch.setattr("spadmnist.inference.model_selection.p_of_best", lambda *_: (3.0, 0.2))
     failed: Any = [object()] if fails else []
-    beside = _Notes([], False)
+    beside = Notes([], False)
     assert _added(path, beside, failed) == fails
     assert (len(path.evaluation.replicate_residuals[TOTALS]) > 16) == fails
     assert not _added(path, beside, failed)  # and not again and again
@@ -313,7 +315,7 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
     monkeypatch.setattr("spadmnist.inference.model_selection.accept", accept)
     for failed in ([object()], []):
         with pytest.raises(StopIteration):
-            _added(path, _Notes([], False), failed)  # type: ignore[arg-type]
+            _added(path, Notes([], False), failed)  # type: ignore[arg-type]
     assert taken == [other, map_] and map_.gain == 16.0  # the square of its trace's, whatever all cells have gained
 
 
@@ -351,8 +353,8 @@ def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) 
         )
         for name, gain in zip(names, (100.0, 50.0, 40.0, 30.0, 20.0, 99.0), strict=True)
     )
-    monkeypatch.setattr("spadmnist.inference.model_selection.failing", lambda *_: [])
-    found = _alternatives(quiet(replicates), evaluation, best, [best], others)
+    monkeypatch.setattr("spadmnist.inference.alternatives.failing", lambda *_: [])
+    found = alternatives(quiet(replicates), evaluation, best, [best], others)
     assert [(a["effect"], a["confused"]) for a in found] == [
         ("blinking_dark_counts", True),
         *((name, False) for name in names[1:4]),

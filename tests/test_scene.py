@@ -21,7 +21,7 @@ from spadmnist.effects.detection import Detection
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Layout
 from spadmnist.inference.comparison import compare
-from spadmnist.inference.replicates import statistics_for
+from spadmnist.inference.reduction import statistics_for
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.scene import Scene
 from spadmnist.sensor import Sensor

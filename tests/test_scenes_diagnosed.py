@@ -24,8 +24,8 @@ from spadmnist.effects.print_tilt import PrintTilt
 from spadmnist.effects.tdc import Tdc
 from spadmnist.events import Layout
 from spadmnist.inference.comparison import compare
+from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.map_fits import light_levels_of
 from spadmnist.inference.map_trials import patterns_first
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.pixel_maps import p_of_explained

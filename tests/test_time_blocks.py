@@ -20,7 +20,8 @@ from spadmnist.inference.error_budget import Rung, placebo_of
 from spadmnist.inference.evaluation import block_checks, evaluate, failing
 from spadmnist.inference.held_out import captures_needed, leave_one_capture_out
 from spadmnist.inference.model_path import ModelPath, accept, begin
-from spadmnist.inference.replicates import Model, halves_of
+from spadmnist.inference.models import Model
+from spadmnist.inference.reduction import halves_of
 from spadmnist.inference.signature import Signature, signatures
 from spadmnist.inference.time_blocks import _same_places, _slopes, measure
 from spadmnist.inference.trial import Trial

@@ -13,11 +13,11 @@ from scipy import stats
 from tinylab import bench_of
 
 from spadmnist.effects import Conditions
+from spadmnist.inference.count_model import CountModel
 from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, failing
 from spadmnist.inference.findings import nuisances
 from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_TOTALS
 from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, of_mean, totals_space
-from spadmnist.inference.map_fits import CountModel
 from spadmnist.inference.replicates import TOTALS, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor

@@ -32,14 +32,10 @@ from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
+from .models import Model
 from .null_distribution import Judgement
 from .phases import evaluate_start
-from .replicates import (
-    REPLICATES,
-    TOTALS,
-    Model,
-    Replicates,
-)
+from .replicates import REPLICATES, TOTALS, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative

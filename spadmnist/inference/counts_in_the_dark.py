@@ -19,7 +19,7 @@ from .. import twin
 from ..effects import Effect
 from ..measurement import Measurement
 from ..sensor import Sensor
-from . import map_fits, pixel_maps
+from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .light_levels import closed_form, level_for
 from .pixel_maps import map_values
@@ -60,7 +60,7 @@ def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: C
         return "no dark capture with data"
     levels = {id: 1.0 if id in replicates.dark else _level(replicates, id) for id in replicates.seen}
     map_ = map_fits.fit_maps(replicates, {}, [candidate], levels, dark)[candidate.carrier]
-    information = map_fits.information(replicates, {candidate.carrier: map_.values()}, candidate, levels)
+    information = map_models.information(replicates, {candidate.carrier: map_.values()}, candidate, levels)
     whole = np.maximum(np.sum(list(information.values()), axis=0), 1e-12)
     if float(np.mean(np.sum([information[id] for id in dark], axis=0) / whole)) < 1 - _LIT:
         return "light in which it shows, too"
@@ -97,7 +97,7 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
     """
     squares, totals, excess = [], [], []
     for id in ids:
-        line = map_fits.CountModel(replicates, id, 1.0)
+        line = count_model.CountModel(replicates, id, 1.0)
         expected, counts = line.expected(sensor), line.seen.counts
         assert counts is not None
         variance = line.variance(np.maximum(expected, 0.5), replicates.dead)

@@ -11,7 +11,8 @@ from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
 from .gauss_newton import Fit, gauss_newton
 from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
 from .model_path import ModelPath, fit_all, keys_of
-from .replicates import FEW, TOTALS, Cell, Model
+from .models import Model
+from .replicates import FEW, TOTALS, Cell
 from .results import Step, title
 from .signature import residuals_at, signatures
 

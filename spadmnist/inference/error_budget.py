@@ -24,7 +24,7 @@ _CLEAR = 3.5  # standard deviations beyond which a single cell is an error of th
 
 @dataclass(frozen=True)
 class HeldMaps:
-    """What the maps of pixels are fitted from, besides the data: see `map_fits.models_with_maps`."""
+    """What the maps of pixels are fitted from, besides the data: see `map_models.models_with_maps`."""
 
     values: dict[Key, Any]
     held: list[Candidate]

@@ -20,8 +20,9 @@ from .candidates import with_values
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
 from .light_levels import CaptureNull, central_level, law_of, of_mean, own_totals, totals_residuals
+from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
-from .replicates import TOTALS, CaptureReplicates, Cell, Model, Replicates, T, joined, no_size
+from .replicates import TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
 _PIECES = 4  # tasks of one capture: the number of workers that share it

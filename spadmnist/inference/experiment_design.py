@@ -17,7 +17,9 @@ from ..recording import Capture, Light, Recording
 from .candidates import Candidate
 from .evaluation import Evaluation, evaluate, square
 from .light_levels import closed_form, level_error
-from .replicates import FEW, InTheDark, Model, ReducedCapture, Replicates, simulated
+from .models import InTheDark, Model
+from .reduction import ReducedCapture
+from .replicates import FEW, Replicates, simulated
 from .results import NONLINEARITY, Step, plain
 from .scan import Scan
 from .setups import SetupExplanation

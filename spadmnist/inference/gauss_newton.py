@@ -11,7 +11,8 @@ import numpy as np
 
 from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
-from .replicates import FEW, Cell, Model, Replicates
+from .models import Model
+from .replicates import FEW, Cell, Replicates
 from .signature import residuals_at, signatures
 
 _ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian

@@ -19,7 +19,8 @@ import numpy as np
 from .. import disk
 from ..sensor import Sensor
 from . import replicate_cache
-from .replicates import CaptureReplicates, ReducedCapture
+from .reduction import ReducedCapture
+from .replicates import CaptureReplicates
 
 FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
 # bytes of all entries, beyond which nothing is added: the quick diagnosis of the tutorial, of two steps, writes 0.3 GB

@@ -20,7 +20,9 @@ from ..effects import Conditions
 from ..recording import Capture
 from ..sensor import Sensor
 from .laws import poisson_scores
-from .replicates import InTheDark, ReducedCapture, Replicates
+from .models import InTheDark
+from .reduction import ReducedCapture
+from .replicates import Replicates
 
 if TYPE_CHECKING:
     from .evaluation import Evaluation

@@ -9,9 +9,8 @@ pixels. Dead times are fitted from the shortest intervals (`blind_times`), width
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -22,9 +21,8 @@ from ..sensor import Sensor
 from . import blind_times
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
-from .light_levels import in_frames
+from .count_model import CountModel
 from .pixel_maps import (
-    ALONE,
     CODES,
     GRID,
     LEAST_WIDTH,
@@ -43,74 +41,17 @@ from .pixel_maps import (
     mean_of,
     median_of,
     outside_bulk,
-    spread_p,
 )
 from .point_process import blur_of
-from .replicates import InTheDark, Model, Replicates
+from .replicates import Replicates
 
-_NEEDED = 1e-4  # p-value of a map that is needed in addition to others
-
-
-class CountModel:
-    """The expected detections of each pixel in one capture, for maps.
-
-    Of first stamps, they are those in the time that the pixel waited.
-    """
-
-    def __init__(self, replicates: Replicates, id: str, level: float):
-        self.seen, self.id, self.level = replicates.seen[id], id, level
-        self.conditions = self.seen.capture.conditions
-        self.waited = self.seen.waited
-        self.frames = not self.seen.capture.counts_events and self.waited is None
-
-    def expected(self, sensor: Sensor) -> np.ndarray:
-        """The expected detections of each pixel, (pixels,)."""
-        if self.seen.capture.light.dark:
-            sensor = InTheDark.of(sensor)
-        light = np.full((1, sensor.layout.pixels), self.level)
-        if self.seen.capture.counts_events:
-            return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
-        share = in_frames(sensor, light, self.conditions)[0]
-        if self.waited is None:
-            return np.maximum(self.conditions.frames * share, 1e-9)
-        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-15)), 1e-9))
-
-    def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
-        """The log-likelihood of the measured counts, (pixels,), up to a constant.
-
-        Args:
-            expected: (pixels,) detections.
-        """
-        counts = self.seen.counts
-        assert counts is not None
-        if not self.frames:
-            return np.asarray(counts * np.log(expected) - expected)
-        share = np.clip(expected / self.conditions.frames, 1e-12, 1 - 1e-9)
-        return np.asarray(counts * np.log(share) + (self.conditions.frames - counts) * np.log1p(-share))
-
-    def saturated(self, counts: np.ndarray) -> bool:
-        """Whether half of the pixels have a detection in nearly every frame.
-
-        Args:
-            counts: (pixels,) detections.
-        """
-        return self.frames and float(np.median(counts)) > 0.9 * self.conditions.frames
-
-    def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
-        """The variance of the counts, (pixels,).
-
-        Args:
-            n: (pixels,) expected detections.
-            dead: dead time, s.
-        """
-        if self.waited is not None:
-            return np.maximum(n, 0.25)
-        if self.frames:
-            return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), 0.25)
-        return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)
+_FIRST_WIDTH = 0.3  # of a prior before its width is estimated; the iterations forget it
+_DIFFERENCE = 0.02  # of a logarithm, by which derivatives are taken: counts are smooth on a scale of 1
+_LARGEST_STEP = 0.7  # of an iteration, as a logarithm: a factor of 2, beyond which a linear model says little
+_FREE_TURNS = 2  # iterations before the prior's width is estimated, so that the maps have their shape by then
 
 
-def _base_of(sensor: Sensor, candidate: Candidate) -> float:
+def base_of(sensor: Sensor, candidate: Candidate) -> float:
     """The value that a map is relative to: the array's own mean, or `off` of an effect that the sensor lacks."""
     assert candidate.carrier is not None
     effect = sensor.effect(candidate.carrier[0])
@@ -123,6 +64,146 @@ def _base_of(sensor: Sensor, candidate: Candidate) -> float:
 def _bounds_of(carrier: Key) -> tuple[float, float]:
     low, high = Effect.registry.find(carrier[0]).parameters[carrier[1]].bounds
     return 0.0 if low is None else low, math.inf if high is None else high
+
+
+@dataclass
+class _Fitted:
+    """One of the maps that are fitted together: logarithms relative to `base`, each with a normal prior.
+
+    Attributes:
+        group: (pixels,) the group that each pixel belongs to.
+        low: smallest value that the parameter may have.
+        high: largest value.
+        of_light: the map acts on the light, so that its mean is that of the light level.
+        logs: (groups,) estimates.
+        variance: (groups,) of the estimates.
+        raw: (groups,) estimates without the prior.
+        raw_variance: (groups,) of these.
+        middle: of the prior, that of most pixels.
+        sigma: width of the prior.
+        precision: (groups,) of the prior: smaller for odd pixels.
+    """
+
+    candidate: Candidate
+    base: float
+    group: np.ndarray
+    low: float
+    high: float
+    of_light: bool
+    logs: np.ndarray
+    variance: np.ndarray
+    raw: np.ndarray
+    raw_variance: np.ndarray
+    precision: np.ndarray
+    middle: float = 0.0
+    sigma: float = _FIRST_WIDTH
+
+    @classmethod
+    def of(cls, start: Sensor, candidate: Candidate) -> _Fitted:
+        """The map before its first iteration."""
+        assert candidate.carrier is not None
+        declared = Effect.registry.find(candidate.carrier[0]).parameters[candidate.carrier[1]]
+        base, group = base_of(start, candidate), groups_of(start, candidate.per)
+        size = int(group.max()) + 1
+        return cls(
+            candidate,
+            base if base > 0 else float((declared.scan or (1e-3, 1))[0]),
+            group,
+            *_bounds_of(candidate.carrier),
+            acts_on_light(start, candidate),
+            logs=np.zeros(size),
+            variance=np.ones(size),
+            raw=np.zeros(size),
+            raw_variance=np.zeros(size),
+            precision=np.full(size, 1e-6),
+        )
+
+    def sums(self, pixels: np.ndarray, weight: np.ndarray | float = 1.0) -> np.ndarray:
+        """(groups,) sums of (pixels,) numbers over the groups, weighted."""
+        return np.asarray(weight * np.bincount(self.group, pixels, self.logs.size))
+
+    def value(self, logs: np.ndarray) -> np.ndarray:
+        """(groups,) values of the parameter, SI."""
+        return np.asarray(np.clip(self.base * np.exp(np.clip(logs, -MOST, MOST)), self.low, self.high))
+
+    def move(self, by: np.ndarray) -> None:
+        """Move the estimates, by a step that is not too large."""
+        self.logs = np.clip(self.logs + np.clip(by, -_LARGEST_STEP, _LARGEST_STEP), -MOST, MOST)
+
+    def move_alone(self, normal: np.ndarray, score: np.ndarray) -> None:
+        """A Newton step of this map, with the others as they are.
+
+        Args:
+            normal: (pixels,) information of the counts.
+            score: (pixels,) derivatives of their log-likelihood.
+        """
+        information, gradient = self.sums(normal), self.sums(score)
+        self.move((gradient - self.precision * (self.logs - self.middle)) / (information + self.precision))
+        self.variance = 1 / (information + self.precision)
+        own = np.maximum(information, 1e-12)
+        self.raw, self.raw_variance = self.logs + gradient / own, 1 / own
+
+    def renew_prior(self, normal: np.ndarray, score: np.ndarray) -> None:
+        """Middle and width of the prior from the pixels' differences beyond their noise, robust against odd pixels.
+
+        Args:
+            normal: (pixels,) information of the counts.
+            score: (pixels,) derivatives of their log-likelihood.
+        """
+        weight = (TAILS + 1) / (TAILS + (self.logs - self.middle) ** 2 / self.sigma**2)
+        if self.of_light:
+            self.logs = self.logs - math.log(float(np.mean(np.exp(self.logs))))
+        else:  # the mean of all pixels, which no pixel by itself may inform
+            own, left = self.sums(normal, weight), self.sums(score, weight)
+            shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -0.5, 0.5))
+            self.logs = self.logs + shift
+            self.middle = float(np.average(self.logs, weights=weight))
+        square = float(np.mean(weight * (self.logs - median_of(self.logs)) ** 2 + self.variance))
+        self.sigma = min(max(math.sqrt(square), 1e-4), 3.0)
+        noise = float(np.median(self.raw_variance))
+        if noise < TELLING**2:
+            # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
+            width = 1.4826 * median_of(np.abs(self.raw - median_of(self.raw)))
+            self.sigma = math.sqrt(max(width**2 - noise, LEAST_WIDTH**2))
+        apart = self.logs - self.middle
+        odd = outside_bulk(apart, self.sigma**2 + self.variance)
+        if noise >= TELLING**2:
+            self.sigma = self._width_of_few(normal, score, apart, odd)
+        self.precision = np.where(
+            odd,
+            WIDE**-2,  # odd pixels are of another kind, on which the prior holds no information
+            (TAILS + 1) / (TAILS * self.sigma**2 + apart**2),
+        )
+
+    def _width_of_few(self, normal: np.ndarray, score: np.ndarray, apart: np.ndarray, odd: np.ndarray) -> float:
+        """The width from the scatter of the counts beyond noise, by moments.
+
+        The estimates of poorly informed pixels say little.
+
+        Args:
+            apart: (groups,) estimates relative to the middle.
+            odd: (groups,) pixels that are left out.
+        """
+        fitted = np.maximum(self.sums(normal), 1e-9)
+        counted = fitted + self.sums(score)
+        # the expectation with the middle's value: the estimate must not weight itself
+        null_counts = fitted * np.exp(-apart)
+        counted, null_counts = counted[~odd], null_counts[~odd]
+        # about the mean of the counts
+        null_counts = np.maximum(
+            null_counts * max(float(counted.sum()), 1e-9) / max(float(null_counts.sum()), 1e-9), 1e-9
+        )
+        square = max(float((null_counts**2).sum()), 1e-12)  # the noise of a single odd pixel is left out
+        # relative variance of the counts; that of the logarithms is smaller
+        relative = float(((counted - null_counts) ** 2 - null_counts).sum()) / square
+        return math.sqrt(max(math.log1p(max(relative, 0.0)), LEAST_WIDTH**2))
+
+    def map(self, of_scene: bool) -> PixelMap:
+        """The map as fitted."""
+        assert self.candidate.carrier is not None
+        error = np.sqrt(np.maximum(self.variance, 0))
+        own = self.group, self.logs, error, self.raw, np.sqrt(self.raw_variance), self.sigma, self.low, self.high
+        return replace(PixelMap(self.candidate.carrier, self.base, *own), of_scene=of_scene)
 
 
 def fit_maps(
@@ -145,146 +226,107 @@ def fit_maps(
     Raises:
         SpadError: where no capture informs a map.
     """
-    others = {c.carrier: fit_codes(replicates, c, use) for c in wanted if c.per == "code" and c.carrier is not None}
-    others |= {
+    out = {c.carrier: fit_codes(replicates, c, use) for c in wanted if c.per == "code" and c.carrier is not None}
+    out |= {
         c.carrier: fit_blind_times(replicates, values, c, use) for c in wanted if c.blinds and c.carrier is not None
     }
     wanted = [c for c in wanted if by_counts(c)]
     if not wanted:
-        return others
+        return out
     start = with_values(replicates.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
     lines = [
         CountModel(replicates, id, levels[id])
         for id, s in replicates.seen.items()
         if s.counts is not None and (not use or id in use)
     ]
-    bases, groups, bounds = [], [], []
-    for candidate in wanted:
-        assert candidate.carrier is not None
-        declared = Effect.registry.find(candidate.carrier[0]).parameters[candidate.carrier[1]]
-        base = _base_of(start, candidate)
-        bases.append(base if base > 0 else float((declared.scan or (1e-3, 1))[0]))
-        bounds.append(_bounds_of(candidate.carrier))
-        groups.append(groups_of(start, candidate.per))
-    sizes = [int(g.max()) + 1 for g in groups]
-    delta = [np.zeros(n) for n in sizes]
-    middle = [0.0 for _ in wanted]
-    sigma = [0.3 for _ in wanted]
-    precision = [np.full(n, 1e-6) for n in sizes]
-    post: list[np.ndarray] = [np.ones(n) for n in sizes]
-    raw: list[tuple[np.ndarray, np.ndarray]] = [(d, d) for d in delta]
+    fitted = [_Fitted.of(start, candidate) for candidate in wanted]
 
-    def model(deltas: Sequence[np.ndarray]) -> Sensor:
-        given = dict(values)
-        for candidate, base, d, (low, high) in zip(wanted, bases, deltas, bounds, strict=True):
-            map_ = np.clip(base * np.exp(np.clip(d, -MOST, MOST)), low, high)
-            given[candidate.carrier] = map_  # type: ignore[index]
-        return with_values(replicates.start, given)
+    def model(logs: Sequence[np.ndarray]) -> Sensor:
+        maps = {one.candidate.carrier: one.value(own) for one, own in zip(fitted, logs, strict=True)}
+        return with_values(replicates.start, {**values, **maps})  # type: ignore[dict-item]
 
-    step = 0.02
-    delta = _begun(lines, model, groups, delta, step)
+    none, groups = [one.logs for one in fitted], [one.group for one in fitted]
+    for one, begun in zip(fitted, _begun(lines, model, groups, none, _DIFFERENCE), strict=True):
+        one.logs = begun
+    together = all(c.per == "pixel" for c in wanted)  # otherwise one map after the other
     for turn in range(TURNS):
-        now = model(delta)
-        other = [model([d + (step if j == i else 0) for j, d in enumerate(delta)]) for i in range(len(wanted))]
-        k = len(wanted)
-        pixels = start.layout.pixels
-        normal = np.zeros((pixels, k, k))
-        score = np.zeros((pixels, k))
-        for line in lines:
-            counts = line.seen.counts
-            assert counts is not None
-            expected = line.expected(now)
-            scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
-            line.level *= min(max(scale, 0.5), 2.0)  # until the level is that of these maps and no factor is needed
-            jacobian = np.stack([(line.expected(o) - expected) / step for o in other], axis=1) * scale
-            expected = expected * scale
-            variance = line.variance(np.maximum(expected, 0.5), replicates.dead)
-            normal += jacobian[:, :, None] * jacobian[:, None, :] / variance[:, None, None]
-            score += jacobian * ((counts - expected) / variance)[:, None]
-        # one map after the other where some groups are no pixels; together where all are
-        if all(c.per == "pixel" for c in wanted):
-            prior = np.stack(precision, axis=1)
-            whole = normal + np.eye(k) * prior[:, None, :]
-            pull = score - prior * (np.stack(delta, axis=1) - np.array(middle))
-            solved = np.linalg.solve(whole, pull[:, :, None])[:, :, 0]
-            inverse = np.linalg.inv(whole)
-            bare = normal + 1e-9 * np.eye(k)
-            free = np.linalg.solve(bare, score[:, :, None])[:, :, 0]
-            variance_free = np.linalg.inv(bare)
-            for i in range(k):
-                # without the prior; the other maps are free
-                raw[i] = delta[i] + np.clip(free[:, i], -2, 2), variance_free[:, i, i]
-                delta[i] = np.clip(delta[i] + np.clip(solved[:, i], -0.7, 0.7), -MOST, MOST)
-                post[i] = inverse[:, i, i]
-        else:
-            for i, group in enumerate(groups):
-                information = np.bincount(group, normal[:, i, i], sizes[i])
-                gradient = np.bincount(group, score[:, i], sizes[i])
-                move = (gradient - precision[i] * (delta[i] - middle[i])) / (information + precision[i])
-                delta[i] = np.clip(delta[i] + np.clip(move, -0.7, 0.7), -MOST, MOST)
-                post[i] = 1 / (information + precision[i])
-                own = np.maximum(information, 1e-12)
-                raw[i] = delta[i] + gradient / own, 1 / own
-        for i in range(k):
-            if turn < 2:
-                continue
-            # the width of the pixels' differences beyond their noise, robust against odd pixels
-            weight = (TAILS + 1) / (TAILS + (delta[i] - middle[i]) ** 2 / sigma[i] ** 2)
-            if acts_on_light(start, wanted[i]):
-                delta[i] = delta[i] - math.log(float(np.mean(np.exp(delta[i]))))
-            else:  # the mean of all pixels, which no pixel by itself may inform
-                own = weight * np.bincount(groups[i], normal[:, i, i], sizes[i])
-                left = weight * np.bincount(groups[i], score[:, i], sizes[i])
-                shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -0.5, 0.5))
-                delta[i] = delta[i] + shift
-                middle[i] = float(np.average(delta[i], weights=weight))
-            square = float(np.mean(weight * (delta[i] - median_of(delta[i])) ** 2 + post[i]))
-            sigma[i] = min(max(math.sqrt(square), 1e-4), 3.0)
-            own_raw, own_variance = raw[i]
-            noise = float(np.median(own_variance))
-            if noise < TELLING**2:
-                # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
-                width = 1.4826 * median_of(np.abs(own_raw - median_of(own_raw)))
-                sigma[i] = math.sqrt(max(width**2 - noise, LEAST_WIDTH**2))
-            apart = delta[i] - middle[i]
-            odd = outside_bulk(apart, sigma[i] ** 2 + post[i])
-            if noise >= TELLING**2:
-                # the scatter of the counts beyond noise, by moments: the estimates of poorly informed pixels say
-                # little
-                fitted = np.maximum(np.bincount(groups[i], normal[:, i, i], sizes[i]), 1e-9)
-                counted = fitted + np.bincount(groups[i], score[:, i], sizes[i])
-                # the expectation with the middle's value: the estimate must not weight itself
-                null_counts = fitted * np.exp(-apart)
-                counted, null_counts = counted[~odd], null_counts[~odd]
-                # about the mean of the counts
-                null_counts = np.maximum(
-                    null_counts * max(float(counted.sum()), 1e-9) / max(float(null_counts.sum()), 1e-9), 1e-9
-                )
-                square = max(float((null_counts**2).sum()), 1e-12)  # the noise of a single odd pixel is left out
-                # relative variance of the counts; that of the logarithms is smaller
-                relative = float(((counted - null_counts) ** 2 - null_counts).sum()) / square
-                sigma[i] = math.sqrt(max(math.log1p(max(relative, 0.0)), LEAST_WIDTH**2))
-            precision[i] = np.where(
-                odd,
-                WIDE**-2,  # odd pixels are of another kind, on which the prior holds no information
-                (TAILS + 1) / (TAILS * sigma[i] ** 2 + apart**2),
-            )
-    out = others
-    for i, candidate in enumerate(wanted):
-        assert candidate.carrier is not None
-        error = np.sqrt(np.maximum(post[i], 0))
-        r, v = raw[i]
-        map_ = PixelMap(candidate.carrier, bases[i], groups[i], delta[i], error, r, np.sqrt(v), sigma[i], *bounds[i])
-        scene = acts_on_light(start, candidate) and any(replicates.of_scene(line.id) for line in lines)
-        map_ = replace(map_, of_scene=scene)
-        if not acts_on_light(start, candidate) and float(np.median(v)) >= TELLING**2:
+        normal, score = _normal_equations(lines, model, fitted, replicates.dead)
+        if together:
+            _move_together(fitted, normal, score)
+        for i, one in enumerate(fitted):
+            if not together:
+                one.move_alone(normal[:, i, i], score[:, i])
+        for i, one in enumerate(fitted):
+            if turn >= _FREE_TURNS:
+                one.renew_prior(normal[:, i, i], score[:, i])
+    scene = any(replicates.of_scene(line.id) for line in lines)
+    for i, one in enumerate(fitted):
+        assert one.candidate.carrier is not None
+        map_ = one.map(one.of_light and scene)
+        if not one.of_light and float(np.median(one.raw_variance)) >= TELLING**2:
 
             def at(log: float, i: int = i) -> Sensor:
-                return model([np.full(d.size, log) if j == i else d for j, d in enumerate(delta)])
+                return model([np.full(o.logs.size, log) if j == i else o.logs for j, o in enumerate(fitted)])
 
             map_ = _of_few_counts(map_, lines, at)
-        out[candidate.carrier] = map_
+        out[one.candidate.carrier] = map_
     return out
+
+
+def _normal_equations(
+    lines: Sequence[CountModel],
+    model: Callable[[Sequence[np.ndarray]], Sensor],
+    fitted: Sequence[_Fitted],
+    dead: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(information (pixels, maps, maps), derivatives of the log-likelihood (pixels, maps)) of all counts.
+
+    The light level of each lit capture is moved towards that of these maps.
+
+    Args:
+        model: (groups,) logarithms of each map -> sensor.
+        dead: dead time, s.
+    """
+    logs = [one.logs for one in fitted]
+    now = model(logs)
+    other = [model([d + (_DIFFERENCE if j == i else 0) for j, d in enumerate(logs)]) for i in range(len(logs))]
+    pixels, k = len(fitted[0].group), len(fitted)
+    normal, score = np.zeros((pixels, k, k)), np.zeros((pixels, k))
+    for line in lines:
+        counts = line.seen.counts
+        assert counts is not None
+        expected = line.expected(now)
+        scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
+        line.level *= min(max(scale, 0.5), 2.0)  # until the level is that of these maps and no factor is needed
+        jacobian = np.stack([(line.expected(o) - expected) / _DIFFERENCE for o in other], axis=1) * scale
+        expected = expected * scale
+        variance = line.variance(np.maximum(expected, 0.5), dead)
+        normal += jacobian[:, :, None] * jacobian[:, None, :] / variance[:, None, None]
+        score += jacobian * ((counts - expected) / variance)[:, None]
+    return normal, score
+
+
+def _move_together(fitted: Sequence[_Fitted], normal: np.ndarray, score: np.ndarray) -> None:
+    """A Newton step of all maps, pixel by pixel.
+
+    Args:
+        normal: (pixels, maps, maps) information of the counts.
+        score: (pixels, maps) derivatives of their log-likelihood.
+    """
+    k = len(fitted)
+    prior = np.stack([one.precision for one in fitted], axis=1)
+    whole = normal + np.eye(k) * prior[:, None, :]
+    middle = np.array([one.middle for one in fitted])
+    pull = score - prior * (np.stack([one.logs for one in fitted], axis=1) - middle)
+    solved = np.linalg.solve(whole, pull[:, :, None])[:, :, 0]
+    inverse = np.linalg.inv(whole)
+    bare = normal + 1e-9 * np.eye(k)
+    free = np.linalg.solve(bare, score[:, :, None])[:, :, 0]  # without the prior; the other maps are free
+    variance_free = np.linalg.inv(bare)
+    for i, one in enumerate(fitted):
+        one.raw, one.raw_variance = one.logs + np.clip(free[:, i], -2, 2), variance_free[:, i, i]
+        one.move(solved[:, i])
+        one.variance = inverse[:, i, i]
 
 
 def _of_few_counts(map_: PixelMap, lines: Sequence[CountModel], model: Callable[[float], Sensor]) -> PixelMap:
@@ -356,24 +398,6 @@ def _begun(
     return out
 
 
-def expected_counts(replicates: Replicates, id: str, evaluation: Any, values: Mapping[Key, Any]) -> np.ndarray:
-    """The expected counts of each pixel in a capture with some values changed, (pixels,).
-
-    Of first stamps, in the time that each pixel waited: so they are proportional to the light, too.
-
-    Args:
-        values: by (effect, parameter), SI.
-    """
-    return CountModel(replicates, id, evaluation.rates[id].level).expected(
-        with_values(evaluation.sensors.usual(id), values)
-    )
-
-
-def light_levels_of(replicates: Replicates, evaluation: Any) -> dict[str, float]:
-    """The level of each capture; in the dark 1, for the rates as they are."""
-    return {id: 1.0 if s.capture.light.dark else evaluation.rates[id].level for id, s in replicates.seen.items()}
-
-
 def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] = ()) -> PixelMap:
     """The map of a converter's code widths from the frequency of each code.
 
@@ -421,7 +445,7 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     """
     assert candidate.carrier is not None
     start = with_values(replicates.start, {k: v for k, v in values.items() if k != candidate.carrier})
-    base = _base_of(start, candidate)
+    base = base_of(start, candidate)
     captures = [s.shortest for id, s in replicates.seen.items() if s.shortest is not None and (not use or id in use)]
     blur = blur_of(start)
     if blur is None or any(hasattr(e, "sensitivity") for e in start.at("dead_time")):
@@ -440,128 +464,3 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
         candidate.carrier, base, groups_of(start, candidate.per), estimate, error, raw, raw_error, width.sigma
     )
     return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)
-
-
-def information(
-    replicates: Replicates, values: Values, candidate: Candidate, levels: dict[str, float]
-) -> dict[str, np.ndarray]:
-    """The information of each capture on a map: squared derivatives over variances, (pixels,) or (1,), by capture.
-
-    Args:
-        values: the values of the model, SI.
-        levels: light level by capture.
-    """
-    if candidate.per == "code":
-        return {id: np.array([seen.total * (CODES in seen.summaries)]) for id, seen in replicates.seen.items()}
-    assert candidate.carrier is not None
-    pixels = replicates.start.layout.pixels
-    if candidate.blinds:
-        base = _base_of(
-            with_values(replicates.start, {k: v for k, v in values.items() if k != candidate.carrier}), candidate
-        )
-        shortest = {id: seen.shortest for id, seen in replicates.seen.items()}
-        return {
-            id: np.zeros(pixels) if s is None else np.where(s.tells(base), base * s.density, 0.0) ** 2
-            for id, s in shortest.items()
-        }
-    effect = with_values(replicates.start, values).effect(candidate.carrier[0])
-    if effect is None:
-        now = np.full(int(groups_of(replicates.start, candidate.per).max()) + 1, _base_of(replicates.start, candidate))
-    else:
-        now = np.asarray(getattr(effect, candidate.carrier[1]), np.float64)
-        if candidate.per == "pixel":
-            now = np.broadcast_to(now, (pixels,))
-    start = with_values(replicates.start, {**values, candidate.carrier: now})
-    other = with_values(replicates.start, {**values, candidate.carrier: now * 1.02})
-    out = {}
-    for id, seen in replicates.seen.items():
-        if seen.counts is None:
-            out[id] = np.zeros(pixels)
-            continue
-        line = CountModel(replicates, id, levels[id])
-        a, b = line.expected(start), line.expected(other)
-        slope = (b - a) / 0.02
-        out[id] = slope**2 / line.variance(np.maximum(a, 0.5), replicates.dead)
-    return out
-
-
-def captures_needed(
-    replicates: Replicates, values: Values, wanted: Sequence[Candidate], levels: dict[str, float]
-) -> set[str]:
-    """The captures without which one of the maps is hardly informed.
-
-    Args:
-        wanted: candidates with a carrier.
-        levels: light level by capture.
-    """
-    needed = [information(replicates, values, candidate, levels) for candidate in wanted]
-    shares = [
-        {id: one / np.maximum(sum(by_capture.values()), 1e-12) for id, one in by_capture.items()}
-        for by_capture in needed
-    ]
-    return {id for id in replicates.seen if any(float(np.mean(share[id])) > ALONE for share in shares)}
-
-
-def models_with_maps(
-    replicates: Replicates, values: Values, wanted: Sequence[Candidate], levels: dict[str, float], unseen: bool = True
-) -> tuple[Model, dict[Key, PixelMap], dict[Key, Any]]:
-    """(model with maps, the maps fitted to all captures, the values with these maps).
-
-    The model of each capture has maps that are fitted without it; where it alone informs a parameter, it is used all
-    the same. Every replicate has a draw of the posterior of the maps.
-
-    Args:
-        wanted: candidates with a carrier.
-        levels: light level by capture.
-        unseen: each capture is left out; otherwise all have the same maps.
-    """
-    whole = fit_maps(replicates, values, wanted, levels)
-    final = {**values, **{key: m.values() for key, m in whole.items()}}
-    needed = captures_needed(replicates, final, wanted, levels)
-    maps: dict[str, dict[Key, PixelMap]] = {}
-    for id, seen in replicates.seen.items():
-        if seen.counts is None or id in needed or not unseen or len(replicates.seen) < 2:
-            maps[id] = whole
-        else:
-            others = [i for i in replicates.seen if i != id]
-            try:
-                maps[id] = fit_maps(replicates, values, wanted, levels, others)
-            except SpadError:  # the other captures do not inform one of the maps
-                maps[id] = whole
-
-    def of(id: str, number: int) -> Sensor:
-        rng = np.random.Generator(np.random.Philox(key=[replicates.seed + 7, number]))
-        drawn = {}
-        for key, m in maps[id].items():
-            drawn[key] = m.values(rng.standard_normal(len(m.estimate)), float(rng.standard_normal()))
-        return with_values(replicates.start, {**values, **drawn})
-
-    def typical(id: str) -> Sensor:
-        return with_values(replicates.start, {**values, **{key: m.values() for key, m in maps[id].items()}})
-
-    return Model(of, with_values(replicates.start, final), alike=False, typical=typical), whole, final
-
-
-def maps_needed(
-    replicates: Replicates,
-    values: Values,
-    held: Sequence[Candidate],
-    wanted: Sequence[Candidate],
-    levels: dict[str, float],
-) -> list[Candidate]:
-    """The maps whose pixels differ beyond their noise when all are fitted together, by p-value.
-
-    Args:
-        held: maps that the model has already.
-        wanted: maps to test.
-        levels: light level by capture.
-    """
-    kept = list(wanted)
-    while kept:
-        found = fit_maps(replicates, values, [*held, *kept], levels)
-        clear = {c: spread_p(found[c.carrier]) for c in kept}  # type: ignore[index]
-        least = max(kept, key=lambda c: clear[c])
-        if clear[least] < _NEEDED:
-            return sorted(kept, key=lambda c: clear[c])
-        kept.remove(least)
-    return []

@@ -10,11 +10,12 @@ import numpy as np
 
 from ..errors import UNABLE
 from ..sensor import Sensor
-from . import map_fits, pixel_maps
+from . import count_model, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
-from .replicates import Model, Replicates
+from .models import Model
+from .replicates import Replicates
 from .score_test import PIXELS, p_of_map
 from .signature import Signature, residuals_at, signatures, template_of
 from .trial import Trial, is_pattern, of_scene, tie
@@ -47,21 +48,21 @@ def map_trials_of(
     """
     if scan.only_rates(evaluation):
         return []
-    levels = map_fits.light_levels_of(scan.replicates, evaluation)
+    levels = count_model.light_levels_of(scan.replicates, evaluation)
     held = [c for c in scan.accepted if c.carrier]
     wanted = candidate_maps(scan, evaluation)
     groups = [[c] for c in wanted]
     pixels = [c for c in wanted if c.per == "pixel" and pixel_maps.by_counts(c)]
     if len(pixels) > 1 and all(c.per == "pixel" for c in held):
         with contextlib.suppress(*UNABLE):  # each is tried by itself, too
-            together = map_fits.maps_needed(scan.replicates, values, held, pixels, levels)
+            together = map_models.maps_needed(scan.replicates, values, held, pixels, levels)
             if len(together) > 1:
                 groups.insert(0, together)
     out = []
     for group in groups:
         made: tuple[Any, ...] = ()
         with scan.if_possible(group[0], MAKING_A_MAP):
-            made = map_fits.models_with_maps(scan.replicates, values, [*held, *group], levels)
+            made = map_models.models_with_maps(scan.replicates, values, [*held, *group], levels)
         if not made:
             continue
         sensors, found, mapped = made
@@ -147,8 +148,8 @@ def _p_of_scene(
     """
     ids = [id for id, name in evaluation.residuals if name == PIXELS and replicates.of_scene(id)]
     after = residuals_at(replicates, evaluation, one.signature, one.times)
-    levels = map_fits.light_levels_of(replicates, evaluation)
-    information = map_fits.information(replicates, evaluation.values, candidate, levels)
+    levels = count_model.light_levels_of(replicates, evaluation)
+    information = map_models.information(replicates, evaluation.values, candidate, levels)
     z, left = (np.stack([x[id, PIXELS] for id in ids]) for x in (evaluation.residuals, after))
     known = np.stack([information[id] for id in ids])
     return pixel_maps.p_of_explained(z, left, known, free.sigma, len(one.candidate.coordinates))
@@ -166,14 +167,14 @@ def unseen_maps(
         like: the trial of the candidate.
         faint: see `Scan.again`.
     """
-    levels = map_fits.light_levels_of(scan.replicates, evaluation)
+    levels = count_model.light_levels_of(scan.replicates, evaluation)
     out = []
     for candidate in scan._beside(evaluation.sensors.one):
         if candidate.per != "pixel" or candidate.carrier is None or candidate.effect == like.candidate.effect:
             continue
         information: Any = None
         with scan.if_possible(candidate, MAKING_A_MAP):
-            information = sum(map_fits.information(scan.replicates, values, candidate, levels).values())
+            information = sum(map_models.information(scan.replicates, values, candidate, levels).values())
         if information is None:
             continue
         # the intervals inform each dead time, but jitter may be what scatters them

@@ -11,16 +11,17 @@ import numpy as np
 
 from ..effects import Effect
 from ..measurement import Measurement
-from . import held_out, map_fits, pixel_maps
+from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .error_budget import HeldMaps, Rung, physical_errors
 from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, square, stacked
 from .exact_likelihood import maximise, not_in_likelihood, recordings
 from .gauss_newton import Fit, error_scale, gauss_newton_step
+from .models import Model
 from .phases import evaluate_start
 from .pixel_maps import HALF_95, map_values
-from .replicates import FEW, TOTALS, Cell, Model, Replicates
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value, title
 from .scan import Scan
 from .signature import captures_showing, residuals_at, signatures, template_of
@@ -319,7 +320,7 @@ def _of_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_maps.PixelM
         u = coordinate.coordinate(float(path.values[coordinate.key]))
         ends = [coordinate.coordinate(coordinate.value(u + h)) for h in (_STEP, -_STEP)]
         rates = [
-            map_fits.expected_counts(replicates, id, path.evaluation, {coordinate.key: coordinate.value(end)})
+            count_model.expected_counts(replicates, id, path.evaluation, {coordinate.key: coordinate.value(end)})
             for end in ends
         ]
         slope = (np.log(rates[0]) - np.log(rates[1])) / max(ends[0] - ends[1], 1e-12)
@@ -362,8 +363,8 @@ def _model(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
     chips = any(step.chips for step in path.steps)
     if not held:
         return Model.same(replicates.start).changed(path.values, scan.phases, chips), {}
-    levels = map_fits.light_levels_of(replicates, path.evaluation)
-    sensors, maps, path.values = map_fits.models_with_maps(replicates, path.values, held, levels)
+    levels = count_model.light_levels_of(replicates, path.evaluation)
+    sensors, maps, path.values = map_models.models_with_maps(replicates, path.values, held, levels)
     return sensors.changed({}, scan.phases, chips), maps
 
 

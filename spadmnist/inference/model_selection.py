@@ -11,34 +11,31 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
 
 from .. import golden
-from ..effects import Mimic
 from ..errors import UNABLE, why
 from ..measurement import Measurement
 from ..sensor import Sensor
 from ..workers import Executor, executor
 from . import experiment_design, setups, time_blocks, upper_limits
+from .alternatives import alternatives
 from .budget import FITS, STEPS, Budget, OutOfBudget, clock
 from .candidates import Candidate
 from .comparison import Comparison, comparison_of, comparison_with
+from .conclusion import Limits, Notes, answer, left_over, not_done, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_mimics, drop_needless, in_vain, left_in_own_cells
 from .error_budget import Rung, placebo_of
-from .evaluation import BlockCheck, Evaluation, block_checks, evaluate, failing, mean_misfit, misfit_null_95, square
-from .findings import mimicked, nuisances, remainder, traces
+from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
+from .findings import mimicked
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_GAIN
 from .map_trials import patterns_first, unseen_maps
 from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
-from .ranking import best_of, compare_by_squares, gain_against, least_probable, worth_fitting
+from .ranking import best_of, compare_by_squares, least_probable, worth_fitting
 from .replicates import REPLICATES, TOTALS, Replicates
-from .results import Diagnosis, Step, Value, plain, title
-from .scan import Scan
+from .results import Diagnosis, title
 from .score_test import explains_its_signature, p_of_any, p_of_best
-from .signature import residuals_at
-from .trial import Trial, at_end, tie
+from .trial import Trial
 from .trial_fits import fit_trial
 
 MAX_STEPS = 12  # of one diagnosis, by default
@@ -47,10 +44,6 @@ _QUICK = 32  # replicates of each capture in a quick diagnosis
 _TRACE = 4e-3
 _MAYBE, _CLOSER = 100.0, REPLICATES  # times that p-value: worth more replicates; their number
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
-_NAMED = 4  # alternatives of a step
-# of the gain of a shape at the end of its range: a candidate with as much is confused with it, because another law
-# may be the right one
-_ALMOST = 0.8
 _LATER_TRACE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed
 
 
@@ -101,31 +94,6 @@ def diagnose(
         return _diagnosed(replicates, max_steps, quick, short, keep or (lambda found: None))
 
 
-@dataclass
-class _Notes:
-    """What a diagnosis reports in addition to its steps.
-
-    Attributes:
-        setup: entries of the set-up.
-        explained: the set-up explains the totals that fail.
-        bent: a nonlinearity that no effect here has may explain them as well.
-        advice: captures that would separate explanations.
-        rival: a change of the sensor that is a tie with the set-up.
-        placebo: the row of the placebo.
-        tried: the last trials of the candidates.
-        looked: the evaluation under which they were tried in all captures.
-    """
-
-    setup: list[dict[str, Any]]
-    explained: bool = False
-    bent: bool = False
-    advice: list[dict[str, Any]] = field(default_factory=list)
-    rival: Trial | None = None
-    placebo: Rung | None = None
-    tried: list[Trial] = field(default_factory=list)
-    looked: Evaluation | None = None
-
-
 def _diagnosed(
     replicates: Replicates,
     max_steps: int,
@@ -134,11 +102,11 @@ def _diagnosed(
     keep: Callable[[Diagnosis], None],
 ) -> Diagnosis:
     path = begin(replicates)
-    start, notes = path.evaluation, _Notes(_too_short(short))
+    start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
     while len(path.steps) < max_steps and not in_vain(path, not notes.explained) and _possible(path, notes):
         if path.steps:
-            keep(_so_far(path, start, notes))
+            keep(so_far(path, start, notes))
     replicates.budget.until = FITS
     if path.steps:
         with _or_as_before(path, "taking out what is needless"):
@@ -156,7 +124,7 @@ def _diagnosed(
     if path.steps:
         with _or_as_before(path, "the last comparison"):
             path.last_rung()
-    verdict = _verdict(path, _left(path, notes), notes)
+    verdict = verdict_of(path, left_over(path, notes), notes)
     if not path.steps:
         path.evaluation, path.fit, path.values = start, None, {}
         path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
@@ -166,12 +134,12 @@ def _diagnosed(
         replicates.budget.until = 1.0
         verdict = _or_confused(path, notes)
     if notes.rival is not None:
-        path.steps.append(_rival_step(path, notes.rival))
+        path.steps.append(rival_step(path, notes.rival))
     for step in path.steps:
         for other in step.alternatives:
             other.pop("confused", None)
             other.pop("tried", None)
-    limits: _Limits = ([], [], [])
+    limits: Limits = ([], [], [])
     replicates.budget.until = 1.0
     if verdict == "adequate" or (verdict == "explained" and not quick):
         replicates.say("what would have been seen")
@@ -187,88 +155,7 @@ def _diagnosed(
         in_sample = (
             comparison_of(replicates, own) if own else comparison_with(replicates, path.values, path.scan.phases)
         )
-    return _answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
-
-
-# as `upper_limits.upper_limits` returns them
-_Limits = tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]
-
-
-def _left(path: ModelPath, notes: _Notes) -> list[BlockCheck]:
-    """The checks that fail with all steps; none where these are totals that the set-up explains."""
-    left = path.failed
-    return [] if left and notes.explained and all(b.cell[0] == "" for b in left) else left
-
-
-def _so_far(path: ModelPath, start: Evaluation, notes: _Notes) -> Diagnosis:
-    """The diagnosis while the search goes on."""
-    verdict = _verdict(path, _left(path, notes), notes)
-    null_95 = misfit_null_95(path.ladder[0].evaluation.replicate_residuals)
-    found = _answer(path, start, notes, verdict, path.ladder, null_95, ([], [], []), None)
-    found.steps = [replace(step, alternatives=[_public(other) for other in step.alternatives]) for step in path.steps]
-    found.finished = False
-    found.untried = [*found.untried, _not_done("further steps", "the search goes on")]
-    return found
-
-
-def _nearest(step: Step) -> dict[str, Any]:
-    """The entry of a step that explains too little of its own cells, as an alternative of what is unexplained."""
-    c = step.candidate
-    misfit = plain(step.misfit)
-    return {"change": c.kind, "effect": c.effect, "parameter": c.parameter, "misfit": misfit, "nearest": True}
-
-
-def _public(alternative: dict[str, Any]) -> dict[str, Any]:
-    return {key: x for key, x in alternative.items() if key not in ("confused", "tried")}
-
-
-def _not_done(where: str, why: str) -> dict[str, Any]:
-    """An entry of `not_tried` that is of no candidate."""
-    return {"change": None, "effect": None, "parameter": None, "where": where, "why": why}
-
-
-def _answer(
-    path: ModelPath,
-    start: Evaluation,
-    notes: _Notes,
-    verdict: str,
-    rungs: Sequence[Rung],
-    null_95: float,
-    limits: _Limits,
-    in_sample: Comparison | None,
-) -> Diagnosis:
-    replicates = path.replicates
-    remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
-    excluded, invisible, unlimited = limits
-    unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
-    if unexplained and verdict == "unexplained" and path.nearest:
-        unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]
-    return Diagnosis(
-        sensor=replicates.start.name,
-        measurement=replicates.measurement.name,
-        verdict=verdict,
-        before=rungs[0].misfit,
-        after=(path.ladder[-1] if path.steps else path.ladder[0]).misfit,
-        null_95=null_95,
-        nuisances=nuisances(replicates, path.evaluation),
-        steps=path.steps,
-        setup=notes.setup,
-        unexplained=unexplained,
-        ladder=[rung.row for rung in rungs],
-        advice=notes.advice,
-        excluded=excluded,
-        invisible=invisible,
-        unlimited=unlimited,
-        traces=traces(replicates, start, path.evaluation, path.steps),
-        values=path.values,
-        simulations=replicates.simulations,
-        dark=replicates.dark,
-        crop=str(replicates.start.window) if replicates.start.window else None,
-        untried=path.scan.untried,
-        in_sample=in_sample,
-        finished=path.finished,
-        shape=replicates.start.layout.shape,
-    )
+    return answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
 
 
 @contextlib.contextmanager
@@ -293,7 +180,7 @@ def _or_as_before(path: ModelPath, where: str) -> Iterator[None]:
 def _end(path: ModelPath, where: str) -> None:
     """Record what the budget has ended."""
     path.finished = False
-    path.scan.untried.append(_not_done(where, "the budget of work was spent; give a longer --within, or none"))
+    path.scan.untried.append(not_done(where, "the budget of work was spent; give a longer --within, or none"))
 
 
 def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:
@@ -308,7 +195,7 @@ def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:
     return misfit_null_95(rungs[0].evaluation.replicate_residuals)
 
 
-def _possible(path: ModelPath, notes: _Notes) -> bool:
+def _possible(path: ModelPath, notes: Notes) -> bool:
     """As `_another`; False where the steps so far cannot be simulated often enough."""
     before = path.kept()
     try:
@@ -326,7 +213,7 @@ def _possible(path: ModelPath, notes: _Notes) -> bool:
         return False
 
 
-def _another(path: ModelPath, notes: _Notes) -> bool:
+def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan, failed = path.replicates, path.scan, path.failed
     number = len(path.steps) + 1
@@ -361,7 +248,7 @@ class _NoCandidate(Exception):
     """The best candidate cannot be simulated, so that it is excluded."""
 
 
-def _added(path: ModelPath, notes: _Notes, failed: Sequence[BlockCheck], least: float = FALSE_ALARM) -> bool:
+def _added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float = FALSE_ALARM) -> bool:
     """Whether the best candidate was added, or another attempt is worth it.
 
     A candidate that cannot be simulated makes room for the next best.
@@ -401,7 +288,7 @@ def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Ite
         raise _NoCandidate({candidate.name for candidate in candidates}) from error
 
 
-def _best_added(path: ModelPath, notes: _Notes, failed: Sequence[BlockCheck], least: float) -> bool:
+def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
     replicates, scan, faint = path.replicates, path.scan, not failed
     number = len(path.steps) + 1
     # a value that a step has set is fitted anew with every other one: it is no finding of its own
@@ -445,7 +332,7 @@ def _best_added(path: ModelPath, notes: _Notes, failed: Sequence[BlockCheck], le
         with _or_as_before(path, "looking for what looks alike"):
             unseen = unseen_maps(scan, before, path.values, best, faint)
             refined, second = refined + unseen, second + unseen
-    new[0].alternatives = _alternatives(scan, before, best, refined, second)
+    new[0].alternatives = alternatives(scan, before, best, refined, second)
     named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
     if notes.placebo is None:
         with contextlib.suppress(*UNABLE):  # no result depends on it
@@ -493,19 +380,7 @@ def _closer(path: ModelPath) -> Evaluation:
     return evaluate(path.replicates, path.evaluation.values, path.evaluation.sensors, _CLOSER, path.evaluation)
 
 
-def _verdict(path: ModelPath, left: Sequence[BlockCheck], notes: _Notes) -> str:
-    if notes.rival is not None:
-        return "confused"
-    if left:
-        return "partly_explained" if path.steps else "unexplained"
-    if path.steps:
-        return "explained"
-    if notes.bent:
-        return "confused"
-    return "setup" if notes.setup else "adequate"
-
-
-def _or_confused(path: ModelPath, notes: _Notes) -> str:
+def _or_confused(path: ModelPath, notes: Notes) -> str:
     """The verdict on steps that leave nothing: "explained", or "confused" where something else is a tie.
 
     The advice is added.
@@ -520,25 +395,12 @@ def _or_confused(path: ModelPath, notes: _Notes) -> str:
         unlisted = mimicked(step)
         if unlisted is not None:
             verdict = "confused"
-            step.alternatives.insert(0, _outside(unlisted, path.ladder[-1].misfit))
+            step.alternatives.insert(0, outside(unlisted, path.ladder[-1].misfit))
             notes.advice.append(experiment_design.on_mimic(step, unlisted))
     return verdict
 
 
-def _too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
-    """The entries of captures that stopped early.
-
-    Args:
-        short: (share that was exposed, its standard deviation) by capture.
-    """
-    out = []
-    for id, (share, error) in short.items():
-        factor = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
-        out.append({"capture": id, "quantity": "exposure", "factor": factor, "confused": False})
-    return out
-
-
-def _by_setup(path: ModelPath, notes: _Notes) -> bool:
+def _by_setup(path: ModelPath, notes: Notes) -> bool:
     """Whether the set-up explains the totals that fail; adds its entries, a rival of the sensor, and the advice."""
     replicates, evaluation = path.replicates, path.evaluation
     likely = setups.explanations(replicates, evaluation)
@@ -565,55 +427,3 @@ def _by_setup(path: ModelPath, notes: _Notes) -> bool:
     notes.setup = found + notes.setup
     notes.explained = True
     return True
-
-
-def _rival_step(path: ModelPath, rival: Trial) -> Step:
-    coordinate = rival.candidate.strengths[0]
-    low, high = rival.intervals.get(coordinate.key, (None, None))
-    value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
-    left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
-    return Step(
-        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike"
-    )
-
-
-def _outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
-    """A mimic as an alternative."""
-    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": mimic.what}
-
-
-def _alternatives(
-    scan: Scan, evaluation: Evaluation, best: Trial, refined: Sequence[Trial], second: Sequence[Trial]
-) -> list[dict[str, Any]]:
-    """The other candidates with the misfit that each leaves, ties first, for the JSON data."""
-    out: list[dict[str, Any]] = []
-    for one in second:
-        if (
-            one is best
-            or one.candidate in best.candidates
-            or any(o["tried"].candidate.name == one.candidate.name for o in out)
-        ):
-            continue
-        with scan.if_possible(one.candidate, "comparing it with the best", wholly=False):
-            out.append(_alternative(scan.replicates, evaluation, best, one))
-    return sorted(out, key=lambda other: not other["confused"])[:_NAMED]
-
-
-def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, one: Trial) -> dict[str, Any]:
-    residuals = one.residuals or residuals_at(replicates, evaluation, one.signature, one.times, noisy=True)
-    judged, left = evaluation, residuals
-    if one.scatters and one.evaluation is not None:
-        judged, left = one.evaluation, one.evaluation.residuals
-    failed = failing(block_checks(replicates, judged, left))
-    most, gain = gain_against(best, one), gain_against(one, best)
-    if one.chips and judged is not evaluation:  # by the likelihood ratio a few odd pixels may gain little
-        gain = max(gain, square(evaluation.residuals) - square(residuals))
-    near = most - gain < tie(most) or (at_end(best) and gain > _ALMOST * most)
-    return {
-        "change": one.candidate.kind,
-        "effect": one.candidate.effect,
-        "parameter": one.candidate.parameter,
-        "misfit": plain(mean_misfit(evaluation.replicate_residuals, residuals)),
-        "confused": one.residuals is not None and near and not failed,
-        "tried": one,
-    }

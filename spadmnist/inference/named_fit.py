@@ -15,7 +15,7 @@ from ..errors import InputError, did_you_mean
 from ..measurement import Measurement
 from ..sensor import Sensor
 from ..workers import Executor, executor
-from . import counts_in_the_dark, map_fits, time_blocks
+from . import count_model, counts_in_the_dark, time_blocks
 from .candidates import Candidate, candidates
 from .comparison import comparison_with
 from .coordinates import Key, point_of
@@ -178,7 +178,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
                 path.evaluation,
                 candidate,
                 path.values,
-                map_fits.light_levels_of(replicates, path.evaluation),
+                count_model.light_levels_of(replicates, path.evaluation),
             )
             best = Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, chance=p)
             accept(path, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))

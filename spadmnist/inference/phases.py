@@ -12,7 +12,8 @@ import numpy as np
 from .coordinates import Key
 from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
-from .replicates import FEW, TOTALS, Cell, Replicates, swinging
+from .models import swinging
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, residuals_at, residuals_shifted, signatures
 
 # factors on the simulated strength: at first, and about the best of these

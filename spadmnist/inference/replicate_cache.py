@@ -25,7 +25,8 @@ from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
-from .replicates import CaptureReplicates, own_statistics
+from .reduction import own_statistics
+from .replicates import CaptureReplicates
 
 _MOST_BYTES = 1 << 30  # bytes of all entries together
 

@@ -7,27 +7,25 @@ one number draws the same random numbers in every model, so that differences bet
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from .. import by_value, plugins, twin
-from ..effects import Conditions
+from .. import twin
 from ..errors import UNABLE, EffectError, why
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
-from ..statistics import Statistic, Summary
+from ..statistics import Summary
 from ..streams import Streams
 from ..workers import Executor
 from . import memory
-from .blind_times import ShortestIntervals
 from .budget import Budget, work_of
-from .candidates import Candidate, candidates, maps_beside, on_chip, with_values
-from .coordinates import Key, Values
+from .candidates import Candidate, candidates, maps_beside
+from .models import InTheDark, Model, Packed
+from .reduction import ReducedCapture, halves_of, reduce_with, statistics_for
 
 if TYPE_CHECKING:
     from .journal import Journal
@@ -42,11 +40,6 @@ _FEW_EVENTS = 100_000  # detections and bits of frames, of which a replicate tak
 _SCALES = 8  # replicates whose scales are averaged, however many there are
 
 
-def halves_of(id: str) -> tuple[str, str]:
-    """The names of the two halves of a capture (`Replicates.halves`)."""
-    return f"{id}, odd blocks", f"{id}, even blocks"
-
-
 class Fault(str):
     """The reason why a model cannot be simulated, where an effect's own code has failed."""
 
@@ -54,52 +47,6 @@ class Fault(str):
 def why_not(error: BaseException) -> str:
     """The reason why a model cannot be simulated, as text; a `Fault` where an effect's own code has failed."""
     return (Fault if isinstance(error, EffectError) else str)(why(error))
-
-
-@dataclass(frozen=True)
-class ReducedCapture:
-    """A measured capture, reduced: its total, the counts of its pixels, its summaries.
-
-    Attributes:
-        total: detections of the whole array.
-        counts: (pixels,) detections; None where the mean alone is known.
-        summaries: by statistic.
-        last: the last detection that has a stamp of its own, s.
-        waited: (pixels,) of first stamps, the time before them, in frames.
-        shortest: the shortest intervals, of time stamps.
-        half_of: (the whole capture, whether this is its second, fourth, ... block of time); None where it is no half.
-    """
-
-    capture: Capture
-    total: float
-    counts: np.ndarray | None
-    summaries: Mapping[str, Summary]
-    last: float | None = None
-    waited: np.ndarray | None = None
-    shortest: ShortestIntervals | None = None
-    half_of: tuple[Capture, bool] | None = None
-
-    @classmethod
-    def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
-        """The reduction of a recording.
-
-        Args:
-            reduced: with its statistics; without them only the counts are there.
-        """
-        summaries = {}
-        for statistic in statistics_for(recording.capture) if reduced else ():
-            summary = reduce_with(statistic, recording)
-            if summary is not None:
-                summaries[statistic.name] = summary.apart()
-        counts = np.asarray(recording.totals, float)
-        last = None
-        if recording.events is not None and len(recording.events):
-            stamps, unit = recording.events.stamps
-            last = float(stamps.max() * unit)
-        waited = None if recording.waited is None else recording.waited[0]
-        shortest = ShortestIntervals.of(recording)
-        capture = replace(recording.capture, tick=recording.tick)
-        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest)
 
 
 @dataclass
@@ -122,72 +69,6 @@ class CaptureReplicates:
         """The first `number` replicates, or all of them where there are fewer."""
         values = {name: x[:number] for name, x in self.values.items()}
         return CaptureReplicates(self.numbers[:number], self.totals[:number], values, self.laws)
-
-
-@dataclass(frozen=True)
-class Model:
-    """A model: one sensor, or one for each capture, or one for each replicate (maps that are known with errors).
-
-    Attributes:
-        of: (capture, number of a replicate) -> sensor.
-        one: a single sensor that stands for all.
-        alike: all replicates of a capture have the same sensor.
-        typical: capture -> the sensor whose closed forms hold in the mean over the replicates; None where all are
-            alike.
-    """
-
-    of: Callable[[str, int], Sensor]
-    one: Sensor
-    alike: bool = True
-    typical: Callable[[str], Sensor] | None = None
-
-    def usual(self, capture: str) -> Sensor:
-        """The sensor whose closed forms hold in the mean over the replicates of a capture."""
-        return self.typical(capture) if self.typical else self.of(capture, 0)
-
-    @staticmethod
-    def same(sensor: Sensor) -> Model:
-        """The model of one sensor for every replicate of every capture."""
-        return Model(lambda capture, number: sensor, sensor)
-
-    def under(self, name_of: Callable[[str], str]) -> Model:
-        """The same sensors for captures of other names.
-
-        Args:
-            name_of: new name -> name of the capture here.
-        """
-        typical = self.typical
-        return Model(
-            lambda capture, number: self.of(name_of(capture), number),
-            self.one,
-            self.alike,
-            None if typical is None else lambda capture: typical(name_of(capture)),
-        )
-
-    def changed(
-        self, values: Values, phases: Mapping[tuple[str, Key], float] | None = None, chips: bool = False
-    ) -> Model:
-        """The model with some values set in each of its sensors.
-
-        Args:
-            values: by (effect, parameter), SI units.
-            phases: by (capture, parameter), rad.
-            chips: every replicate is of a chip of its own, because the random properties of the pixels are not known.
-        """
-
-        def own(capture: str) -> dict[Key, Any]:
-            return {**values, **{key: x for (id, key), x in (phases or {}).items() if id == capture}}
-
-        def of(capture: str, number: int) -> Sensor:
-            sensor = self.of(capture, number)
-            return with_values(on_chip(sensor, number + 1) if chips else sensor, own(capture))
-
-        def usual(capture: str) -> Sensor:
-            return with_values(self.usual(capture), own(capture))
-
-        typical = functools.lru_cache(maxsize=64)(usual)
-        known = typical if self.typical or chips else None
-        return Model(of, with_values(self.one, values), self.alike and not chips, known)
 
 
 @dataclass(frozen=True)
@@ -468,13 +349,6 @@ def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:
     )
 
 
-def statistics_for(capture: Capture) -> list[Statistic]:
-    """Every registered statistic that applies to a capture: by its modality, and by its light."""
-    kinds = [Statistic.registry.find(name) for name in Statistic.registry]
-    scene = capture.light.scene is not None
-    return [kind() for kind in kinds if capture.modality in kind.modalities and not (kind.flat and scene)]
-
-
 def simulated(
     sensor: Sensor, capture: Capture, photons: np.ndarray, numbers: np.ndarray, seed: int
 ) -> Iterator[Recording]:
@@ -497,87 +371,6 @@ def simulated(
             yield made.pop(0) if capture.tick is None else made.pop(0).on_ticks(capture.tick)
 
 
-def swinging(sensor: Sensor) -> list[Key]:
-    """The parameters of a sensor that are phases."""
-    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.phase]
-
-
-class InTheDark(Sensor):
-    """A sensor without light, whose dark rates are scaled by the number that stands for photons/s.
-
-    A dark capture can so be simulated with as many detections as were measured. The test of their number is then
-    separate from the test of their pattern.
-    """
-
-    @staticmethod
-    def of(sensor: Sensor) -> Sensor:
-        """The same sensor, in the dark."""
-        own = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
-        return InTheDark(**own | {"chip": None if sensor.chip is None else InTheDark.of(sensor.chip)})
-
-    def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
-        """The dark rates times the factors that stand for photons/s; arrays as in `Sensor.rates`."""
-        rate, light = super().rates(np.zeros_like(photons), conditions)
-        return rate * photons, light * photons
-
-
-@dataclass(frozen=True)
-class Packed:
-    """A sensor on its way to a worker, with the user's own statistics.
-
-    A worker must load the user's plug-in files before it can unpack it.
-    """
-
-    files: tuple[plugins.Carried, ...]
-    packed: bytes
-
-    @staticmethod
-    def of(sensor: Sensor, apart: bool = True) -> Packed:
-        """The packed sensor.
-
-        Args:
-            apart: it is unpacked in another process.
-        Raises:
-            EffectError: where a class of the user's cannot be sent there.
-        """
-        own = own_statistics()
-        return Packed(plugins.carried(), by_value.packed((sensor, own), apart))
-
-    @property
-    def sensor(self) -> Sensor:
-        """The unpacked sensor. The user's plug-in files are run where that has not been done in this process."""
-        plugins.load_carried(self.files)
-        return _unpacked(self.packed)
-
-
-def own_statistics() -> list[type[Statistic]]:
-    """The statistics of a notebook or of modules of the user's, which stand neither here nor in a plug-in file."""
-    known = (Statistic.registry.find(name) for name in Statistic.registry)
-    return [cls for cls in known if plugins.is_own(cls)]
-
-
-@functools.lru_cache(maxsize=2)
-def _unpacked(packed: bytes) -> Sensor:
-    """The unpacked sensor; only what this program has packed itself is unpacked."""
-    sensor, _ = by_value.unpacked(packed)
-    assert isinstance(sensor, Sensor)
-    return sensor
-
-
 def no_size(cell: int, measured: float, expected: float) -> tuple[str, float]:
     """No words: for a summary whose words are not needed."""
     return "", 0.0
-
-
-def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
-    """The summary of a recording by a statistic; None where it does not apply.
-
-    Raises:
-        SpadError: where a user's own statistic fails; it names the file and line.
-    """
-    try:
-        return statistic.reduce(recording)
-    except Exception as error:
-        if plugins.is_built_in(type(statistic)):
-            raise
-        raise plugins.blame(statistic, error) from error

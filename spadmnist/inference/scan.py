@@ -17,9 +17,10 @@ from .coordinates import Key, is_edge
 from .evaluation import Evaluation, block_checks, failing, square
 from .levels import COST_OF_A_NUMBER, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
+from .models import Model
 from .phases import NEAR, TIMES, simulate_phases
 from .ranking import gain_by_own_scatter
-from .replicates import FEW, Model, Replicates
+from .replicates import FEW, Replicates
 from .score_test import LEAST_P, best_direction, sigmas_of
 from .signature import Signature, gain_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
 from .spectral_lines import Line, spectral_lines

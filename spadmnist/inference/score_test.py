@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from ..errors import SpadError
-from . import map_fits, pixel_maps
+from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, stacked
@@ -75,7 +75,7 @@ def p_of_any(
     """
     data, own = _p_values(replicates, evaluation, tried)
     p = _trials_corrected(own, min(data, default=1.0))
-    levels = map_fits.light_levels_of(replicates, evaluation)
+    levels = count_model.light_levels_of(replicates, evaluation)
     maps = [
         p_of_map(replicates, evaluation, c, values, levels)
         for c in replicates.candidates(evaluation.sensors.one)
@@ -337,7 +337,7 @@ def p_of_map(
         levels: light level by capture.
     """
     try:
-        information = map_fits.information(replicates, values, candidate, levels)
+        information = map_models.information(replicates, values, candidate, levels)
     except (SpadError, np.linalg.LinAlgError):
         return 1.0
     if candidate.blinds:

@@ -17,8 +17,9 @@ from scipy import ndimage, stats
 from ..errors import UNABLE, SpadError, why
 from .evaluation import Evaluation, far_wider, square
 from .light_levels import matched_light, needed_light, totals_space
+from .models import Model
 from .null_distribution import residuals_of
-from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Model, Replicates, joined, why_not
+from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, joined, why_not
 from .shifts import beyond_noise, mean_shift
 
 # times the scatter of the model's totals: the scatter of another model's totals up to which it is the same

@@ -13,11 +13,12 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from ..statistics import Summary
-from . import held_out, map_fits
+from . import count_model, held_out, map_models
 from .error_budget import Rung
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95
 from .laws import law_of
-from .replicates import Cell, Replicates, halves_of
+from .reduction import halves_of
+from .replicates import Cell, Replicates
 from .signature import residuals_at, signatures
 
 _SAME_PLACE = 0.02  # relative, on the axis: cells of two captures at the same place
@@ -78,8 +79,8 @@ def _captures_needed(replicates: Replicates, rung: Rung) -> set[str]:
     if rung.fit is not None:
         out |= held_out.captures_needed(rung.evaluation.residuals, rung.fit.jacobian)
     if rung.maps is not None:
-        out |= map_fits.captures_needed(
-            replicates, rung.maps.values, rung.maps.held, map_fits.light_levels_of(replicates, rung.evaluation)
+        out |= map_models.captures_needed(
+            replicates, rung.maps.values, rung.maps.held, count_model.light_levels_of(replicates, rung.evaluation)
         )
     return out
 
@@ -91,10 +92,10 @@ def _evaluation(replicates: Replicates, half: Replicates, rung: Rung, apart: Col
     if rung.maps is not None:
         all_ = copy.copy(half)
         all_.seen = {**{id: seen for id, seen in replicates.seen.items() if id not in apart}, **half.seen}
-        levels_of_whole = map_fits.light_levels_of(replicates, rung.evaluation)
+        levels_of_whole = count_model.light_levels_of(replicates, rung.evaluation)
         levels = {name: levels_of_whole[whole_of.get(name, name)] for name in all_.seen}
         phases = {(name, key): x for (id, key), x in rung.maps.phases.items() for name in (id, *halves_of(id))}
-        sensors, _, _ = map_fits.models_with_maps(all_, rung.maps.values, rung.maps.held, levels)
+        sensors, _, _ = map_models.models_with_maps(all_, rung.maps.values, rung.maps.held, levels)
         sensors = sensors.changed({}, phases, rung.maps.chips)
     return evaluate(half, rung.evaluation.values, sensors, max(half.number // _FEWER, _LEAST))
 

@@ -16,7 +16,8 @@ from .coordinates import Coordinate, Key, is_edge
 from .evaluation import Evaluation
 from .gauss_newton import Fit
 from .levels import COST_OF_A_NUMBER
-from .replicates import TOTALS, Cell, Model
+from .models import Model
+from .replicates import TOTALS, Cell
 from .signature import Signature
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad

@@ -23,8 +23,8 @@ from spadmnist.effects.print_contrast import PrintContrast
 from spadmnist.effects.print_tilt import PrintTilt
 from spadmnist.events import Layout
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.models import swinging
 from spadmnist.inference.named_fit import fit_named
-from spadmnist.inference.replicates import swinging
 from spadmnist.recording import Capture, Light
 from spadmnist.scene import Scene
 from spadmnist.sensor import Sensor

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from simple_sensor import one_of_each, stamped
 
 from spadmnist import kernels
-from spadmnist.inference.replicates import statistics_for
+from spadmnist.inference.reduction import statistics_for
 from spadmnist.recording import FirstStamps, Recording, StampedFrames
 from spadmnist.statistics._frames import add_pixels, first_stamps, frame_sums
 

@@ -1,0 +1,56 @@
+"""The other candidates of a step, with the misfit that each leaves; those that cannot be told from it are confused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from .evaluation import Evaluation, block_checks, failing, mean_misfit, square
+from .ranking import gain_against
+from .replicates import Replicates
+from .results import plain
+from .scan import Scan
+from .signature import residuals_at
+from .trial import Trial, at_end, tie
+
+_NAMED = 4  # alternatives of a step
+# of the gain of a shape at the end of its range: a candidate with as much is confused with it, because another law
+# may be the right one
+_ALMOST = 0.8
+
+
+def alternatives(
+    scan: Scan, evaluation: Evaluation, best: Trial, refined: Sequence[Trial], second: Sequence[Trial]
+) -> list[dict[str, Any]]:
+    """The other candidates with the misfit that each leaves, ties first, for the JSON data."""
+    out: list[dict[str, Any]] = []
+    for one in second:
+        if (
+            one is best
+            or one.candidate in best.candidates
+            or any(o["tried"].candidate.name == one.candidate.name for o in out)
+        ):
+            continue
+        with scan.if_possible(one.candidate, "comparing it with the best", wholly=False):
+            out.append(_alternative(scan.replicates, evaluation, best, one))
+    return sorted(out, key=lambda other: not other["confused"])[:_NAMED]
+
+
+def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, one: Trial) -> dict[str, Any]:
+    residuals = one.residuals or residuals_at(replicates, evaluation, one.signature, one.times, noisy=True)
+    judged, left = evaluation, residuals
+    if one.scatters and one.evaluation is not None:
+        judged, left = one.evaluation, one.evaluation.residuals
+    failed = failing(block_checks(replicates, judged, left))
+    most, gain = gain_against(best, one), gain_against(one, best)
+    if one.chips and judged is not evaluation:  # by the likelihood ratio a few odd pixels may gain little
+        gain = max(gain, square(evaluation.residuals) - square(residuals))
+    near = most - gain < tie(most) or (at_end(best) and gain > _ALMOST * most)
+    return {
+        "change": one.candidate.kind,
+        "effect": one.candidate.effect,
+        "parameter": one.candidate.parameter,
+        "misfit": plain(mean_misfit(evaluation.replicate_residuals, residuals)),
+        "confused": one.residuals is not None and near and not failed,
+        "tried": one,
+    }

@@ -1,0 +1,178 @@
+"""The diagnosis that a search ends with: verdict, steps, what remains unexplained, limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..effects import Mimic
+from .comparison import Comparison
+from .error_budget import Rung
+from .evaluation import BlockCheck, Evaluation, mean_misfit, misfit_null_95
+from .findings import nuisances, remainder, traces
+from .model_path import ModelPath
+from .results import Diagnosis, Step, Value, plain
+from .trial import Trial
+
+# as `upper_limits.upper_limits` returns them
+Limits = tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]
+
+
+@dataclass
+class Notes:
+    """What a diagnosis reports in addition to its steps.
+
+    Attributes:
+        setup: entries of the set-up.
+        explained: the set-up explains the totals that fail.
+        bent: a nonlinearity that no effect here has may explain them as well.
+        advice: captures that would separate explanations.
+        rival: a change of the sensor that is a tie with the set-up.
+        placebo: the row of the placebo.
+        tried: the last trials of the candidates.
+        looked: the evaluation under which they were tried in all captures.
+    """
+
+    setup: list[dict[str, Any]]
+    explained: bool = False
+    bent: bool = False
+    advice: list[dict[str, Any]] = field(default_factory=list)
+    rival: Trial | None = None
+    placebo: Rung | None = None
+    tried: list[Trial] = field(default_factory=list)
+    looked: Evaluation | None = None
+
+
+def left_over(path: ModelPath, notes: Notes) -> list[BlockCheck]:
+    """The checks that fail with all steps; none where these are totals that the set-up explains."""
+    left = path.failed
+    return [] if left and notes.explained and all(b.cell[0] == "" for b in left) else left
+
+
+def so_far(path: ModelPath, start: Evaluation, notes: Notes) -> Diagnosis:
+    """The diagnosis while the search goes on."""
+    verdict = verdict_of(path, left_over(path, notes), notes)
+    null_95 = misfit_null_95(path.ladder[0].evaluation.replicate_residuals)
+    found = answer(path, start, notes, verdict, path.ladder, null_95, ([], [], []), None)
+    found.steps = [replace(step, alternatives=[public(other) for other in step.alternatives]) for step in path.steps]
+    found.finished = False
+    found.untried = [*found.untried, not_done("further steps", "the search goes on")]
+    return found
+
+
+def _nearest(step: Step) -> dict[str, Any]:
+    """The entry of a step that explains too little of its own cells, as an alternative of what is unexplained."""
+    c = step.candidate
+    misfit = plain(step.misfit)
+    return {"change": c.kind, "effect": c.effect, "parameter": c.parameter, "misfit": misfit, "nearest": True}
+
+
+def public(alternative: dict[str, Any]) -> dict[str, Any]:
+    """An alternative as it stands in the JSON data, without what only the search needs."""
+    return {key: x for key, x in alternative.items() if key not in ("confused", "tried")}
+
+
+def not_done(where: str, why: str) -> dict[str, Any]:
+    """An entry of `not_tried` that is of no candidate."""
+    return {"change": None, "effect": None, "parameter": None, "where": where, "why": why}
+
+
+def answer(
+    path: ModelPath,
+    start: Evaluation,
+    notes: Notes,
+    verdict: str,
+    rungs: Sequence[Rung],
+    null_95: float,
+    limits: Limits,
+    in_sample: Comparison | None,
+) -> Diagnosis:
+    """The diagnosis.
+
+    Args:
+        start: the evaluation of the model without steps.
+        rungs: the rows of the table of steps.
+        null_95: 95 % of the misfits of a right model lie below.
+        limits: as `upper_limits.upper_limits` returns them.
+        in_sample: the comparison of the model with its steps; None where there is none.
+    """
+    replicates = path.replicates
+    remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
+    excluded, invisible, unlimited = limits
+    unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
+    if unexplained and verdict == "unexplained" and path.nearest:
+        unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]
+    return Diagnosis(
+        sensor=replicates.start.name,
+        measurement=replicates.measurement.name,
+        verdict=verdict,
+        before=rungs[0].misfit,
+        after=(path.ladder[-1] if path.steps else path.ladder[0]).misfit,
+        null_95=null_95,
+        nuisances=nuisances(replicates, path.evaluation),
+        steps=path.steps,
+        setup=notes.setup,
+        unexplained=unexplained,
+        ladder=[rung.row for rung in rungs],
+        advice=notes.advice,
+        excluded=excluded,
+        invisible=invisible,
+        unlimited=unlimited,
+        traces=traces(replicates, start, path.evaluation, path.steps),
+        values=path.values,
+        simulations=replicates.simulations,
+        dark=replicates.dark,
+        crop=str(replicates.start.window) if replicates.start.window else None,
+        untried=path.scan.untried,
+        in_sample=in_sample,
+        finished=path.finished,
+        shape=replicates.start.layout.shape,
+    )
+
+
+def verdict_of(path: ModelPath, left: Sequence[BlockCheck], notes: Notes) -> str:
+    """The verdict on the steps so far.
+
+    Args:
+        left: the checks that fail with them.
+    """
+    if notes.rival is not None:
+        return "confused"
+    if left:
+        return "partly_explained" if path.steps else "unexplained"
+    if path.steps:
+        return "explained"
+    if notes.bent:
+        return "confused"
+    return "setup" if notes.setup else "adequate"
+
+
+def too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
+    """The entries of captures that stopped early.
+
+    Args:
+        short: (share that was exposed, its standard deviation) by capture.
+    """
+    out = []
+    for id, (share, error) in short.items():
+        factor = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
+        out.append({"capture": id, "quantity": "exposure", "factor": factor, "confused": False})
+    return out
+
+
+def rival_step(path: ModelPath, rival: Trial) -> Step:
+    """A change of the sensor that explains the totals as well as the set-up does, as a step."""
+    coordinate = rival.candidate.strengths[0]
+    low, high = rival.intervals.get(coordinate.key, (None, None))
+    value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
+    left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
+    return Step(
+        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike"
+    )
+
+
+def outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
+    """A mimic as an alternative."""
+    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": mimic.what}

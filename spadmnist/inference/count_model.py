@@ -1,0 +1,92 @@
+"""Expected detections of each pixel in a capture, by the closed forms of the effects, for fits of maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..sensor import Sensor
+from .candidates import with_values
+from .coordinates import Key
+from .light_levels import in_frames
+from .models import InTheDark
+from .replicates import Replicates
+
+
+class CountModel:
+    """The expected detections of each pixel in one capture, for maps.
+
+    Of first stamps, they are those in the time that the pixel waited.
+    """
+
+    def __init__(self, replicates: Replicates, id: str, level: float):
+        self.seen, self.id, self.level = replicates.seen[id], id, level
+        self.conditions = self.seen.capture.conditions
+        self.waited = self.seen.waited
+        self.frames = not self.seen.capture.counts_events and self.waited is None
+
+    def expected(self, sensor: Sensor) -> np.ndarray:
+        """The expected detections of each pixel, (pixels,)."""
+        if self.seen.capture.light.dark:
+            sensor = InTheDark.of(sensor)
+        light = np.full((1, sensor.layout.pixels), self.level)
+        if self.seen.capture.counts_events:
+            return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
+        share = in_frames(sensor, light, self.conditions)[0]
+        if self.waited is None:
+            return np.maximum(self.conditions.frames * share, 1e-9)
+        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-15)), 1e-9))
+
+    def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
+        """The log-likelihood of the measured counts, (pixels,), up to a constant.
+
+        Args:
+            expected: (pixels,) detections.
+        """
+        counts = self.seen.counts
+        assert counts is not None
+        if not self.frames:
+            return np.asarray(counts * np.log(expected) - expected)
+        share = np.clip(expected / self.conditions.frames, 1e-12, 1 - 1e-9)
+        return np.asarray(counts * np.log(share) + (self.conditions.frames - counts) * np.log1p(-share))
+
+    def saturated(self, counts: np.ndarray) -> bool:
+        """Whether half of the pixels have a detection in nearly every frame.
+
+        Args:
+            counts: (pixels,) detections.
+        """
+        return self.frames and float(np.median(counts)) > 0.9 * self.conditions.frames
+
+    def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
+        """The variance of the counts, (pixels,).
+
+        Args:
+            n: (pixels,) expected detections.
+            dead: dead time, s.
+        """
+        if self.waited is not None:
+            return np.maximum(n, 0.25)
+        if self.frames:
+            return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), 0.25)
+        return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)
+
+
+def expected_counts(replicates: Replicates, id: str, evaluation: Any, values: Mapping[Key, Any]) -> np.ndarray:
+    """The expected counts of each pixel in a capture with some values changed, (pixels,).
+
+    Of first stamps, in the time that each pixel waited: so they are proportional to the light, too.
+
+    Args:
+        values: by (effect, parameter), SI.
+    """
+    return CountModel(replicates, id, evaluation.rates[id].level).expected(
+        with_values(evaluation.sensors.usual(id), values)
+    )
+
+
+def light_levels_of(replicates: Replicates, evaluation: Any) -> dict[str, float]:
+    """The level of each capture; in the dark 1, for the rates as they are."""
+    return {id: 1.0 if s.capture.light.dark else evaluation.rates[id].level for id, s in replicates.seen.items()}

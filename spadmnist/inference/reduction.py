@@ -1,0 +1,91 @@
+"""Reduction of a recording: its total, the counts of its pixels, and its summaries by every statistic that applies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .. import plugins
+from ..recording import Capture, Recording
+from ..statistics import Statistic, Summary
+from .blind_times import ShortestIntervals
+
+
+def halves_of(id: str) -> tuple[str, str]:
+    """The names of the two halves of a capture (`Replicates.halves`)."""
+    return f"{id}, odd blocks", f"{id}, even blocks"
+
+
+@dataclass(frozen=True)
+class ReducedCapture:
+    """A measured capture, reduced: its total, the counts of its pixels, its summaries.
+
+    Attributes:
+        total: detections of the whole array.
+        counts: (pixels,) detections; None where the mean alone is known.
+        summaries: by statistic.
+        last: the last detection that has a stamp of its own, s.
+        waited: (pixels,) of first stamps, the time before them, in frames.
+        shortest: the shortest intervals, of time stamps.
+        half_of: (the whole capture, whether this is its second, fourth, ... block of time); None where it is no half.
+    """
+
+    capture: Capture
+    total: float
+    counts: np.ndarray | None
+    summaries: Mapping[str, Summary]
+    last: float | None = None
+    waited: np.ndarray | None = None
+    shortest: ShortestIntervals | None = None
+    half_of: tuple[Capture, bool] | None = None
+
+    @classmethod
+    def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
+        """The reduction of a recording.
+
+        Args:
+            reduced: with its statistics; without them only the counts are there.
+        """
+        summaries = {}
+        for statistic in statistics_for(recording.capture) if reduced else ():
+            summary = reduce_with(statistic, recording)
+            if summary is not None:
+                summaries[statistic.name] = summary.apart()
+        counts = np.asarray(recording.totals, float)
+        last = None
+        if recording.events is not None and len(recording.events):
+            stamps, unit = recording.events.stamps
+            last = float(stamps.max() * unit)
+        waited = None if recording.waited is None else recording.waited[0]
+        shortest = ShortestIntervals.of(recording)
+        capture = replace(recording.capture, tick=recording.tick)
+        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest)
+
+
+def statistics_for(capture: Capture) -> list[Statistic]:
+    """Every registered statistic that applies to a capture: by its modality, and by its light."""
+    kinds = [Statistic.registry.find(name) for name in Statistic.registry]
+    scene = capture.light.scene is not None
+    return [kind() for kind in kinds if capture.modality in kind.modalities and not (kind.flat and scene)]
+
+
+def own_statistics() -> list[type[Statistic]]:
+    """The statistics of a notebook or of modules of the user's, which stand neither here nor in a plug-in file."""
+    known = (Statistic.registry.find(name) for name in Statistic.registry)
+    return [cls for cls in known if plugins.is_own(cls)]
+
+
+def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
+    """The summary of a recording by a statistic; None where it does not apply.
+
+    Raises:
+        SpadError: where a user's own statistic fails; it names the file and line.
+    """
+    try:
+        return statistic.reduce(recording)
+    except Exception as error:
+        if plugins.is_built_in(type(statistic)):
+            raise
+        raise plugins.blame(statistic, error) from error
