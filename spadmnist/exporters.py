@@ -44,13 +44,14 @@ def facts(recording: Recording) -> dict[str, float | int]:
 class Target:
     """Writes one kind of file.
 
-    name: what `--format` calls it; suffix: of its files; modalities: what it can hold; again: what an import of it must
-    be told, since the file does not say it.
+    name: what `--format` calls it; suffix: of its files; opened_by: in Python; modalities: what it holds; again: what
+    an import of it must be told, since the file does not say it.
     """
 
     every: ClassVar[dict[str, type[Target]]] = {}
     name: ClassVar[str]
     suffix: ClassVar[str]
+    opened_by: ClassVar[str]
     modalities: ClassVar[tuple[str, ...]] = ("tr", "str", "qis", "counts")
 
     def __init_subclass__(cls) -> None:
@@ -125,6 +126,7 @@ class PlainHdf5(Target):
 
     name = "hdf5"
     suffix = ".h5"
+    opened_by = "h5py.File(FILE)"
 
     @classmethod
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
@@ -137,6 +139,7 @@ class Npz(Target):
 
     name = "npz"
     suffix = ".npz"
+    opened_by = "numpy.load(FILE)"
 
     @classmethod
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
@@ -175,6 +178,7 @@ class Npy(Target):
 
     name = "npy"
     suffix = ".npy"
+    opened_by = "numpy.load(FILE)"
     modalities = ("qis", "str", "counts")
 
     @classmethod
@@ -203,6 +207,7 @@ class PhotonHdf5(Target):
 
     name = "photon-hdf5"
     suffix = ".hdf5"
+    opened_by = "h5py.File(FILE)"
     modalities = ("tr",)
 
     @classmethod

@@ -192,6 +192,7 @@ class ImageTarget:
     every: ClassVar[dict[str, type[ImageTarget]]] = {}
     name: ClassVar[str]
     suffix: ClassVar[str]
+    opened_by: ClassVar[str]  # in Python
 
     def __init_subclass__(cls) -> None:
         ImageTarget.every[cls.name] = cls
@@ -270,6 +271,7 @@ class Npz(ImageTarget):
 
     name = "npz"
     suffix = ".npz"
+    opened_by = "numpy.load(FILE)"
 
     @classmethod
     def put(cls, found: Chosen, block: Block, file: IO[bytes]) -> None:
@@ -318,6 +320,7 @@ class WebDataset(ImageTarget):
 
     name = "webdataset"
     suffix = ".tar"
+    opened_by = "webdataset.WebDataset(FILE)"
 
     @classmethod
     def put(cls, found: Chosen, block: Block, file: IO[bytes]) -> None:
@@ -355,6 +358,7 @@ class Png(ImageTarget):
 
     name = "png"
     suffix = ".png"
+    opened_by = "PIL.Image.open(FILE)"
 
     @classmethod
     def check(cls, found: Chosen) -> None:
@@ -404,6 +408,7 @@ class Parquet(ImageTarget):
 
     name = "parquet"
     suffix = ".parquet"
+    opened_by = "polars.read_parquet(FILE)"
 
     @classmethod
     def check(cls, found: Chosen) -> None:

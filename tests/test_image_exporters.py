@@ -101,6 +101,17 @@ def test_npz(out: Path, tmp_path: Path) -> None:
         assert held["tick"] == 1e-11 and held["frames"] == 102 and held["exposure"] == 1020e-6
 
 
+def test_many_files_are_named_by_level_and_split(out: Path, tmp_path: Path) -> None:
+    """A program that wants each of them asks for JSON."""
+    done = run("export", out, "-o", tmp_path / "png", "--format", "png")
+    lines, number = done.stdout.splitlines(), len(list((tmp_path / "png").rglob("*.png")))
+    assert number > 20 and len(lines) == 4 and "PIL.Image.open(FILE)" in done.stderr
+    assert sum(int(line.split(": ")[1].split()[0]) for line in lines) == number
+    assert all((tmp_path / "png" / line.split(": ")[0]).is_dir() for line in lines)
+    again = run("export", out, "-o", tmp_path / "again", "--format", "png", "--json")
+    assert len(json.loads(again.stdout)["files"]) == number
+
+
 def test_one_npz(out: Path, tmp_path: Path) -> None:
     """A file holds one level and split; the same images are the same bytes."""
     for name in ("a.npz", "b.npz"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -261,11 +263,13 @@ def export(
             raise SpadError("--readout: png holds flux images alone; leave it out, or take npz, parquet or webdataset")
         with terminal.progress() as progress:
             paths = image_exporters.export(dataset, output, format_, choice, progress)
+        kind: Any = image_exporters.ImageTarget.every[format_]
     else:
         _check_captures(dataset, format_, choice)
         opened = library.open(dataset, readouts[0] if readouts else None)
         with terminal.progress() as progress:
             paths = exporters.export(opened, output, format_, ids, progress)
+        kind = exporters.Target.every[format_]
         if opened.layout.positions is not None:
             terminal.say(
                 "Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv."
@@ -278,8 +282,21 @@ def export(
     if as_json:
         terminal.print_json({"files": [str(path) for path in paths]})
         return
-    for path in paths:
-        terminal.print_line(str(path))
+    for line in _by_folder(paths, output):
+        terminal.print_line(line)
+    terminal.say(f"Made: {output}. In Python:  {kind.opened_by}")
+
+
+_LISTED = 20  # files that are named one by one; of more, a line for each level and split
+
+
+def _by_folder(paths: Sequence[Path], out: Path) -> Iterator[str]:
+    """The lines that name files; of many, the level and split, and how many lie there."""
+    if len(paths) <= _LISTED:
+        yield from map(str, paths)
+        return
+    for parts, number in Counter(path.relative_to(out).parts[:2] for path in paths).items():
+        yield f"{out.joinpath(*parts)}: {number:,} files" if number > 1 else str(out.joinpath(*parts))
 
 
 def _check_captures(source: Path, format_: str, choice: Any) -> None:
