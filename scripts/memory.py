@@ -3,6 +3,7 @@
     python scripts/memory.py                    # all kinds, about 400 MB each: half an hour, 3 GB of disk
     python scripts/memory.py "*.h5" a.ptu       # some
     python scripts/memory.py --size 100         # MB
+    python scripts/memory.py --inference 99000000       # compare, diagnose and fit of a capture with so many stamps
 
 Each file is made in a temporary folder, and is gone before the next one is made. The table goes to standard output:
 the peak resident memory of each verb's largest process, in MB (of `compare` that of all its processes together, shared
@@ -335,17 +336,64 @@ def measured(name: str, kind: Kind, size: int, place: Path, compare: tuple[float
     return row
 
 
+# --- inference ----------------------------------------------------------------------------------------------------
+
+LIT = """format: spadmnist-measurement/1
+name: large
+layout: {rows: 8, columns: 8}
+captures:
+  - {id: lit, modality: tr, light: {kind: flat, wavelength: 500 nm, irradiance: %g nW/cm^2}, exposure: 4 s}
+"""
+EACH = 404.4  # nW/cm^2 on 25 um^2 with a PDP of 50 % at 500 nm, by which a pixel has 1e6 detections in 4 s
+
+
+def inference(count: int, jobs: int, place: Path, within: str) -> dict[str, tuple[str, float]]:
+    """(peak, seconds) of each verb on time stamps of a sensor that has afterpulsing, which the model lacks.
+
+    Args:
+        count: detections of the capture, about.
+        within: the budget of diagnose.
+    """
+    model, truth, plan, lab = (place / name for name in ("sensor.yaml", "truth.yaml", "plan.yaml", "lab"))
+    text = SENSOR % _TR
+    model.write_text(text)
+    truth.write_text(text + "    afterpulsing: {probability: 1 %, lifetime: 60 ns}\n")
+    plan.write_text(LIT % (EACH * count / PIXELS / 1e6))
+    peaks = {}
+    for name, arguments, ok in (
+        ("simulate", ["simulate", str(truth), str(plan), "-o", str(lab)], (0,)),
+        ("compare", ["compare", str(model), str(lab), "--jobs", str(jobs)], (0, 1)),
+        ("fit", ["fit", str(model), str(lab), "--add", "afterpulsing", "--jobs", str(jobs)], (0, 1)),
+        (
+            f"diagnose --quick --within {within}",
+            ["diagnose", str(model), str(lab), "--quick", "--within", within, "--jobs", str(jobs)],
+            (0, 1),
+        ),
+    ):
+        began = time.monotonic()
+        peaks[name] = peak(arguments, place, 3600.0, ok), time.monotonic() - began
+    return peaks
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=["*"], help=f"which of {', '.join(KINDS)}")
     parser.add_argument("--size", type=int, default=380, help="MiB of a file, about")
     parser.add_argument("--compare", type=float, default=0.0, metavar="SECONDS", help="compare, too, for so long")
-    parser.add_argument("--jobs", type=int, default=1, help="of compare")
+    parser.add_argument("--jobs", type=int, default=1, help="of compare, diagnose and fit")
+    parser.add_argument("--inference", type=int, metavar="N", help="measure it alone, on a capture of so many stamps")
+    parser.add_argument("--within", default="10min", help="the budget of its diagnose")
     parser.add_argument("--make", action="store_true", help=argparse.SUPPRESS)
     said = parser.parse_args()
     if said.make:
         name, path = said.names
         KINDS[name].make(Path(path), said.size << 20)
+        return
+    if said.inference:
+        print("| verb | seconds | peak |\n| --- | --- | --- |", flush=True)
+        with tempfile.TemporaryDirectory(prefix="memory-") as place:
+            for verb, (most, seconds) in inference(said.inference, said.jobs, Path(place), said.within).items():
+                print(f"| {verb} | {seconds:,.0f} | {most} |", flush=True)
         return
     columns = ["file", "import", "inspect", "reconstruct", *dict.fromkeys((*_STAMPS, *_FRAMES)), "compare"]
     print("| " + " | ".join(columns) + " |\n|" + " --- |" * len(columns), flush=True)

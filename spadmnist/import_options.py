@@ -69,7 +69,7 @@ class Said:
     """What the user says of the files, in SI. None where nothing was said: then the file is asked."""
 
     relative_uncertainty: float | None = _option(
-        f"Standard uncertainty of the light's calibration: 1.5 %.  [default: {UNCERTAIN:.0%}]",
+        f"Standard uncertainty of the light's calibration: 1.5 %.  [default: {100 * UNCERTAIN:.0f} %]",
         unit="",
         metavar="SHARE",
     )

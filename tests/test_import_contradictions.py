@@ -116,7 +116,7 @@ def test_lux_without_a_wavelength_are_green(tmp_path: Path) -> None:
 def test_a_level_without_an_uncertainty_is_good_to_5_percent(tmp_path: Path) -> None:
     made = run(stamps(tmp_path / "a.npz", wavelength=500e-9, irradiance=1e-3), Said(), [])
     assert made.captures[0].light.relative_uncertainty == 0.05
-    assert any("as good to 5.0%" in note for note in made.notes)
+    assert any("as good to 5.0 %" in note for note in made.notes)
 
 
 @pytest.mark.parametrize(

@@ -364,7 +364,7 @@ def test_a_simulation_to_a_folder_is_the_one_in_memory_and_its_progress_is_told(
     made = sp.simulate(sensor(), FLAT, 3, folder=tmp_path / "twin", crop="0:1,0:2", progress=said.append)
     assert made.folder == tmp_path / "twin" and made.layout.shape == (1, 2)
     assert np.array_equal(made["flat"].frames, sp.simulate(sensor(), [FLAT], 3, crop=part)["flat"].frames)
-    assert said[-1] == "flat: 100%" and len(set(said)) == len(said)
+    assert said[-1] == "flat: 100 %" and len(set(said)) == len(said)
 
 
 # ---- a diagnosis that is kept -----------------------------------------------------------------------------

@@ -88,7 +88,7 @@ def answer_of(**options: Any) -> Diagnosis:
                 {"probability": Value(0.0051, 0.0047, 0.0055), "delay": Value(1.12e-9, 9e-10, 1.4e-9, "s")},
                 11.2,
                 35.2,
-                "mean rate +2.20%",
+                "mean rate +2.20 %",
                 [other("add", "source_noise", None, 41.3), other("set", "dead_time", "duration", 58.4)],
             ),
             Step(
@@ -96,11 +96,11 @@ def answer_of(**options: Any) -> Diagnosis:
                 {"sigma": Value(0.0313, 0.0262, 0.0364), "low_ratio": Value(1.0, None, None)},
                 4.1,
                 18.0,
-                "mean rate +0.01%",
+                "mean rate +0.01 %",
                 [other("per_pixel", "dark_counts", "rate", 7.7)],
             ),
             Step(
-                change_of("set", "dead_time", "paralyzable"), {"paralyzable": Value(1.0, None, None)}, 1.04, 9.1, "+1%"
+                change_of("set", "dead_time", "paralyzable"), {"paralyzable": Value(1.0, None, None)}, 1.04, 9.1, "+1 %"
             ),
         ],
         "setup": [
@@ -191,7 +191,7 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
             "The placebo is",
         ),
         "What is missing": (
-            "1. crosstalk an effect that the model lacks · 35.2 sigma · mean rate +2.20%",
+            "1. crosstalk an effect that the model lacks · 35.2 sigma · mean rate +2.20 %",
             "misfit on held-out data with it 11.2",
             Effect.registry.find("crosstalk").summary(),
             "probability probability that an avalanche fires one given side neighbour 0.0051 0.0047 to 0.0055",
@@ -294,14 +294,14 @@ def test_where_the_totals_alone_were_wrong_their_error_falls(tmp_path: Path) -> 
 def test_what_would_look_the_same_is_said(tmp_path: Path) -> None:
     said = "But: a dead time that differs from event to event"
     for name, there in (("jitter", True), ("crosstalk", False)):
-        step = Step(change_of("add", name), {}, 1.0, 8.0, "mean rate +0%")
+        step = Step(change_of("add", name), {}, 1.0, 8.0, "mean rate +0 %")
         found = answer_of(steps=[step])
         assert (said in table(found)) == there
         assert (said in written(found, tmp_path)[1].text) == there
 
 
 def test_the_effect_of_a_plug_in_that_is_not_at_hand(tmp_path: Path) -> None:
-    step = Step(change_of("add", "of_a_plug_in"), {"strength": Value(0.25, 0.2, 0.3)}, 1.0, 8.0, "mean rate +1%")
+    step = Step(change_of("add", "of_a_plug_in"), {"strength": Value(0.25, 0.2, 0.3)}, 1.0, 8.0, "mean rate +1 %")
     limits = [{"effect": "of_a_plug_in", "parameter": "strength", "upper_limit_95": 0.5}]
     text, _ = written(answer_of(steps=[step], excluded=limits, invisible=[{"effect": "of_a_plug_in"}]), tmp_path)
     assert "1. of_a_plug_in an effect" in spoken(text) and "strength 0.25 0.2 to 0.3" in spoken(text)

@@ -428,7 +428,7 @@ def _light(path: Path, found: Found, notes: list[str]) -> Light | None:
 def _uncertain_note(path: Path | None, share: float) -> str:
     where = "" if path is None else f"{path}: "
     return (
-        f"{where}the light's level is taken as good to {share:.1%} (one standard deviation); give "
+        f"{where}the light's level is taken as good to {100 * share:.1f} % (one standard deviation); give "
         "--relative-uncertainty where you know better"
     )
 

@@ -292,7 +292,7 @@ def _between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], c
         p_cell = min(1.0, 2 * z.size * float(stats.norm.sf(abs(float(z[worst])))))
         place = f"row {worst // columns}, column {worst % columns}"
         names = " over ".join(units.show(wave, "m") for wave in (long, short))
-        size = f"{float(difference[worst]):+.2%} in the worst pixel"
+        size = f"{100 * float(difference[worst]):+.2f} % in the worst pixel"
         p = min(1.0, 2 * min(p_sum, p_cell))
         out.append(Check("wavelength_ratio", None, square, p, f"{place}, {names}", size, float(difference[worst])))
     return out
@@ -360,7 +360,7 @@ def light_of(
             pull**2,
             float(2 * stats.norm.sf(abs(pull))),
             "all lit captures",
-            f"light {math.expm1(own):+.2%} of what is stated, uncertain by {common:.2%}",
+            f"light {100 * math.expm1(own):+.2f} % of what is stated, uncertain by {100 * common:.2f} %",
             math.expm1(own),
         )
     ]
@@ -382,7 +382,7 @@ def light_of(
                 )
             )
         change = math.expm1((log - mean) * elasticity)
-        size = f"{change:+.2%} detections relative to the other captures"
+        size = f"{100 * change:+.2f} % detections relative to the other captures"
         checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))
     return nuisances, checks
 
@@ -461,7 +461,7 @@ def table(comparison: Comparison) -> str:
     about = (
         f"Misfit {comparison.misfit:.4g} (1: the model's own scatter; 95 % of its recordings stay below "
         f"{comparison.misfit_null_95:.4g}); {comparison.replicates} simulations of each capture; a right model is "
-        f"called wrong in {comparison.false_alarm_rate:.0%} of comparisons."
+        f"called wrong in {100 * comparison.false_alarm_rate:.0f} % of comparisons."
     )
     lines += textwrap.wrap(about, 100)
     for n in comparison.nuisances:

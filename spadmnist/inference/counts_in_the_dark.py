@@ -136,7 +136,9 @@ def _answer(
     right = "explained" if start.misfit > likely else "adequate"
     mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
-    step = Step(candidate, results, found.misfit, _clear(start.misfit, free), f"mean of the map {mean - 1:+.2%}")
+    step = Step(
+        candidate, results, found.misfit, _clear(start.misfit, free), f"mean of the map {100 * (mean - 1):+.2f} %"
+    )
     step.map = map_
     return Diagnosis(
         replicates.start.name,

@@ -371,7 +371,7 @@ def _model(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
 def material(one: Trial) -> str:
     """The change of the mean rate by a candidate, as text."""
     logs = list(one.signature.at(one.times).logs.values())
-    return f"mean rate {math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2%}"
+    return f"mean rate {100 * math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2f} %"
 
 
 def sharpen(path: ModelPath, measurement: Measurement) -> None:

@@ -330,7 +330,7 @@ def _bar(told: Told | None) -> Progress:
     def advance(work: float, note: str) -> None:
         nonlocal done, last
         done += work
-        line = f"{note}: {min(done / whole, 1):.0%}"
+        line = f"{note}: {100 * min(done / whole, 1):.0f} %"
         if line != last:
             told(line)
         last = line
