@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import itertools
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import config, disk, document, units
+from . import config, disk, document, units, yaml_edit
 from .effects import Effect
 from .errors import InputError, SpadError
 from .foreign import quoted, visible
@@ -97,9 +96,9 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = Fal
         told = {name: value(effect, name, declared) for name, declared in effect.parameters.items()}
         effects_[effect.name] = {name: x for name, x in told.items() if x is not None}
     head = {"name": sensor.name, "rules": sensor.rules, "chip_seed": int(sensor.chip_seed), "layout": layout}
-    text = document.dump({"sensor": {**head, "effects": effects_}})
-    for (name, _), note in (notes or {}).items():
-        text = re.sub(rf"(?m)^(    {name}:)( *)$", rf"\g<1>  # {note}", text, count=1)
+    edit = yaml_edit.Edit(document.dump({"sensor": {**head, "effects": effects_}}), str(out))
+    for (name, parameter), note in (notes or {}).items():
+        edit.note(("sensor", "effects", name, parameter), note)
     with disk.writing(out.parent, 0):
         out.parent.mkdir(parents=True, exist_ok=True)
     for file, array in maps.items():
@@ -108,7 +107,7 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = Fal
         disk.put_file(out.parent / file, held.getvalue())
     if at.positions is not None:
         disk.put_file(out.parent / layout["positions"], positions_text(at.positions).encode())
-    disk.put_file(out, _headed(text, out).encode())
+    disk.put_file(out, _headed(edit.text(), out).encode())
     config.read_sensor(out)
     return out
 
@@ -144,10 +143,11 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     source = _described_in(source)
-    text = source.read_text(encoding="utf-8-sig")
     chip = config.read_sensor(source)
-    shape = chip.layout.shape
-    written: dict[Key, str] = {}
+    edit = yaml_edit.Edit(source.read_bytes().decode("utf-8-sig"), str(source))
+    before, after = source.parent.resolve(), out.parent.resolve()
+    edit.map_texts({"file", "positions"}, lambda name: os.path.relpath(before / name, after))
+    head = ("sensor", "effects") if "sensor" in edit.value else ("effects",)
     for (effect, parameter), value in values.items():
         declared = Effect.registry.find(effect).parameters[parameter]
         if isinstance(value, np.ndarray):
@@ -156,41 +156,40 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
             # with the file's own name, lest it takes the place of a map that another sensor beside it has
             name = f"{out.stem}.{effect}.{parameter}.npy"
             map_ = io.BytesIO()
-            np.save(map_, value.reshape(shape) if declared.per_pixel else value)
+            np.save(map_, value.reshape(chip.layout.shape) if declared.per_pixel else value)
             disk.put_file(out.parent / name, map_.getvalue())
-            written[effect, parameter] = f"{{file: {name}}}"
+            written: Any = {"file": name}
         elif isinstance(value, bool):
-            written[effect, parameter] = "true" if value else "false"
+            written = value
         elif isinstance(value, ByWavelength):
             entries = zip(value.wavelengths, value.values, strict=True)
-            told = ", ".join(f"{units.show(at, 'm', 9)}: {_number(declared, x)}" for at, x in entries)
-            written[effect, parameter] = f"{{{told}}}"
+            written = {units.show(at, "m", 9): _number(declared, x) for at, x in entries}
         else:
-            written[effect, parameter] = _number(declared, value)
-    text = _moved_files(text, source.parent, out.parent)
+            written = _number(declared, value)
+        edit.set((*head, effect, parameter), written)
+    for (effect, parameter), note in notes.items():
+        edit.note((*head, effect, parameter), note)
+    disk.put_file(out, _headed(edit.text(), out).encode())
     try:
-        new = _headed(_edited(text, written, notes), out)
-        disk.put_file(out, new.encode())
         config.read_sensor(out)
-    except (SpadError, ValueError):
-        # a file written in another way: its contents, without its comments
-        disk.put_file(out, _headed(_dumped(text, written), out).encode())
-        try:
-            config.read_sensor(out)
-        except SpadError:
-            out.unlink()
-            raise
+    except SpadError:
+        out.unlink()
+        raise
     return out
 
 
-def _number(declared: Parameter, value: float) -> str:
-    return units.show(float(value), declared.unit, 6) if declared.unit else f"{float(value):.6g}"
+def _number(declared: Parameter, value: float) -> str | float:
+    if declared.unit:
+        return units.show(float(value), declared.unit, 6)
+    rounded = float(f"{float(value):.6g}")
+    return int(rounded) if rounded.is_integer() and abs(rounded) < 1e6 else rounded
 
 
 def _headed(text: str, out: Path) -> str:
     """The text with the first line of such files, and a comment for each effect that comes from a plug-in."""
-    lines = text.splitlines()
-    if lines[:1] == [_OURS]:  # with the comments of an earlier file
+    end = "\r" if text.partition("\n")[0].endswith("\r") else ""
+    lines = text.removesuffix("\n").split("\n")
+    if lines[0].rstrip() == _OURS:  # with the comments of an earlier file
         lines = list(itertools.dropwhile(lambda line: line.startswith(_ITS_EFFECT), lines[1:]))
     read = document.parse(text, str(out)).value
     names = read.get("sensor", read).get("effects") or {}
@@ -198,7 +197,7 @@ def _headed(text: str, out: Path) -> str:
     files = " ".join(f"--plugin {quoted(file)}" for file in dict.fromkeys(file for file, _ in own.values()))
     command = f"spadmnist compare {quoted(out)} MEASUREMENT {files}"
     needs = [f"{_ITS_EFFECT} {name} {where}. The command with it: {command}" for name, (_, where) in own.items()]
-    return "\n".join([_OURS, *needs, *lines]) + "\n"
+    return "\n".join([*(line + end for line in (_OURS, *needs)), *lines]) + "\n"
 
 
 def _own_file(cls: type[Effect]) -> tuple[str, str] | None:
@@ -210,88 +209,3 @@ def _own_file(cls: type[Effect]) -> tuple[str, str] | None:
     if cls.__module__ == "__main__":
         return f"{cls.name}.py", f"was defined in no file: put its class into one, {cls.name}.py"
     return None
-
-
-def _moved_files(text: str, before: Path, after: Path) -> str:
-    """Files that the sensor names, as they are reached from its new place."""
-
-    def moved(match: re.Match[str]) -> str:
-        name = match.group(2).strip().strip("\"'")
-        if not name or Path(name).is_absolute():
-            return match.group(0)
-        return f"{match.group(1)}{os.path.relpath(before.resolve() / name, after.resolve())}"
-
-    return re.sub(r"(\b(?:file|positions):\s*)([^,}\s#]+)", moved, text)
-
-
-def _edited(text: str, written: Mapping[Key, str], notes: Notes) -> str:
-    read = document.parse(text, "sensor")
-    sensor = read.value.get("sensor", read.value)
-    head = ("sensor",) if "sensor" in read.value else ()
-    known = sensor.get("effects") or {}
-    lines = text.rstrip("\n").split("\n")
-    by_effect: dict[str, dict[str, str]] = {}
-    for (effect, parameter), value in written.items():
-        by_effect.setdefault(effect, {})[parameter] = value
-    added: list[tuple[int, str]] = []  # behind which line, what
-    at = read.lines[(*head, "effects")] - 1
-    entries = [read.lines[(*head, "effects", name)] - 1 for name in known]
-    depth = _indent(lines[entries[0]]) if entries else _indent(lines[at]) + 2
-    end = max([at, *(n - 1 for path, n in read.lines.items() if path[: len(head) + 1] == (*head, "effects"))])
-    for effect, parameters in by_effect.items():
-        comment = "; ".join(dict.fromkeys(notes[effect, p] for p in parameters if (effect, p) in notes))
-        tail = f"  # {comment}" if comment else ""
-        if effect not in known:
-            body = ", ".join(f"{name}: {value}" for name, value in parameters.items())
-            added.append((end, f"{' ' * depth}{effect}: {{{body}}}{tail}"))
-            continue
-        place = read.lines[(*head, "effects", effect)] - 1
-        own = known[effect] or {}
-        if "{" in lines[place]:
-            lines[place] = _in_flow(lines[place], parameters, tail)
-            continue
-        inner = [read.lines[(*head, "effects", effect, name)] - 1 for name in own]
-        last = max(
-            [place, *(n - 1 for path, n in read.lines.items() if path[: len(head) + 2] == (*head, "effects", effect))]
-        )
-        for name, value in parameters.items():
-            path = (*head, "effects", effect, name)
-            if name in own and not isinstance(own[name], (dict, list)):
-                line = read.lines[path] - 1
-                lines[line] = re.sub(r"(:\s*)[^#]*?(\s*(#.*)?)$", rf"\g<1>{value}", lines[line]) + tail
-            elif name in own:
-                raise ValueError("a value over several lines")
-            else:
-                inner_depth = _indent(lines[inner[0]]) if inner else depth + 2
-                added.append((last, f"{' ' * inner_depth}{name}: {value}{tail}"))
-    for behind, more in sorted(added, key=lambda a: -a[0]):
-        lines.insert(behind + 1, more)
-    return "\n".join(lines) + "\n"
-
-
-def _in_flow(line: str, parameters: Mapping[str, str], tail: str) -> str:
-    """`effect: {a: 1, b: 2}` on one line."""
-    close = line.rindex("}")
-    body, rest = line[:close], line[close:]
-    for name, value in parameters.items():
-        pattern = rf"(\b{re.escape(name)}:\s*)(\{{[^{{}}]*\}}|[^,{{}}]+)"
-        if re.search(pattern, body):
-            body = re.sub(pattern, lambda m, value=value: m.group(1) + value, body, count=1)  # type: ignore[misc]
-        else:
-            body += ("" if body.rstrip().endswith("{") else ", ") + f"{name}: {value}"
-    return body + rest + tail
-
-
-def _indent(line: str) -> int:
-    return len(line) - len(line.lstrip(" "))
-
-
-def _dumped(text: str, written: Mapping[Key, str]) -> str:
-    read = document.parse(text, "sensor").value
-    sensor = read.get("sensor", read)
-    for (effect, parameter), value in written.items():
-        effects = sensor.setdefault("effects", {})
-        own = effects.get(effect)
-        effects[effect] = own = dict(own or {})
-        own[parameter] = document.parse(f"x: {value}", "value").value["x"]
-    return document.dump({"sensor": sensor})

@@ -28,7 +28,7 @@ LAYERS = [
     {"disk", "kernels", "large", "sources", "workers"},
     {"archive"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
-    {"validated", "scene", "zipped", "by_value"},
+    {"validated", "scene", "zipped", "by_value", "yaml_edit"},
     {"effects", "readout", "remote", "images", "pictures", "positions", "window"},
     {"gather", "grids", "recording"},
     {"reconstruct", "sensor", "statistics", "capture_files"},

@@ -74,6 +74,24 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
     assert "# measured" in out.read_text() and "scene" not in out.read_text()
 
 
+def test_the_user_s_own_lines_stay_and_the_maps_are_reached_from_the_new_place(tmp_path: Path) -> None:
+    """Quotes, blanks and ends of lines are the user's; the name of a map may have blanks, signs and quotes."""
+    file = sensor_in(tmp_path, 2, 3)
+    np.save(tmp_path / "the dcr, of 300 K.npy", np.arange(1.0, 7.0))
+    text = file.read_text().replace("{rate: 100 Hz}", "{ rate: {file:  'the dcr, of 300 K.npy'} }   # measured")
+    text = text.replace("  rules: device", "  rules:   'device'  # as on the data sheet\n\n  # its size")
+    file.write_bytes(text.replace("\n", "\r\n").encode())
+    key = ("crosstalk", "probability")
+    out = sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: 0.005}, {key: "from lab"})
+    assert np.array_equal(config.read_sensor(out).resolved().effect("dark_counts").rate, np.arange(1.0, 7.0))
+    first, *lines = out.read_bytes().decode().split("\r\n")
+    assert first.startswith("# Written by")
+    map_ = "{rate: {file: '../the dcr, of 300 K.npy'}}"
+    text = text.replace("{ rate: {file:  'the dcr, of 300 K.npy'} }", map_)
+    added = "    crosstalk: {probability: 0.005}  # from lab\n"
+    assert lines == (text + added).split("\n")
+
+
 def test_codes_of_each_pixel_are_written_as_they_are(tmp_path: Path) -> None:
     file, widths = sensor_in(tmp_path, 2, 2), np.linspace(0.9, 1.1, 16).reshape(4, 4)
     key = OF_KIND["code"]
