@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -78,7 +79,7 @@ class Shard:
 
         files: of each shard, by its place, as `files_by_shard` gives them, where they are known.
         """
-        n, pixels, columns = self.stop - self.start, int(np.prod(like.shape)), like.shape[-1]
+        n, pixels, columns = self.stop - self.start, math.prod(like.shape), like.shape[-1]
         bits = {"frames": like.frames, "columns": columns, "lines_per_image": pixels // columns}
         stamps = {"tick_s": like.tick} if like.tick > 0 else {}
         sizes = {"image": n, "event_start": n + 1, "first_event_start": n + 1, "line": n * (pixels // columns)}

@@ -195,7 +195,7 @@ def _described(
 
 
 def _record_path(root: Path, shard: Shard) -> Path:
-    return root / STATE / "shards" / f"{shard.path}.json"
+    return root / f"{STATE}/shards/{shard.path}.json"
 
 
 def note(root: Path, shard: Shard, files: Files) -> None:
@@ -356,6 +356,7 @@ def generate(
         if part:
             shards = shards[part.number - 1 :: part.of]
         missing = [s for s in shards if s not in made]
+        del made  # of many shards it is much
         _make(experiment, splits, root, shards, missing, workers, progress)
         if part:
             return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 _DEEPEST = 64  # groups within groups of JSON: a config has at most 50, and stands in a manifest
+_GROUPS = {dict, list}  # of JSON
 _TOO_DEEP = f"it is nested more than {_DEEPEST} deep"
 _LONGEST_LINE = 2000  # characters of a line for people; names of files and of captures fit
 
@@ -47,16 +48,13 @@ def from_json(text: str | bytes) -> Any:
         raise ValueError(_TOO_DEEP) from None
     except ValueError:
         raise ValueError("it is not JSON") from None
-    level = [value]
+    level = [value] if type(value) in _GROUPS else []
     for _ in range(_DEEPEST + 1):
-        level = [held for group in level for held in _inside(group) if isinstance(held, dict | list)]
         if not level:
             return value
+        inside = [group.values() if type(group) is dict else group for group in level]
+        level = [held for group in inside for held in group if type(held) in _GROUPS]
     raise ValueError(_TOO_DEEP)
-
-
-def _inside(group: Any) -> Iterable[Any]:
-    return group.values() if isinstance(group, dict) else group if isinstance(group, list) else ()
 
 
 def quoted(word: str | os.PathLike[str]) -> str:

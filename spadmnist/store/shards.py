@@ -62,7 +62,7 @@ class Encoding(ABC):
     def exists(self, root: str | os.PathLike[str], path: str) -> bool:
         """Whether the shard is there. A shard that is there was written to its end."""
         try:
-            mode = os.lstat(Path(root) / self.location(path)).st_mode
+            mode = os.lstat(os.path.join(root, self.location(path))).st_mode
         except (FileNotFoundError, NotADirectoryError):
             return False
         return stat.S_ISREG(mode) if self.one_file else stat.S_ISDIR(mode)
