@@ -2,17 +2,16 @@
 
     python scripts/kill_workers.py configs/spad_mnist.yaml --limit 3000 --kills 100 -o killed
 
-A worker is killed every few seconds, as long as another one lives, until so many have been or the dataset is there.
-First the same dataset is made without a cluster. Exit status 1 where the two differ.
+A worker is killed every few seconds, as long as another one is at the scheduler, until so many have been or the dataset
+is there. Each is a `dask worker` without a nanny, and another is started in its place at once, as a batch system does:
+a nanny gives up where its worker dies as it starts. First the same dataset is made without a cluster. Exit status 1
+where the two differ.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
 import random
-import signal
 import subprocess
 import sys
 import threading
@@ -38,11 +37,12 @@ def main() -> int:
     alone, killed = asked.output / "alone", asked.output / "killed"
     command = [sys.executable, "-m", "spadmnist", "generate", str(asked.config), "--limit", str(asked.limit), "-o"]
     subprocess.run([*command, str(alone)], check=True, stdout=subprocess.DEVNULL)
-    with distributed.LocalCluster(
-        n_workers=asked.workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1", silence_logs=60
-    ) as site:
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=None, host="127.0.0.1", silence_logs=60) as site,
+        Workers(site, asked.workers) as workers,
+    ):
         kills, over = [0], threading.Event()
-        killer = threading.Thread(target=kill, args=(site, kills, over, asked))
+        killer = threading.Thread(target=kill, args=(workers, kills, over, asked))
         started = time.monotonic()
         killer.start()
         try:
@@ -64,18 +64,50 @@ def main() -> int:
     return 0 if same else 1
 
 
-def kill(site: distributed.LocalCluster, kills: list[int], over: threading.Event, asked: argparse.Namespace) -> None:
-    """Kill a worker now and then, until it is over; kills: how many."""
+class Workers:
+    """So many workers of a scheduler, each a process of its own; within a `with` block."""
+
+    def __init__(self, site: distributed.LocalCluster, number: int):
+        self._site, self._number, self._begun = site, number, 0
+        self._alive: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Workers:
+        self.fill()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._alive.values():
+            process.kill()
+            process.wait()
+
+    def fill(self) -> None:
+        """Start a worker for each that has ended."""
+        self._alive = {name: process for name, process in self._alive.items() if process.poll() is None}
+        while len(self._alive) < self._number:
+            self._begun += 1
+            name = f"worker-{self._begun}"
+            command = [sys.executable, "-m", "dask", "worker", self._site.scheduler_address, "--name", name]
+            options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            self._alive[name] = subprocess.Popen([*command, *options], **quiet)
+
+    def there(self) -> list[subprocess.Popen[bytes]]:
+        """Those that have come to the scheduler."""
+        names = {worker.name for worker in list(self._site.scheduler.workers.values())}
+        return [process for name, process in self._alive.items() if name in names and process.poll() is None]
+
+
+def kill(workers: Workers, kills: list[int], over: threading.Event, asked: argparse.Namespace) -> None:
+    """Kill a worker now and then, until it is over, and keep up their number; kills: how many."""
     rng = random.Random(asked.seed)
-    while kills[0] < asked.kills and not over.wait(rng.expovariate(1 / asked.every)):
-        # a nanny whose worker dies as it starts replaces none and leaves: another comes, as a batch system sends one
-        site.scale(asked.workers)
-        begun = [nanny.process for nanny in site.workers.values() if nanny.process]
-        there = [process.pid for process in begun if process.pid and process.status.name == "running"]
-        if len(there) > 1:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(rng.choice(there), signal.SIGKILL)
-                kills[0] += 1
+    while not over.wait(rng.expovariate(1 / asked.every)):
+        there = workers.there()
+        if kills[0] < asked.kills and len(there) > 1:
+            victim = rng.choice(there)
+            victim.kill()
+            victim.wait()
+            kills[0] += 1
+        workers.fill()
 
 
 if __name__ == "__main__":
