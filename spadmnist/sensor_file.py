@@ -168,7 +168,8 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
             written = _number(declared, value)
         edit.set((*head, effect, parameter), written)
     for (effect, parameter), note in notes.items():
-        edit.note((*head, effect, parameter), note)
+        if (effect, parameter) in values:
+            edit.note((*head, effect, parameter), note)
     disk.put_file(out, _headed(edit.text(), out).encode())
     try:
         config.read_sensor(out)
