@@ -70,6 +70,7 @@ bench: $(VENV)/installed  ## measure the benchmark's table on this machine (abou
 
 # For example OPTIONS="--limit 20000 --lux all --threads"
 OPTIONS ?=
+profile: export PYTHONDONTWRITEBYTECODE =
 
 profile: $(VENV)/installed  ## where the time of a generate goes: a table and a timeline of its workers, in build/profile
 	$(RUN)/python scripts/timeline.py $(if $(IMAGES),--images-dir $(IMAGES)) $(OPTIONS)

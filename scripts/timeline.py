@@ -30,8 +30,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 HERE = Path(__file__).resolve().parent
 STAGES = {
     "simulate": "#3b6fb6",
@@ -246,6 +244,11 @@ def traced_executor(inner: Any, run: Run) -> Any:
         def __init__(self) -> None:
             self.__dict__.update(inner.__dict__)
 
+        def start(self, module: str) -> None:
+            with SPANS.span("start the workers"):
+                super().start(module)
+            watch_parent(run)  # only now: the verb imports its libraries after it has started its workers
+
         def run(
             self, function: Callable[[Any], Any], make: Any, keys: Sequence[Any], done: Callable[[Any, Any], None]
         ) -> None:
@@ -263,13 +266,25 @@ def measure(arguments: Sequence[str], jobs: int, threads: bool, began: float) ->
     run = Run(began, jobs)
     with SPANS.span("start the program"):
         from spadmnist.cli import _options, cli
-    with SPANS.span("import the libraries"):
-        from spadmnist import config, factory
-        from spadmnist.experiment import Experiment
         from spadmnist.workers import executor, safe_path
 
     inner = executor_in_threads(jobs) if threads else executor(jobs)
     _options.executor = lambda asked: traced_executor(inner, run)  # type: ignore[assignment]
+    paths = [str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)  # where workers find this module
+    with safe_path(), SPANS.span("rest of the verb"):
+        cli.main(["generate", *arguments], prog_name="spadmnist", standalone_mode=False)
+    run.ended, run.processor = time.monotonic(), time.process_time()
+    run.spans = SPANS.taken()
+    inner.close()
+    return run
+
+
+def watch_parent(run: Run) -> None:
+    """Wrap what the verb does in this process."""
+    with SPANS.span("import the libraries"):
+        from spadmnist import config, factory
+        from spadmnist.experiment import Experiment
     wrap(config, "read", "read the config")
     wrap(Experiment, "load_images", "load the images")
     wrap(factory, "identity", "digest of the images")
@@ -286,18 +301,12 @@ def measure(arguments: Sequence[str], jobs: int, threads: bool, began: float) ->
             return real(experiment, splits, *rest)
 
     factory.generate = generate
-    paths = [str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])]
-    os.environ["PYTHONPATH"] = os.pathsep.join(paths)  # where workers find this module
-    with safe_path(), SPANS.span("rest of the verb"):
-        cli.main(["generate", *arguments], prog_name="spadmnist", standalone_mode=False)
-    run.ended, run.processor = time.monotonic(), time.process_time()
-    run.spans = SPANS.taken()
-    inner.close()
-    return run
 
 
 def floor(experiment: Any, images: Mapping[str, Any]) -> float:
     """s of the processor that numpy needs for as many exponentials as the run draws at all levels, the best of five."""
+    import numpy as np
+
     total = 0.0
     rng = np.random.Generator(np.random.SFC64(1))
     for level in experiment.levels:
