@@ -246,8 +246,8 @@ class Loky(Executor):
             for _ in range(few):
                 self._submit(_imported, module)
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and self._started:
+    def __exit__(self, *raised: object) -> None:
+        if self._started and raised[0] is not None:
             self._end()
 
     @contextlib.contextmanager

@@ -91,8 +91,9 @@ def generate(
     """
     root = output if output is not None else Path(config.stem)
     with options.workers_of(jobs, cluster, no_shared) as workers:
-        if config.is_file() and not dry_run and not (root / "manifest.json").exists():
-            workers.start("spadmnist.factory")  # they import their libraries while this process does, and reads images
+        # they import their libraries while this process does, and reads images; plug-ins may set what they inherit
+        if config.is_file() and not (dry_run or plugin_files or (root / "manifest.json").exists()):
+            workers.start("spadmnist.factory")
         from .. import config as configs
         from .. import factory
         from .. import images as sources
