@@ -5,7 +5,7 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify docs docs-two faults bench matrix package challenge lint clean
+.PHONY: help demo test verify docs docs-two faults bench profile matrix package challenge lint clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -67,6 +67,13 @@ lint: $(VENV)/installed
 
 bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
+
+# For example OPTIONS="--limit 20000 --lux all --threads"
+OPTIONS ?=
+profile: export PYTHONDONTWRITEBYTECODE =
+
+profile: $(VENV)/installed  ## where the time of a generate goes: a table and a timeline of its workers, in build/profile
+	$(RUN)/python scripts/timeline.py $(if $(IMAGES),--images-dir $(IMAGES)) $(OPTIONS)
 
 matrix: $(VENV)/installed  ## the same bytes under each Python, oldest and newest libraries? (minutes for each)
 	$(RUN)/python scripts/matrix.py -o build/matrix

@@ -459,8 +459,7 @@ def _image(settings: reconstruct.Settings, method: reconstruct.Method, recorded:
 
 def read_tr(reader: ShardReader, start: int, stop: int, pixels: int, tick: float) -> Events:
     """The TR stream of some images of a shard."""
-    counts = reader.read("tr/counts", start, stop).reshape(-1)
-    events = _read_ragged(reader, "tr", start, stop, counts, pixels, tick)
+    events = _read_ragged(reader, "tr", start, stop, None, pixels, tick)
     _read_causes(reader, "tr", start, stop, events)
     return events
 
@@ -493,27 +492,39 @@ def read_frames(
 
 
 def _read_ragged(
-    reader: ShardReader, group: str, start: int, stop: int, counts: np.ndarray, pixels: int, tick: float
+    reader: ShardReader, group: str, start: int, stop: int, counts: np.ndarray | None, pixels: int, tick: float
 ) -> Events:
+    """The stamps of some images. counts: stamps of each pixel; None: they are read, too."""
+    stamps = f"{group}/{'ticks' if tick > 0 else 'times'}"
     first, last = (int(x) for x in reader.kept(f"{group}/starts")[[start, stop]])
+    if not 0 <= first <= last <= reader.shape(stamps)[0]:
+        raise _disagreement(reader)
+    wanted = (
+        [(stamps, first, last)] if counts is not None else [(f"{group}/counts", start, stop), (stamps, first, last)]
+    )
+    *read, values = reader.read_each(*wanted)
+    counts = read[0].reshape(-1) if counts is None else counts
     offsets = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=offsets[1:])
-    _check_stamps(reader, f"{group}/{'ticks' if tick > 0 else 'times'}", first, last, int(offsets[-1]))
+    if last - first != offsets[-1]:
+        raise _disagreement(reader)
     if tick > 0:
-        ticks = reader.read(f"{group}/ticks", first, last)
-        if group == "tr":
-            ticks = kernels.row_sums(ticks, offsets)
+        ticks = kernels.row_sums(values, offsets) if group == "tr" else values
         return Events(None, offsets, pixels, ticks, tick)
-    return Events(reader.read(f"{group}/times", first, last), offsets, pixels)
+    return Events(values, offsets, pixels)
 
 
 def _check_stamps(reader: ShardReader, name: str, first: int, last: int, count: int) -> None:
     """Raise InputError unless an array holds the entries `first` to `last`, which are `count`."""
     if last - first != count or not 0 <= first <= last <= reader.shape(name)[0]:
-        raise InputError(
-            f"{reader.root / reader.path}: counts and stamps disagree; "
-            f"spadmnist verify {quoted(str(reader.root))} says more"
-        )
+        raise _disagreement(reader)
+
+
+def _disagreement(reader: ShardReader) -> InputError:
+    return InputError(
+        f"{reader.root / reader.path}: counts and stamps disagree; "
+        f"spadmnist verify {quoted(str(reader.root))} says more"
+    )
 
 
 def statistics(experiment: Experiment, recorded: Recorded) -> dict[str, Any]:

@@ -139,15 +139,19 @@ def _experiment(job: Job) -> Experiment:
 
 
 def make_shard(task: Task) -> Files:
-    """Simulate, encode and commit one shard, then note its files' digests in the state folder."""
+    """Simulate, encode and commit one shard, then note its files' digests, and its facts, in the state folder."""
     experiment = _experiment(task.job)
     if task.run:
         task.run.check()
     columns, attributes = shard_content(experiment, task)
     if task.run:
         task.run.check()  # once more: nobody waits for a worker that was given up
-    files = experiment.encoding.write(task.root, task.shard.path, columns, attributes)
-    note(Path(task.root), task.shard, files)
+    root, shard, encoding = Path(task.root), task.shard, experiment.encoding
+    files = encoding.write(root, shard.path, columns, attributes)
+    told = None
+    if shard.level is not None:
+        told = facts_of(encoding.reader(root, shard.path), experiment.methods, files)
+    note(root, shard, files, told)
     return files
 
 
@@ -198,12 +202,12 @@ def _record_path(root: Path, shard: Shard) -> Path:
     return root / f"{STATE}/shards/{shard.path}.json"
 
 
-def note(root: Path, shard: Shard, files: Files) -> None:
-    """Remember the digests of a shard's files until the manifest lists them, and by what they were made.
+def note(root: Path, shard: Shard, files: Files, facts: Facts | None = None) -> None:
+    """Remember the digests of a shard's files until the manifest lists them, by what they were made, and its facts.
 
     A loss of power may take the note with it; the shard is then made again.
     """
-    record = {"files": files, "made_by": golden.made_by()}
+    record = {"files": files, "made_by": golden.made_by(), **({} if facts is None else {"facts": asdict(facts)})}
     disk.commit_file(_record_path(root, shard), json.dumps(record).encode(), disk.temporary(root), sync=False)
 
 
@@ -550,10 +554,11 @@ def _made(root: Path, shard: Shard, encoding: store.Encoding, like: Likeness) ->
 
 @dataclass(frozen=True)
 class Note:
-    """What is noted of a shard: its files, and by what they were made; None where that is not known."""
+    """What is noted of a shard: its files, by what they were made, and its facts; None where that is not known."""
 
     files: Files | None
     made_by: dict[str, str] | None
+    facts: Facts | None = None
 
     @property
     def bytes(self) -> int:
@@ -572,7 +577,8 @@ def _noted(root: Path, shard: Shard) -> Note:
     if not {"files", "made_by"} <= set(found):  # spadmnist 0.1.0 noted the files alone
         return Note(found, None)
     files, made_by = found["files"], found["made_by"]
-    return Note(files if isinstance(files, dict) else None, made_by if isinstance(made_by, dict) else None)
+    facts = Facts.noted(found.get("facts"))
+    return Note(files if isinstance(files, dict) else None, made_by if isinstance(made_by, dict) else None, facts)
 
 
 def _make(
@@ -862,8 +868,12 @@ def finish(
 
     temporary = disk.temporary(root)
     files: Files = {}
+    facts: dict[str, Facts] = {}
     for shard in shards:
-        files |= _noted(root, shard).files or {}
+        noted = _noted(root, shard)
+        files |= noted.files or {}
+        if noted.facts is not None:
+            facts[shard.path] = noted.facts
     small, groups = small_files(experiment, shards, normalisation)
     files |= experiment.encoding.write_groups(root, groups)
     for name, data in small.items():
@@ -879,7 +889,14 @@ def finish(
         "normalisation": normalisation,
         **({"causes": list(experiment.sensor.causes)} if experiment.causes else {}),
         "statistics": statistics_of(
-            root, experiment.encoding, [x.text for x in experiment.levels], experiment.methods, like, shards, files
+            root,
+            experiment.encoding,
+            [x.text for x in experiment.levels],
+            experiment.methods,
+            like,
+            shards,
+            files,
+            facts,
         ),
         "files": files,
     }
@@ -923,6 +940,37 @@ def _level_attributes(
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
 
 
+@dataclass(frozen=True)
+class Facts:
+    """What a shard says of itself for the manifest.
+
+    statistics: `dataset.statistics`; saturated: pixels by method, of methods that `statistics` does not name; kinds:
+    bytes by kind of data.
+    """
+
+    statistics: dict[str, dict[str, int]]
+    saturated: dict[str, int]
+    kinds: dict[str, int]
+
+    @classmethod
+    def noted(cls, found: Any) -> Facts | None:
+        """As a note has them; None where it has none, or damaged ones."""
+        try:
+            facts = cls(**found)
+            each = [*facts.statistics.values(), facts.saturated, facts.kinds]
+            return facts if all(type(number) is int for numbers in each for number in numbers.values()) else None
+        except (TypeError, AttributeError):
+            return None
+
+
+def facts_of(reader: store.ShardReader, methods: Sequence[str], files: Files) -> Facts:
+    """The facts of a shard that is there. Raises InputError, KeyError, TypeError or ValueError where it is damaged."""
+    told = from_json(reader.attributes["statistics"])
+    others = [method for method in methods if method not in told.get("saturated_pixels", ())]
+    saturated = {m: int(reader.array_attributes(f"reconstruction/{m}")["saturated_pixels"]) for m in others}
+    return Facts(told, saturated, reader.kinds(files))
+
+
 def statistics_of(
     root: Path | Source,
     encoding: store.Encoding,
@@ -931,10 +979,12 @@ def statistics_of(
     like: Likeness,
     shards: Sequence[Shard],
     files: Files,
+    known: Mapping[str, Facts] | None = None,
 ) -> dict[str, Any]:
     """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data.
 
-    They are added up from what each shard says of itself. Raises InputError where one of them cannot be read.
+    They are added up from what each shard says of itself. known: the facts of shards that need not be read, by path.
+    Raises InputError where another one cannot be read.
     """
     pixels = int(np.prod(like.shape))
     by_shard = dataset.files_by_shard(files, encoding)
@@ -948,23 +998,23 @@ def statistics_of(
         )
         total["images"] += shard.stop - shard.start
         total["pixels"] += (shard.stop - shard.start) * pixels
-        reader = shard.reader(root, encoding, like)
         place = encoding.location(shard.path)
         try:
-            told = from_json(reader.attributes["statistics"])
-            for readout, numbers in told.items():
+            facts = (known or {}).get(shard.path)
+            if facts is None:
+                facts = facts_of(shard.reader(root, encoding, like), methods, by_shard.get(place, {}))
+            for readout, numbers in facts.statistics.items():
                 sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
                 for key, value in numbers.items():
                     sums[key] += value
-            for method in set(methods) - set(told.get("saturated_pixels", ())):
-                found = reader.array_attributes(f"reconstruction/{method}")["saturated_pixels"]
-                total["saturated_pixels"][method] += int(found)
+            for method, number in facts.saturated.items():
+                total["saturated_pixels"][method] += number
         except (KeyError, TypeError, ValueError, AttributeError):
             raise InputError(
                 f"{root / place}: what it says of its own detections is "
                 "damaged; remove it and type the same command again"
             ) from None
-        for kind, size in reader.kinds(by_shard.get(place, {})).items():
+        for kind, size in facts.kinds.items():
             kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
             total["bytes"][kind] = total["bytes"].get(kind, 0) + size
     return out

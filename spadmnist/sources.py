@@ -26,9 +26,13 @@ PIECE = 1 << 22  # bytes, of a file that is read from its beginning to its end
 
 
 class File(ABC):
-    """A file that is open for reading. size: bytes."""
+    """A file that is open for reading.
+
+    size: bytes; version: another one where the file was written to or replaced, as far as the source can tell.
+    """
 
     size: int
+    version: Any = None
 
     @abstractmethod
     def read(self, offset: int, length: int) -> bytes:
@@ -116,10 +120,11 @@ class Reading(io.RawIOBase):
 
 
 class _LocalFile(File):
-    __slots__ = ("_handle", "size")
+    __slots__ = ("_handle", "size", "version")
 
-    def __init__(self, handle: int, size: int):
-        self._handle, self.size = handle, size
+    def __init__(self, handle: int, status: os.stat_result):
+        self._handle, self.size = handle, status.st_size
+        self.version = status.st_ino, status.st_mtime_ns
 
     def read(self, offset: int, length: int) -> bytes:
         return system.read_at(self._handle, offset, length)
@@ -144,7 +149,7 @@ class Local(Source):
         except BaseException:
             os.close(handle)
             raise
-        return _LocalFile(handle, status.st_size)
+        return _LocalFile(handle, status)
 
     def names(self) -> set[str]:
         found = set()

@@ -14,6 +14,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import importlib
 import math
 import os
 import queue
@@ -36,6 +37,7 @@ _LEAST = 2 << 30  # bytes of it, from which on the folder is put there
 _PREFIX = "spadmnist-workers-"
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
+_AHEAD = 8  # workers at most that are started before it is known how many tasks there are; the others come with these
 _PLACE = "SPADMNIST_WORKERS"  # names another folder for it
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
@@ -101,6 +103,12 @@ class Executor:
         Args:
             question: of a module; it answers a digest and, in words, by what it was made.
             about: what it is asked, which can be hashed.
+        """
+
+    def start(self, module: str) -> None:
+        """Start workers of this machine, which import a module until tasks come. Nothing is waited for.
+
+        Within `with`, an error before the first task ends them.
         """
 
     def limited(self, most: int) -> Executor:
@@ -231,6 +239,17 @@ class Loky(Executor):
         # fewer workers are other ones; those that are too many end as the first task is given to the others
         return self if most >= self.threads else Loky(max(1, most))
 
+    def start(self, module: str) -> None:
+        """As `Executor.start`; one that cannot be started is missed by the first task, which says so."""
+        few = min(self.threads, _AHEAD)
+        with contextlib.suppress(OSError, RuntimeError), self._opened(few):
+            for _ in range(few):
+                self._submit(_imported, module)
+
+    def __exit__(self, *raised: object) -> None:
+        if self._started and raised[0] is not None:
+            self._end()
+
     @contextlib.contextmanager
     def _opened(self, number: int) -> Iterator[None]:
         from . import compiled
@@ -245,6 +264,8 @@ class Loky(Executor):
             self._started = max(self._started, min(self.threads, number))
             # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
             warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+            # those that were started before are still importing while more of them are asked for
+            warnings.filterwarnings("ignore", "Trying to resize an executor with running jobs", UserWarning)
             yield
 
     def _submit(self, function: Callable[[Any], Any], task: Any) -> Any:
@@ -288,6 +309,10 @@ class Loky(Executor):
             if isinstance(process, LokyProcess) and process.pid is not None:  # started before the one that could not be
                 system.kill(process.pid)
                 process.join()
+
+
+def _imported(module: str) -> None:
+    importlib.import_module(module)
 
 
 def _start_worker(parent: int) -> None:

@@ -5,6 +5,7 @@ The stand-in does tasks in this process as soon as they are handed out; for it a
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import resource
 import signal
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from loky.backend.process import LokyProcess
 
 from spadmnist.errors import SpadError
 from spadmnist.workers import Executor, Loky, Serial
@@ -193,3 +195,24 @@ def test_a_hundred_thousand_tasks() -> None:
     StandIn().run(square, iter, range(100_000), found.__setitem__)
     assert time.monotonic() - started < 200
     assert len(found) == 100_000 and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+
+
+def which(_: object) -> int:
+    time.sleep(0.05)
+    return os.getpid()
+
+
+def test_workers_that_are_started_ahead_do_the_tasks_and_end_with_an_error() -> None:
+    def alive() -> set[int | None]:
+        return {one.pid for one in multiprocessing.active_children() if isinstance(one, LokyProcess)}
+
+    Loky(2)._end()  # what other tests have left
+    with pytest.raises(SpadError, match="before"), Loky(2) as workers:
+        workers.start("spadmnist.no_such_module")  # its own error is that of the task that needs it
+        started = alive()
+        assert len(started) == 2
+        by: list[int] = []
+        workers.run(which, iter, range(6), lambda key, result: by.append(result))
+        assert set(by) <= started and alive() == started
+        raise SpadError("before any task")
+    assert not alive()

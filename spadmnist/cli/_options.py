@@ -141,17 +141,14 @@ def model_and_measurement(command: F) -> F:
     return command
 
 
-def workers_of(jobs: int | None, cluster: str | None, no_shared: bool = False, most: int | None = None) -> Executor:
-    """Who does the work: the workers of a cluster, or processes of this machine.
-
-    most: how many of these by default; None: one per processor.
-    """
+def workers_of(jobs: int | None, cluster: str | None, no_shared: bool = False) -> Executor:
+    """Who does the work: the workers of a cluster, or processes of this machine, by default one per processor."""
     from ..errors import SpadError
 
     if cluster is None:
         if no_shared:
             raise SpadError("--no-shared: is said of the workers of a cluster; give --cluster as well, or leave it out")
-        return executor(jobs or most or processors())
+        return executor(jobs or processors())
     if jobs is not None:
         raise SpadError("--jobs: a cluster has the workers that were started there; leave --jobs or --cluster out")
     from ..cluster import Cluster

@@ -89,31 +89,36 @@ def generate(
     spadmnist generate configs/spad_mnist.yaml -o full --images-dir ~/mnist
     spadmnist generate configs/spad_mnist.yaml -o dim --lux "5 mlux" --limit 1000
     """
-    from .. import config as configs
-    from .. import factory
-    from .. import images as sources
-
-    one = None if part is None else factory.Part.parse(part)
-    options.load_plugins(plugin_files)
-    experiment = configs.read(config, seed, format_, levels, limit, causes)
-    for note in experiment.notes:
-        terminal.say(f"Note: {note}")
-    images = experiment.load_images(images_dir)
-    for note in sources.notes(images):
-        terminal.say(f"Note: {note}")
     root = output if output is not None else Path(config.stem)
-    most = factory.most_workers(experiment, images, processors())
-    if dry_run:
-        from .. import plan
+    with options.workers_of(jobs, cluster, no_shared) as workers:
+        # they import their libraries while this process does, and reads images; plug-ins may set what they inherit
+        if config.is_file() and not (dry_run or plugin_files or (root / "manifest.json").exists()):
+            workers.start("spadmnist.factory")
+        from .. import config as configs
+        from .. import factory
+        from .. import images as sources
 
-        estimate = plan.estimate(experiment, images, jobs or most)
-        if as_json:
-            terminal.print_json(estimate)
-        else:
-            terminal.print_lines(plan.text(estimate, root))
-        return
-    with options.workers_of(jobs, cluster, no_shared, most) as workers, terminal.progress() as progress:
-        outcome = factory.generate(experiment, images, root, workers, progress, one)
+        one = None if part is None else factory.Part.parse(part)
+        options.load_plugins(plugin_files)
+        experiment = configs.read(config, seed, format_, levels, limit, causes)
+        for note in experiment.notes:
+            terminal.say(f"Note: {note}")
+        images = experiment.load_images(images_dir)
+        for note in sources.notes(images):
+            terminal.say(f"Note: {note}")
+        most = factory.most_workers(experiment, images, processors())
+        if dry_run:
+            from .. import plan
+
+            estimate = plan.estimate(experiment, images, jobs or most)
+            if as_json:
+                terminal.print_json(estimate)
+            else:
+                terminal.print_lines(plan.text(estimate, root))
+            return
+        workers = workers if jobs else workers.limited(most)
+        with terminal.progress() as progress:
+            outcome = factory.generate(experiment, images, root, workers, progress, one)
     if as_json:
         terminal.print_json(
             {"dataset": str(root), "made": outcome.made, "kept": outcome.kept, "seconds": outcome.seconds}

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import hashlib
 import io
+import itertools
 import os
 import stat
 import zlib
@@ -21,6 +22,7 @@ from ..disk import Files, commit_file, inside, install, put_tree, temporary, wor
 from ..errors import InputError
 from ..foreign import quoted
 from ..sources import File, Local, NotAFile, Reading, Source
+from . import recent
 from .chunks import Damaged
 from .columns import NAME, Column, check_attributes, check_columns, check_name
 
@@ -181,6 +183,9 @@ class Expected:
     files: Files | None = None
 
 
+_numbers = itertools.count()  # of the readers of this process
+
+
 class Missing(InputError):
     """A file of the shard is not there."""
 
@@ -201,6 +206,7 @@ class ShardReader(ABC):
         self._kept: dict[str, np.ndarray] = {}
         self._attributes: dict[str, Any] | None = None
         self._names: tuple[str, ...] | None = None
+        self._number = next(_numbers)
 
     def __getstate__(self) -> tuple[Encoding, Path | Source, str, Expected | None]:
         return self.encoding, self.root, self.path, self._expected
@@ -296,9 +302,20 @@ class ShardReader(ABC):
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows `start` to `stop` of an array. Only the chunks they lie in are read and decoded."""
+        return self.read_each((name, start, self._array(name).shape[0] if stop is None else stop))[0]
+
+    def read_each(self, *wanted: tuple[str, int, int]) -> list[np.ndarray]:
+        """Rows of several arrays, each as (name, start, stop); a file in which several lie is opened once."""
+        handles: dict[str, File] = {}
+        try:
+            return [self._rows(handles, *one) for one in wanted]
+        finally:
+            for handle in handles.values():
+                handle.close()
+
+    def _rows(self, handles: dict[str, File], name: str, start: int, stop: int) -> np.ndarray:
         array = self._array(name)
         length, rows = array.shape[0], array.rows
-        stop = length if stop is None else stop
         if not 0 <= start <= stop <= length:
             raise IndexError(f"{name}: rows {start} to {stop} were asked for; it has rows 0 to {length}")
         try:
@@ -307,21 +324,19 @@ class ShardReader(ABC):
                 return out
             flat = out.reshape(-1).view(np.uint8)
             row = out.nbytes // len(out)
-            handle = self._open(array.file)
-            try:
-                first, last = array.places[start // rows], array.places[-(-stop // rows) - 1]
-                handle.expect(first[0], last[0] + last[1] - first[0])
-                for i in range(start // rows, -(-stop // rows)):
-                    low, high = max(start, i * rows), min(stop, (i + 1) * rows)
-                    target = flat[(low - start) * row : (high - start) * row]
-                    if high - low == rows:
-                        self._chunk(handle, array, i, target)
-                    else:
-                        chunk = np.empty(rows * row, np.uint8)
-                        self._chunk(handle, array, i, chunk)
-                        target[:] = chunk[(low - i * rows) * row : (high - i * rows) * row]
-            finally:
-                handle.close()
+            if array.file not in handles:
+                handles[array.file] = self._open(array.file)
+            handle = handles[array.file]
+            first, last = array.places[start // rows], array.places[-(-stop // rows) - 1]
+            handle.expect(first[0], last[0] + last[1] - first[0])
+            for i in range(start // rows, -(-stop // rows)):
+                low, high = max(start, i * rows), min(stop, (i + 1) * rows)
+                target = flat[(low - start) * row : (high - start) * row]
+                if high - low == rows:
+                    self._chunk(handle, array, i, target)
+                else:
+                    chunk = self._whole_chunk(handle, array, name, i, rows * row)
+                    target[:] = chunk[(low - i * rows) * row : (high - i * rows) * row]
         except MemoryError:
             raise InputError(
                 f"{self.root / array.file}: rows {start} to {stop} of {name} need more memory than there is; "
@@ -330,6 +345,16 @@ class ShardReader(ABC):
         except Damaged as error:
             raise self._refuse(array.file, f"{name}: {error}") from None
         return out
+
+    def _whole_chunk(self, handle: File, array: Array, name: str, i: int, size: int) -> np.ndarray:
+        """A chunk of so many bytes, of which a part is wanted; see `recent`."""
+        held, key = recent.of_size(size), (self._number, name, i, handle.version)
+        chunk = held.find(key)
+        if chunk is None:
+            chunk = np.empty(size, np.uint8)
+            self._chunk(handle, array, i, chunk)
+            held.keep(key, chunk)
+        return chunk
 
     def kept(self, name: str) -> np.ndarray:
         """A whole array, read once and kept: for small ones by which others are read."""
