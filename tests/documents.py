@@ -43,6 +43,15 @@ RULES = {
     "make test": ("make -n -o .venv/installed test", "these tests would run themselves"),
     "make verify": ("make -n -o .venv/installed verify", "these tests would run themselves"),
     "make docs": ("make -n -o .venv/installed -o .venv/installed-docs docs", "the build executes all cells"),
+    "make profile": ("make -n -o .venv/installed profile", "it takes a minute; test_timeline.py runs the script"),
+    'make profile OPTIONS="--limit 20000 --lux all --jobs 4"': (
+        'make -n -o .venv/installed profile OPTIONS="--limit 20000 --lux all --jobs 4"',
+        "it takes minutes; test_timeline.py runs the script",
+    ),
+    "python scripts/kill_workers.py configs/spad_mnist.yaml --limit 10000 --kills 100 --workers 3 -o killed": (
+        "python scripts/kill_workers.py --help",
+        "it takes most of an hour",
+    ),
     "make bench": ("make -n -o .venv/installed bench", "it takes minutes of an idle machine"),
     "python scripts/memory.py": ("python scripts/memory.py --help", "it makes and reads gigabytes"),
     "make faults": ("make -n -o .venv/installed faults", "it takes up to an hour; test_faults.py runs the script"),

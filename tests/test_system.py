@@ -105,7 +105,7 @@ def files_in(root: Path) -> dict[str, bytes]:
 
 def test_a_part_says_where_no_lock_is_shared(tmp_path: Path) -> None:
     (tmp_path / "lab.yaml").write_text(CONFIG)
-    asked = ["generate", "lab.yaml", "--part", "1/2"]
+    asked = ["generate", "lab.yaml", "--part", "1/2", "--jobs", "1"]
     done = run_bare(tmp_path, f"from spadmnist.start import main\nsys.argv[1:] = {asked}\nmain()\n")
     assert done.returncode == 2 and "--part 1/2: this system has no lock that several parts can hold" in done.stderr
     assert "Traceback" not in done.stderr

@@ -90,19 +90,19 @@ def generate(
     spadmnist generate configs/spad_mnist.yaml -o dim --lux "5 mlux" --limit 1000
     """
     root = output if output is not None else Path(config.stem)
-    with options.workers_of(jobs, cluster, no_shared) as workers:
-        # they import their libraries while this process does, and reads images; plug-ins may set what they inherit
-        if config.is_file() and not (dry_run or plugin_files or (root / "manifest.json").exists()):
-            workers.start("spadmnist.factory")
-        from .. import config as configs
-        from .. import factory
-        from .. import images as sources
+    from .. import config as configs
+    from .. import factory
+    from .. import images as sources
 
-        one = None if part is None else factory.Part.parse(part)
-        options.load_plugins(plugin_files)
-        experiment = configs.read(config, seed, format_, levels, limit, causes)
-        for note in experiment.notes:
-            terminal.say(f"Note: {note}")
+    one = None if part is None else factory.Part.parse(part)
+    options.load_plugins(plugin_files)
+    experiment = configs.read(config, seed, format_, levels, limit, causes)
+    for note in experiment.notes:
+        terminal.say(f"Note: {note}")
+    with options.workers_of(jobs, cluster, no_shared) as workers:
+        # they import their libraries while this process reads images; plug-ins may set what they inherit
+        if not (dry_run or plugin_files or (root / "manifest.json").exists()):
+            workers.start("spadmnist.factory")
         images = experiment.load_images(images_dir)
         for note in sources.notes(images):
             terminal.say(f"Note: {note}")
