@@ -17,6 +17,7 @@ import select
 import signal
 import struct
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +29,8 @@ from spadmnist import cli
 _CHANGES = ("mkdir", "rename", "replace", "unlink", "remove", "rmdir", "link", "symlink", "fsync", "truncate")
 _TAKES_SPACE = ("mkdir", "link", "symlink")
 _BROKEN = 99  # exit status of a process in which something was raised that no command lets out
-SECONDS = 30.0  # that a command may take; the same ones end in a tenth of a second where nothing is wrong
+SECONDS = 30.0  # of the processor that a command may take; where nothing is wrong it takes a tenth of one
+_WAITED = 10  # times as long by the clock: a busy machine gives a process a tenth of a processor, or less
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class End:
     def wrong(self, *allowed: int) -> str:
         """What is wrong with this end: no allowed status, or no sentence with status 2; empty: nothing."""
         if self.status is None:
-            return f"does not end within {SECONDS:g} s"
+            return f"does not end within {SECONDS:g} s of the processor"
         for word in ("Traceback", "fault of the program"):
             if word in self.err:
                 return f"status {self.status}: {self.err.strip()[-600:]}"
@@ -123,13 +125,21 @@ def command(*arguments: object) -> Callable[[], int | None]:
 
 
 def _wait(child: int, seconds: float) -> int | None:
-    handle = os.pidfd_open(child)
-    ready, _, _ = select.select([handle], [], [], seconds)
+    """The status of a process; None after so many seconds of the processor, or `_WAITED` times as many by the clock."""
+    handle, began, ready = os.pidfd_open(child), time.monotonic(), False
+    while not ready and _processor_time(child) < seconds and time.monotonic() - began < _WAITED * seconds:
+        ready = bool(select.select([handle], [], [], 1.0)[0])
     os.close(handle)
     if not ready:
         os.kill(child, signal.SIGKILL)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     return status if ready else None
+
+
+def _processor_time(child: int) -> float:
+    """s of the processor that a process has taken, with all its threads."""
+    used = Path(f"/proc/{child}/stat").read_bytes().rpartition(b")")[2].split()[11:13]
+    return sum(map(int, used)) / os.sysconf("SC_CLK_TCK")
 
 
 def _address_space() -> int:
