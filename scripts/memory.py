@@ -363,7 +363,11 @@ def inference(count: int, jobs: int, place: Path, within: str) -> dict[str, tupl
     for name, arguments, ok in (
         ("simulate", ["simulate", str(truth), str(plan), "-o", str(lab)], (0,)),
         ("compare", ["compare", str(model), str(lab), "--jobs", str(jobs)], (0, 1)),
-        ("fit", ["fit", str(model), str(lab), "--add", "afterpulsing", "--jobs", str(jobs)], (0, 1)),
+        (
+            "fit --add afterpulsing",
+            ["fit", str(model), str(lab), "--add", "afterpulsing", "-o", str(place / "next.yaml"), "--jobs", str(jobs)],
+            (0,),
+        ),
         (
             f"diagnose --quick --within {within}",
             ["diagnose", str(model), str(lab), "--quick", "--within", within, "--jobs", str(jobs)],
