@@ -283,7 +283,7 @@ def measure(arguments: Sequence[str], jobs: int, threads: bool, began: float) ->
 def watch_parent(run: Run) -> None:
     """Wrap what the verb does in this process."""
     with SPANS.span("import the libraries"):
-        from spadmnist import config, factory
+        from spadmnist import config, factory, shard_facts
         from spadmnist.experiment import Experiment
     wrap(config, "read", "read the config")
     wrap(Experiment, "load_images", "load the images")
@@ -292,7 +292,7 @@ def watch_parent(run: Run) -> None:
     wrap(factory, "_warm", "load the kernels")
     wrap(factory, "make_shards", "make shards")
     wrap(factory, "finish", "finish")
-    wrap(factory, "statistics_of", "read the shards' statistics")
+    wrap(shard_facts, "statistics_of", "read the shards' statistics")
     real = factory.generate
 
     def generate(experiment: Any, splits: Mapping[str, Any], *rest: Any) -> Any:

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, golden, plugins, reconstruct, store, system
+from . import config, dataset, disk, document, golden, plugins, reconstruct, shard_facts, store, system
 from .compiled import compiling
 from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
@@ -39,7 +39,7 @@ from .identity import FORMAT, STREAM, held, identity, plugin_sources, portable, 
 from .images import Images
 from .reconstruct import median_of_nonzero
 from .sensor import BYTES_PER_EVENT
-from .sources import Source
+from .shard_facts import Facts
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
@@ -150,7 +150,7 @@ def make_shard(task: Task) -> Files:
     files = encoding.write(root, shard.path, columns, attributes)
     told = None
     if shard.level is not None:
-        told = facts_of(encoding.reader(root, shard.path), experiment.methods, files)
+        told = shard_facts.facts_of(encoding.reader(root, shard.path), experiment.methods, files)
     note(root, shard, files, told)
     return files
 
@@ -888,7 +888,7 @@ def finish(
         "shards": [asdict(shard) for shard in shards],
         "normalisation": normalisation,
         **({"causes": list(experiment.sensor.causes)} if experiment.causes else {}),
-        "statistics": statistics_of(
+        "statistics": shard_facts.statistics_of(
             root,
             experiment.encoding,
             [x.text for x in experiment.levels],
@@ -938,83 +938,3 @@ def _level_attributes(
     unit = "lux" if level.kind == "lux" else "W/m^2"
     medians = {f"normalisation_{k}": v for k, v in sorted(normalisation.get(shard.level, {}).items()) if v is not None}
     return {"level": level.text, "value": level.value, "unit": unit, **medians}
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What a shard says of itself for the manifest.
-
-    statistics: `dataset.statistics`; saturated: pixels by method, of methods that `statistics` does not name; kinds:
-    bytes by kind of data.
-    """
-
-    statistics: dict[str, dict[str, int]]
-    saturated: dict[str, int]
-    kinds: dict[str, int]
-
-    @classmethod
-    def noted(cls, found: Any) -> Facts | None:
-        """As a note has them; None where it has none, or damaged ones."""
-        try:
-            facts = cls(**found)
-            each = [*facts.statistics.values(), facts.saturated, facts.kinds]
-            return facts if all(type(number) is int for numbers in each for number in numbers.values()) else None
-        except (TypeError, AttributeError):
-            return None
-
-
-def facts_of(reader: store.ShardReader, methods: Sequence[str], files: Files) -> Facts:
-    """The facts of a shard that is there. Raises InputError, KeyError, TypeError or ValueError where it is damaged."""
-    told = from_json(reader.attributes["statistics"])
-    others = [method for method in methods if method not in told.get("saturated_pixels", ())]
-    saturated = {m: int(reader.array_attributes(f"reconstruction/{m}")["saturated_pixels"]) for m in others}
-    return Facts(told, saturated, reader.kinds(files))
-
-
-def statistics_of(
-    root: Path | Source,
-    encoding: store.Encoding,
-    levels: Sequence[str],
-    methods: Sequence[str],
-    like: Likeness,
-    shards: Sequence[Shard],
-    files: Files,
-    known: Mapping[str, Facts] | None = None,
-) -> dict[str, Any]:
-    """Per level and split: images, pixels, detections, empty and saturated pixels, bytes by kind of data.
-
-    They are added up from what each shard says of itself. known: the facts of shards that need not be read, by path.
-    Raises InputError where another one cannot be read.
-    """
-    pixels = int(np.prod(like.shape))
-    by_shard = dataset.files_by_shard(files, encoding)
-    out: dict[str, Any] = {level: {} for level in levels}
-    for shard in shards:
-        if shard.level is None:
-            continue
-        total = out[shard.level].setdefault(
-            shard.split,
-            {"images": 0, "pixels": 0, "saturated_pixels": dict.fromkeys(methods, 0), "bytes": {}},
-        )
-        total["images"] += shard.stop - shard.start
-        total["pixels"] += (shard.stop - shard.start) * pixels
-        place = encoding.location(shard.path)
-        try:
-            facts = (known or {}).get(shard.path)
-            if facts is None:
-                facts = facts_of(shard.reader(root, encoding, like), methods, by_shard.get(place, {}))
-            for readout, numbers in facts.statistics.items():
-                sums = total.setdefault(readout, dict.fromkeys(numbers, 0))
-                for key, value in numbers.items():
-                    sums[key] += value
-            for method, number in facts.saturated.items():
-                total["saturated_pixels"][method] += number
-        except (KeyError, TypeError, ValueError, AttributeError):
-            raise InputError(
-                f"{root / place}: what it says of its own detections is "
-                "damaged; remove it and type the same command again"
-            ) from None
-        for kind, size in facts.kinds.items():
-            kind = kind if kind in ("tr", "frames", "reconstruction", "all") else "other"
-            total["bytes"][kind] = total["bytes"].get(kind, 0) + size
-    return out

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, factory, golden, store
+from . import config, dataset, disk, document, factory, golden, shard_facts, store
 from .dataset import CONFIG, MANIFEST, STATE, Shard
 from .disk import Files
 from .errors import InputError, SpadError
@@ -92,7 +92,7 @@ def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
     methods = config["reconstruct"]
     try:
         encoding = dataset.encoding_in(manifest, root)
-        told = factory.statistics_of(root, encoding, levels, methods, like, shards, files)
+        told = shard_facts.statistics_of(root, encoding, levels, methods, like, shards, files)
     except InputError:
         return False
     return told == manifest["statistics"]

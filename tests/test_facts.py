@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from spadmnist import config, factory, verify
-from spadmnist.factory import Facts
+from spadmnist import config, factory, shard_facts, verify
+from spadmnist.shard_facts import Facts
 
 
 def test_each_shards_facts_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,13 +18,13 @@ def test_each_shards_facts_are_taken_once(tmp_path: Path, monkeypatch: pytest.Mo
     images = experiment.load_images()
     monkeypatch.setattr(factory.dataset, "_IMAGES_PER_SHARD", 32)
     read: list[str] = []
-    real = factory.facts_of
+    real = shard_facts.facts_of
 
     def facts_of(reader: Any, *rest: Any) -> Facts:
         read.append(reader.path)
         return real(reader, *rest)
 
-    monkeypatch.setattr(factory, "facts_of", facts_of)
+    monkeypatch.setattr(shard_facts, "facts_of", facts_of)
     at_once = factory.generate(experiment, images, tmp_path / "once", 1)
     assert len(read) == len(set(read)) == 4
 

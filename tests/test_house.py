@@ -37,7 +37,7 @@ LAYERS = [
     {"config"},
     {"identity", "manifest", "sensor_file"},
     {"dataset"},
-    {"golden", "measurement"},
+    {"golden", "measurement", "shard_facts"},
     {"factory", "look", "reference", "schema", "template", "twin"},
     {"inference"},
     {"plan", "verify", "report", "pages", "starting", "testing"},
