@@ -45,9 +45,16 @@ from .pixel_maps import (
 from .point_process import blur_of
 from .replicates import Replicates
 
-_FIRST_WIDTH = 0.3  # of a prior before its width is estimated; the iterations forget it
-_DIFFERENCE = 0.02  # of a logarithm, by which derivatives are taken: counts are smooth on a scale of 1
-_LARGEST_STEP = 0.7  # of an iteration, as a logarithm: a factor of 2, beyond which a linear model says little
+# Logarithms of a parameter relative to the array, unless another unit is named. Those of an iteration decide how fast a
+# fit moves, not where it ends. They are rules of thumb: no measurement that is kept chose them.
+_FIRST_WIDTH = 0.3  # of a prior before its width is estimated
+_FIRST_PRECISION = 1e-6  # of that prior: no pixel is held before the width is estimated
+_WIDTHS = (1e-4, 3.0)  # least and largest width of a prior: none to speak of, a factor of 20
+_DIFFERENCE = 0.02  # by which derivatives are taken: counts are smooth on a scale of 1
+_LARGEST_STEP = 0.7  # of an estimate in an iteration: a factor of 2, beyond which a linear model says little
+_LARGEST_FREE_STEP = 2.0  # the same without a prior, for which little holds an estimate back
+_LARGEST_SHIFT = 0.5  # of the mean of all pixels in an iteration
+_LEVEL_STEP = 2.0  # factor: the most that a light level changes in an iteration
 _FREE_TURNS = 2  # iterations before the prior's width is estimated, so that the maps have their shape by then
 
 
@@ -115,7 +122,7 @@ class _Fitted:
             variance=np.ones(size),
             raw=np.zeros(size),
             raw_variance=np.zeros(size),
-            precision=np.full(size, 1e-6),
+            precision=np.full(size, _FIRST_PRECISION),
         )
 
     def sums(self, pixels: np.ndarray, weight: np.ndarray | float = 1.0) -> np.ndarray:
@@ -155,11 +162,11 @@ class _Fitted:
             self.logs = self.logs - math.log(float(np.mean(np.exp(self.logs))))
         else:  # the mean of all pixels, which no pixel by itself may inform
             own, left = self.sums(normal, weight), self.sums(score, weight)
-            shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -0.5, 0.5))
+            shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -_LARGEST_SHIFT, _LARGEST_SHIFT))
             self.logs = self.logs + shift
             self.middle = float(np.average(self.logs, weights=weight))
         square = float(np.mean(weight * (self.logs - median_of(self.logs)) ** 2 + self.variance))
-        self.sigma = min(max(math.sqrt(square), 1e-4), 3.0)
+        self.sigma = min(max(math.sqrt(square), _WIDTHS[0]), _WIDTHS[1])
         noise = float(np.median(self.raw_variance))
         if noise < TELLING**2:
             # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
@@ -297,7 +304,9 @@ def _normal_equations(
         assert counts is not None
         expected = line.expected(now)
         scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
-        line.level *= min(max(scale, 0.5), 2.0)  # until the level is that of these maps and no factor is needed
+        line.level *= min(
+            max(scale, 1 / _LEVEL_STEP), _LEVEL_STEP
+        )  # until the level is that of these maps and no factor is needed
         jacobian = np.stack([(line.expected(o) - expected) / _DIFFERENCE for o in other], axis=1) * scale
         expected = expected * scale
         variance = line.variance(np.maximum(expected, 0.5), dead)
@@ -324,7 +333,10 @@ def _move_together(fitted: Sequence[_Fitted], normal: np.ndarray, score: np.ndar
     free = np.linalg.solve(bare, score[:, :, None])[:, :, 0]  # without the prior; the other maps are free
     variance_free = np.linalg.inv(bare)
     for i, one in enumerate(fitted):
-        one.raw, one.raw_variance = one.logs + np.clip(free[:, i], -2, 2), variance_free[:, i, i]
+        one.raw, one.raw_variance = (
+            one.logs + np.clip(free[:, i], -_LARGEST_FREE_STEP, _LARGEST_FREE_STEP),
+            variance_free[:, i, i],
+        )
         one.move(solved[:, i])
         one.variance = inverse[:, i, i]
 
