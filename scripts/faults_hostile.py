@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import importfiles
 
 MEMORY = 2 << 30  # bytes that a command may take, whatever it reads
-SECONDS = 20.0
+SECONDS = 10.0
 _QUICK = 2.0, 1e8  # s, bytes that a dry run may foresee, so that the dataset is made, too
 _LARGE = (0, 1, 0x7F, 0x80, 0xFF, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 _WORDS = (

@@ -29,7 +29,7 @@ from spadmnist import cli
 _CHANGES = ("mkdir", "rename", "replace", "unlink", "remove", "rmdir", "link", "symlink", "fsync", "truncate")
 _TAKES_SPACE = ("mkdir", "link", "symlink")
 _BROKEN = 99  # exit status of a process in which something was raised that no command lets out
-SECONDS = 30.0  # of the processor that a command may take; where nothing is wrong it takes a tenth of one
+SECONDS = 10.0  # of the processor that a command may take; where nothing is wrong it takes some tenths of one
 _WAITED = 10  # times as long by the clock: a busy machine gives a process a tenth of a processor, or less
 
 
