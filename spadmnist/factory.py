@@ -260,9 +260,11 @@ def _leave(root: Path) -> None:
             if not (state / "plan.json").exists() and not (state / "repairing").exists():
                 shutil.rmtree(state)
         elif not any((state / "shards").rglob("*.json")):
-            shutil.rmtree(state)
-            for folder in (root / "data.zarr", root / "data", root):
+            for folder in (root / "data.zarr", root / "data"):
                 _remove_empty(folder)
+            if os.listdir(root) == [STATE]:  # a shard whose note could not be written needs the plan
+                shutil.rmtree(state)
+                os.rmdir(root)
 
 
 def clear_state(root: Path) -> None:

@@ -757,6 +757,22 @@ def test_a_damaged_plan_is_said(made: tuple[Path, Path], tmp_path: Path) -> None
         make(made[0], tmp_path / "out")
 
 
+def test_a_shard_whose_record_could_not_be_written_is_no_strange_file(
+    made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk can be full after the first shard, whole, and before its record."""
+
+    def full(*_: object) -> None:
+        raise SpadError("the disk is full")
+
+    with monkeypatch.context() as patch, pytest.raises(SpadError, match="full"):
+        patch.setattr(factory, "note", full)
+        make(made[0], tmp_path / "out")
+    assert (tmp_path / "out" / "data").exists()
+    make(made[0], tmp_path / "out")
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
 def test_a_damaged_record_is_made_again(made: tuple[Path, Path], tmp_path: Path) -> None:
     """A loss of power can leave one that is empty."""
     interrupted(made[0], tmp_path / "out", 3)
