@@ -18,11 +18,12 @@ import importlib
 import math
 import os
 import queue
+import re
 import shutil
 import tempfile
 import warnings
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ _PREFIX = "spadmnist-workers-"
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
 _AHEAD = 8  # workers at most that are started before it is known how many tasks there are; the others come with these
+_STATUS = re.compile(r"\b[A-Z]+\((-?\d+)\)")  # how loky says that a worker ended: EXIT(1), SIGKILL(-9)
 _PLACE = "SPADMNIST_WORKERS"  # names another folder for it
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
@@ -128,21 +130,34 @@ class Executor:
 
     def _all(self, function: Callable[[Any], Any], make: Make, keys: Sequence[Any], done: Done) -> None:
         deaths: Counter[Any] = Counter()
-        waiting, alone, hopeless = list(keys), [], False
+        waiting, alone, hopeless, any_done = list(keys), [], False, False
+
+        def counted(key: Any, result: Any) -> None:
+            nonlocal any_done
+            any_done = True
+            done(key, result)
+
         while waiting and not hopeless:
             patience: float = _IN_A_ROW * 2 * self.threads
-            lost, waiting = self._pass(function, make, waiting, done, lambda: 2 * self.threads, patience)
+            lost, waiting = self._pass(function, make, waiting, counted, lambda: 2 * self.threads, patience)
             hopeless = bool(waiting)
-            deaths.update(lost)
+            deaths.update(lost.keys())
             alone += [key for key in lost if deaths[key] >= self.chances]
             waiting += [key for key in lost if deaths[key] < self.chances]
         patience = _IN_A_ROW if hopeless else math.inf
-        killers, left = self._pass(function, make, [*waiting, *alone], done, lambda: 1, patience)
+        killers, left = self._pass(function, make, [*waiting, *alone], counted, lambda: 1, patience)
         if killers:
+            by_itself = self._by_itself(killers.values())
+            if by_itself and not any_done:
+                raise SpadError(
+                    f"every worker of this machine {by_itself}, and nothing was made; give --jobs 1, which needs no "
+                    "workers, or see that this user may read and run this Python and its packages"
+                )
             rest = "what is complete is kept" if left else "all else is complete"
+            cure = "mend what ends it" if by_itself else "free some memory or give fewer --jobs"
             raise SpadError(
-                f"a worker died each time it made {', '.join(map(str, killers))} (out of memory?); {rest}: free some "
-                "memory or give fewer --jobs, and type the same command again"
+                f"a worker died each time it made {', '.join(map(str, killers))} ({by_itself or 'out of memory?'}); "
+                f"{rest}: {cure}, and type the same command again"
             )
 
     def _pass(
@@ -153,15 +168,15 @@ class Executor:
         done: Done,
         window: Callable[[], int],
         patience: float,
-    ) -> tuple[list[Any], list[Any]]:
-        """Try each key once; (those lost with their workers, those that were not tried).
+    ) -> tuple[dict[Any, Exception], list[Any]]:
+        """Try each key once; (those lost with their workers and what was raised, those that were not tried).
 
         Args:
             window: how many tasks are handed out at a time.
             patience: how many may be lost in a row before no more is tried.
         """
         left, tasks, in_a_row = deque(keys), make(keys), 0
-        lost: list[Any] = []
+        lost: dict[Any, Exception] = {}
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         under_way: dict[Any, Any] = {}
         while True:
@@ -179,7 +194,7 @@ class Executor:
                 if not self._is_death(error):
                     raise
                 in_a_row += 1
-                lost.append(key)
+                lost[key] = error
                 continue
             in_a_row = 0
             done(key, result)
@@ -201,6 +216,10 @@ class Executor:
     def _is_death(self, error: BaseException) -> bool:
         """Does what a future raised say that its worker died?"""
         raise NotImplementedError
+
+    def _by_itself(self, deaths: Iterable[Exception]) -> str:
+        """In words, how workers ended of which none was killed; empty where one was, or where it is not known."""
+        return ""
 
     def _end(self) -> None:
         """End what is under way."""
@@ -296,6 +315,12 @@ class Loky(Executor):
         from loky.process_executor import TerminatedWorkerError
 
         return isinstance(error, TerminatedWorkerError)
+
+    def _by_itself(self, deaths: Iterable[Exception]) -> str:
+        statuses = {int(status) for death in deaths for status in _STATUS.findall(str(death))}
+        if not statuses or min(statuses) < 0:  # a negative one is a signal
+            return ""
+        return f"ended by itself with status {', '.join(map(str, sorted(statuses)))}"
 
     def _end(self) -> None:
         import multiprocessing

@@ -184,6 +184,19 @@ def test_where_all_workers_die_not_every_task_is_tried(workers: Executor) -> Non
     assert tried < 50
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a worker is started by what sys.executable names")
+def test_workers_that_cannot_start_are_not_blamed_on_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    Loky(2)._end()  # those that are there
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(SpadError, match=r"every worker .* status 1, and nothing was made; give --jobs 1"):
+        Loky(2).run(square, iter, range(4), lambda key, result: None)
+
+
+def test_a_task_that_ends_its_worker_is_not_blamed_on_memory() -> None:
+    with pytest.raises(SpadError, match=r"each time it made 2 \(ended by itself with status 3\); all else is complete"):
+        Loky(2).run(leave_at_two, iter, range(4), lambda key, result: None)
+
+
 # --- scale --------------------------------------------------------------------------------------------------------
 
 
@@ -195,6 +208,11 @@ def test_a_hundred_thousand_tasks() -> None:
     StandIn().run(square, iter, range(100_000), found.__setitem__)
     assert time.monotonic() - started < 200
     assert len(found) == 100_000 and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+
+
+def leave_at_two(number: int) -> None:
+    if number == 2:
+        os._exit(3)
 
 
 def which(_: object) -> int:
