@@ -155,9 +155,11 @@ class Measurement:
         if layout.shape != mine.shape:
             part = ""
             if mine.rows <= layout.rows and mine.columns <= layout.columns:
+                rows, columns = f"0:{mine.rows}", f"0:{mine.columns}"
                 part = (
-                    f", or, where a part of the sensor was measured, say which: --crop 0:{mine.rows},0:{mine.columns} "
-                    "if it begins at the first row and column (its corner must be put right)"
+                    f", or, where a part of the sensor was measured, say which to simulate, compare, diagnose or fit: "
+                    f"--crop {rows},{columns} (in Python sensor.cropped) if it begins at the first row and column (its "
+                    "corner must be put right)"
                 )
             raise InputError(
                 f"{self.source}: layout has {_size(mine)} pixels, but the sensor {_size(layout)}; correct one of "
