@@ -18,7 +18,6 @@ import re
 import secrets
 import shutil
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, golden, plugins, reconstruct, shard_facts, store, system
+from . import config, dataset, disk, document, golden, leftovers, plugins, reconstruct, shard_facts, store, system
 from .compiled import compiling
 from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
@@ -129,12 +128,15 @@ class Progress:
 @functools.lru_cache(maxsize=2)
 def _experiment(job: Job) -> Experiment:
     plugins.load_carried(job.plugins)
-    with tempfile.TemporaryDirectory(prefix="spadmnist-maps-") as folder:
+    folder = leftovers.temporary("maps")
+    try:
         for name, data in job.maps:
-            path = Path(folder, name)
+            path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        experiment = config.build(document.parse(job.config, "config"), Path(folder))
+        experiment = config.build(document.parse(job.config, "config"), folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
     return replace(experiment, encoding=job.encoding)
 
 

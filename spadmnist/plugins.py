@@ -8,7 +8,6 @@ has been imported: by `discover` (the package's own places and the entry points 
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import importlib
 import importlib.abc
@@ -18,9 +17,7 @@ import inspect
 import io
 import pkgutil
 import re
-import shutil
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -30,7 +27,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from . import disk, units
+from . import disk, leftovers, units
 from .errors import EffectError, InputError, UnknownName, did_you_mean
 
 PLACES = ("spadmnist.effects", "spadmnist.reconstruct", "spadmnist.statistics")  # packages or modules
@@ -673,8 +670,7 @@ def load_carried(files: Iterable[Carried]) -> None:
                 here = False
             path = Path(file.path)
             if not here:
-                path = Path(tempfile.mkdtemp(prefix="spadmnist-plugin-")) / path.name
-                atexit.register(shutil.rmtree, path.parent, ignore_errors=True)
+                path = leftovers.temporary("plugin") / path.name
                 path.write_text(file.text, encoding="utf-8")
             load_file(path)
 

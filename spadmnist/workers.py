@@ -5,13 +5,11 @@ workers of a dask.distributed scheduler). They keep one contract, that of `Execu
 here once, and an executor says how a task is handed to a worker, and which errors mean that the worker died.
 
 Processes that were killed together with their workers leave semaphores of the system. So all of one process bear the
-name of one folder, which it holds locked for as long as it lives: the next process of the same user that works, with
-workers or alone, removes what nobody holds.
+name of its folder (`leftovers`), and go with what else a killed one left.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import functools
 import importlib
@@ -19,28 +17,22 @@ import math
 import os
 import queue
 import re
-import shutil
-import tempfile
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import system
+from . import leftovers, system
 from .errors import SpadError
 
 Make = Callable[[Sequence[Any]], Iterator[Any]]  # keys -> the task of each, made when it is called for
 Done = Callable[[Any, Any], None]  # called with a key and its result
 
-_MEMORY = Path("/dev/shm")  # files that are memory, and the semaphores of Linux
-_LEAST = 2 << 30  # bytes of it, from which on the folder is put there
-_PREFIX = "spadmnist-workers-"
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
 _AHEAD = 8  # workers at most that are started before it is known how many tasks there are; the others come with these
 _STATUS = re.compile(r"\b[A-Z]+\((-?\d+)\)")  # how loky says that a worker ended: EXIT(1), SIGKILL(-9)
-_PLACE = "SPADMNIST_WORKERS"  # names another folder for it
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
     *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
@@ -237,7 +229,7 @@ class Serial(Executor):
         """As `Executor.run`; a task that kills takes this process with it."""
         from .heap import keep_freed_memory
 
-        clear_once(os.getpid())
+        leftovers.clear_once(os.getpid())
         keep_freed_memory()
         for key, task in zip(keys, make(keys), strict=True):
             done(key, function(task))
@@ -278,8 +270,8 @@ class Loky(Executor):
         silence = "ignore:resource_tracker:UserWarning" if debugging else "ignore"
         quiet = {"PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", silence)}
         with safe_path(), _environment({**quiet, **compiled.for_workers()}):
-            clear_once(os.getpid())
-            _own_place(os.getpid())
+            leftovers.clear_once(os.getpid())
+            _name_semaphores(os.getpid())
             self._started = max(self._started, min(self.threads, number))
             # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
             warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
@@ -299,7 +291,7 @@ class Loky(Executor):
         options: dict[str, Any] = {
             "timeout": _IDLE,
             "initializer": _start_worker,
-            "initargs": (os.getpid(),),
+            "initargs": (os.getpid(), leftovers.own(os.getpid())),
             "env": {name: os.environ.get(name, each) for name in _THREADS},
         }
         # workers, which this may start, never see Ctrl-C: not while they import what they need, either
@@ -340,29 +332,26 @@ def _imported(module: str) -> None:
     importlib.import_module(module)
 
 
-def _start_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing."""
+def _start_worker(parent: int, folder: Path | None) -> None:
+    """Leave Ctrl-C to the parent, and die with it: an orphan must not go on writing. folder: of the parent."""
     import signal
 
     from .heap import keep_freed_memory
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     system.end_with(parent)
+    leftovers.lend(folder)
     keep_freed_memory()
 
 
-# --- what is left of the killed -----------------------------------------------------------------------------------
+# --- semaphores ---------------------------------------------------------------------------------------------------
 
 
 @functools.cache
-def _own_place(process: int) -> None:
-    """Make the folder of this process, whose name its semaphores bear; where it cannot be made, they keep theirs."""
-    held = next(filter(None, map(_made, _places())), None)
-    if held is None:
-        return
-    folder, lock = held
-    atexit.register(_remove_own, folder, lock, process)  # loky's own come later, and so are called before it
-    if _MEMORY.is_dir():
+def _name_semaphores(process: int) -> None:
+    """Give the semaphores of this process the name of its folder; where that cannot be made, they keep theirs."""
+    folder = leftovers.own(process)
+    if folder is not None and leftovers.SEMAPHORES.is_dir():
         from loky.backend.synchronize import SemLock
 
         names = SemLock._rand
@@ -377,81 +366,6 @@ class _Names:
 
     def __next__(self) -> str:
         return f"{self.owner}-{next(self.names)}"
-
-
-@functools.cache
-def clear_once(process: int) -> None:
-    """Remove what killed processes left, the first time that this process asks for it."""
-    clear()
-
-
-def clear() -> int:
-    """Remove what processes of this user left that are no more; of how many."""
-    count = 0
-    for place in dict.fromkeys(_places(all_of_them=True)):
-        with contextlib.suppress(OSError):
-            for entry in list(os.scandir(place)):
-                if entry.name.startswith(_PREFIX) and (held := _held(Path(entry.path))) is not None:
-                    _remove(Path(entry.path))
-                    held.close()
-                    count += 1
-    return count
-
-
-def _places(all_of_them: bool = False) -> Iterator[Path]:
-    """Where the folder may lie."""
-    if told := os.environ.get(_PLACE):
-        yield Path(told)
-    with contextlib.suppress(OSError):
-        if all_of_them or shutil.disk_usage(_MEMORY).free > _LEAST:
-            yield _MEMORY
-    with contextlib.suppress(OSError):  # there is no folder for temporary files
-        yield Path(tempfile.gettempdir())
-
-
-def _made(place: Path) -> tuple[Path, system.Lock] | None:
-    """A new folder, and its lock; None where it cannot be made or be held."""
-    try:
-        while True:
-            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=place))
-            if (lock := _held(folder)) is not None:
-                return folder, lock
-            if folder.exists():  # the file system knows no locks
-                folder.rmdir()
-                return None
-    except OSError:
-        return None
-
-
-def _held(folder: Path) -> system.Lock | None:
-    """The lock of a folder of this user; None where another process has it, or it is no such folder."""
-    if not system.LOCKS_FOLDERS or folder.is_symlink() or not folder.is_dir():
-        return None
-    try:
-        lock = system.Lock(folder)
-    except (OSError, system.Busy):
-        return None
-    if lock.is_own():
-        return lock
-    lock.close()
-    return None
-
-
-def _remove_own(folder: Path, lock: system.Lock, process: int) -> None:
-    """The end of the process that the folder belongs to; one that divided from it leaves it alone."""
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)
-        lock.close()
-
-
-def _remove(folder: Path) -> None:
-    """A folder that this process holds, and the semaphores of its name."""
-    with contextlib.suppress(OSError):
-        for entry in list(os.scandir(_MEMORY)):
-            if entry.name.startswith("sem.") and f"-{folder.name}-" in entry.name:
-                with contextlib.suppress(OSError):
-                    os.unlink(entry.path)
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager

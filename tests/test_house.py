@@ -24,7 +24,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 # a module imports from layers below its own, and within its own only along an arrow
 LAYERS = [
     {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "system"},
-    {"compiled", "import_options"},
+    {"compiled", "import_options", "leftovers"},
     {"disk", "kernels", "large", "sources", "workers"},
     {"archive"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},

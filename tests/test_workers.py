@@ -20,7 +20,7 @@ import tinylab
 from commands import COMMAND
 from test_factory import alive, descendants, wait_for
 
-from spadmnist import workers
+from spadmnist import leftovers
 from spadmnist.workers import executor, safe_path
 
 ROOT = Path(__file__).parents[1]
@@ -212,8 +212,9 @@ def test_the_environment_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 HOLDING = """
 import sys, time
+from spadmnist import leftovers
 from spadmnist.workers import executor
-executor(2).run(abs, iter, range(4), lambda key, result: None)
+executor(2).run(leftovers.temporary, iter, ["plugin", "maps"], lambda key, folder: (folder / "file").touch())
 print("ready", flush=True)
 if "wait" in sys.argv:
     time.sleep(120)
@@ -244,6 +245,8 @@ def test_the_next_run_removes_what_a_killed_one_left_and_nothing_of_a_living_one
     try:
         (left,) = tmp_path.iterdir()
         assert semaphores(left)
+        held_by_workers = {path.parent.name.split("-")[0] for path in left.glob("*/file")}
+        assert held_by_workers == {"plugin", "maps"}, "workers use the folder of their parent"
         os.killpg(killed.pid, signal.SIGKILL)
         killed.wait(10)
         assert wait_for(lambda: not alive([p for p in descendants(psutil.Process()) if p.pid not in others]), 60)
@@ -270,7 +273,7 @@ def test_the_next_run_removes_what_a_killed_one_left_and_nothing_of_a_living_one
                 os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
         monkeypatch.setenv("SPADMNIST_WORKERS", str(tmp_path))
-        workers.clear()
+        leftovers.clear()
 
 
 def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,14 +283,14 @@ def test_what_is_anothers_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monk
     folder.mkdir()
     with monkeypatch.context() as other:
         other.setattr(os, "geteuid", lambda: os.getuid() + 1)
-        workers.clear()
+        leftovers.clear()
         assert folder.is_dir()
     handle = os.open(folder, os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
-    workers.clear()
+    leftovers.clear()
     assert folder.is_dir()
     os.close(handle)
-    workers.clear()
+    leftovers.clear()
     assert not folder.exists()
 
 
@@ -300,7 +303,7 @@ def test_a_run_without_workers_removes_it_too(tmp_path: Path, monkeypatch: pytes
     (folder / "array").write_bytes(b"left")
     semaphore = MEMORY / f"sem.loky-1-{folder.name}-abc"
     semaphore.touch()
-    workers.clear_once.cache_clear()
+    leftovers.clear_once.cache_clear()
     try:
         found: dict[int, int] = {}
         executor(1).run(abs, iter, [-1], found.__setitem__)
