@@ -227,8 +227,9 @@ def test_nothing_is_evaluated_and_no_global_random_state_is_used(file: str) -> N
         assert not re.fullmatch(r"np\.random\.[a-z_]+", name), f"{file}:{line} calls {name}"
 
 
-def own_effects() -> set[str]:
-    return {n for n in Effect.registry if Effect.registry.find(n).__module__.startswith("spadmnist.")}
+@functools.cache
+def own_effects() -> frozenset[str]:
+    return frozenset(n for n in Effect.registry if Effect.registry.find(n).__module__.startswith("spadmnist."))
 
 
 @pytest.mark.parametrize("file", list(MODULES))
