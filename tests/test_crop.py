@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import json
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -648,8 +650,8 @@ def test_a_fit_and_a_diagnosis_say_which_part_they_are_of(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     told = ["--jobs", "1", "--json", "answer.json", *crop]
     line = ["fit", "sensor.yaml", "lab", "--per-pixel", "dark_counts.rate", "-o", "next.yaml", *told]
-    done = commands.run(*line, cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
+    fitted = commands.run(*line, cwd=tmp_path)
+    assert fitted.returncode == 0, fitted.stdout + fitted.stderr
     assert json.loads((tmp_path / "answer.json").read_text())["crop"] == "2:5,1:4"
     assert "of rows and columns 2:5,1:4" in (tmp_path / "next.yaml").read_text()
     found = config.read_sensor(tmp_path / "next.yaml").effect("dark_counts").rate.reshape(6, 6)
@@ -663,7 +665,9 @@ def test_a_fit_and_a_diagnosis_say_which_part_they_are_of(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "answer.json").read_text())["crop"] == "2:5,1:4"
     assert "its rows and columns 2:5,1:4" in (tmp_path / "next" / "report.html").read_text()
     assert config.read_sensor(tmp_path / "next" / "sensor.yaml").layout.shape == (6, 6)
-    done = commands.run("compare", "next.yaml", "lab", "--jobs", "1", *crop, cwd=tmp_path)
+    typed = re.search(r"Next: spadmnist (compare next.yaml lab .*) checks", fitted.stdout)
+    assert typed, "the next command is about the same part"
+    done = commands.run(*shlex.split(typed[1]), "--jobs", "1", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -164,11 +164,12 @@ def load_plugins(plugin_files: tuple[Path, ...]) -> None:
         plugins.load_file(file)
 
 
-def again(measurement: Path, plugin_files: tuple[Path, ...]) -> str:
-    """MEASUREMENT and the plug-ins, as the next command names them, quoted for a shell."""
+def again(measurement: Path, plugin_files: tuple[Path, ...], crop: str | None) -> str:
+    """MEASUREMENT, the part of the sensor and the plug-ins, as the next command names them, quoted for a shell."""
     from ..foreign import quoted
 
-    return " ".join([quoted(measurement), *(f"--plugin {quoted(file)}" for file in plugin_files)])
+    part = [] if crop is None else [f"--crop={''.join(crop.split())}"]  # it was parsed: numbers, colons and a comma
+    return " ".join([quoted(measurement), *part, *(f"--plugin {quoted(file)}" for file in plugin_files)])
 
 
 def model_of(sensor: Path, crop: str | None) -> Sensor:

@@ -75,7 +75,7 @@ def compare(
             progress=progress,
         )
     _write_answer(json_file, comparison.canonical(found))
-    what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files))
+    what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files, crop))
     if output is not None:
         terminal.say(f"Report: {found.save(output, command=_command(), then=what)}")
     terminal.print_lines(f"{found}\n\nNext: {what}")
@@ -150,7 +150,7 @@ def diagnose(
         _write_sensor(found, output / SENSOR)
     new = quoted(found.file or f"next/{SENSOR}")
     same = f"-o {quoted(output or 'next')}{' --quick' if quick else ''}"
-    again = options.again(measurement, plugin_files)
+    again = options.again(measurement, plugin_files, crop)
     what = next_step.after_diagnosis(found.found, quoted(sensor), again, new, same)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
@@ -212,7 +212,7 @@ def fit(
     )
     _write_sensor(found, output)
     _write_answer(json_file, results.canonical(found.found))
-    again = options.again(measurement, plugin_files)
+    again = options.again(measurement, plugin_files, crop)
     what = next_step.after_diagnosis(found.found, quoted(sensor), again, quoted(found.file or output))
     terminal.print_lines(f"{found}\n\nNext: {what}")
     if found.unwritten:

@@ -10,11 +10,12 @@ import numpy as np
 from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
 from .gauss_newton import Fit, gauss_newton
 from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
-from .model_path import ModelPath, fit_all, keys_of
+from .model_path import ModelPath, fit_all, keys_of, without_fit
 from .models import Model
 from .replicates import FEW, TOTALS, Cell
 from .results import Step, title
 from .signature import residuals_at, signatures
+from .trial_fits import fit_trial
 
 _MOSTLY = 0.95  # of the excess misfit: a step that explains as much is no look-alike, whatever its law leaves
 _CHANCE = 3.0  # standard deviations of a mean square: as much is left by noise
@@ -57,6 +58,7 @@ def drop_needless(path: ModelPath) -> None:
             path.scan.accepted.remove(step.candidate)
             path.values = rest
             fit_all(path)
+            _fit_from_templates(path)
             path.rung(f"- {title(step.candidate)}")
 
 
@@ -79,7 +81,33 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
     if missed:
         path.back_to(before)
     else:
+        _fit_from_templates(path)
         path.rung(f"- {title(step.candidate)}")
+
+
+def _fit_from_templates(path: ModelPath) -> None:
+    """Fit the steps that have shapes once more, each from its own templates; kept where the squares fall.
+
+    A shape that was fitted beside the dropped step may lie where no gradient leads to the better one.
+    """
+    for step in path.steps:
+        if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates:
+            continue
+        before, steps = path.kept(), path.steps
+        path.steps = [other for other in steps if other is not step]
+        path.scan.accepted = [c for c in path.scan.accepted if c is not step.candidate]
+        path.values = {k: x for k, x in path.values.items() if k not in keys_of(step.candidate, path)}
+        evaluation = without_fit(path)
+        found = path.scan.looked_at(evaluation, step.candidate, path.scan.begun(evaluation, step.candidate))
+        best = max(found, key=lambda one: one.gain, default=None)
+        rest, accepted = path.values, path.scan.accepted
+        if best is not None:
+            best = fit_trial(path.replicates, evaluation, best)
+            path.steps, path.scan.accepted = steps, [*accepted, step.candidate]
+            path.values = {**rest, **best.values}
+            fit_all(path)
+        if best is None or square(path.evaluation.residuals) > square(before[0].residuals) - _NEEDLESS:
+            path.back_to(before)
 
 
 def drop_mimics(path: ModelPath, start: Evaluation, totals: bool) -> None:

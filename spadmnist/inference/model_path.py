@@ -80,12 +80,15 @@ class ModelPath:
     def kept(self) -> tuple[Any, ...]:
         """A copy of all that a step changes, for `back_to`."""
         own = (self.evaluation, dict(self.values), list(self.steps), list(self.ladder), self.fit)
-        return (*own, list(self.scan.accepted), dict(self.scan.phases))
+        fitted = [(step, dict(step.values), step.map) for step in self.steps]  # a fit writes into the steps
+        return (*own, list(self.scan.accepted), dict(self.scan.phases), fitted)
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """Restore the state that `kept` returned."""
         self.evaluation, self.values, self.steps, self.ladder, self.fit = kept[:5]
-        self.scan.accepted, self.scan.phases = kept[5:]
+        self.scan.accepted, self.scan.phases, fitted = kept[5:]
+        for step, values, map_ in fitted:
+            step.values, step.map = values, map_
 
     def rung(self, name: str, steps: Sequence[Step] = ()) -> None:
         """Append the model to the error budget.
@@ -366,6 +369,12 @@ def _model(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
     levels = count_model.light_levels_of(replicates, path.evaluation)
     sensors, maps, path.values = map_models.models_with_maps(replicates, path.values, held, levels)
     return sensors.changed({}, scan.phases, chips), maps
+
+
+def without_fit(path: ModelPath) -> Evaluation:
+    """The evaluation of the model with the values as they are; its maps are fitted."""
+    sensors, _ = _model(path)
+    return evaluate(path.replicates, path.values, sensors)
 
 
 def material(one: Trial) -> str:

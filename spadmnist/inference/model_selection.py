@@ -161,18 +161,14 @@ def _diagnosed(
 @contextlib.contextmanager
 def _or_as_before(path: ModelPath, where: str) -> Iterator[None]:
     """A context that restores the steps where a model in it cannot be simulated, or the budget is spent."""
-    before, earlier = path.kept(), [(step, dict(step.values)) for step in path.steps]
+    before = path.kept()
     try:
         yield
     except OutOfBudget:
         path.back_to(before)
-        for step, values in earlier:
-            step.values = values
         _end(path, where)
     except UNABLE as error:
         path.back_to(before)
-        for step, values in earlier:
-            step.values = values
         for candidate in [step.candidate for step in path.steps[-1:]]:
             path.scan.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
 

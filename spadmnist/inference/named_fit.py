@@ -251,4 +251,22 @@ def _named(
     if kind == "set" and not listed and effect in Effect.registry:
         raise InputError(f"--free {name}: the sensor does not list {effect}; --add {effect} adds it and fits it")
     able = sorted({c.effect + (f".{c.parameter}" if c.parameter else "") for c in every if c.kind == kind})
-    raise InputError(f"{name} cannot be fitted here; those that can: {', '.join(able)}.{did_you_mean(name, able)}")
+    others = f"; those that can: {', '.join(able)}.{did_you_mean(name, able)}" if able else ""
+    raise InputError(f"{name} cannot be fitted here{_why_not(kind, effect, parameter, listed)}{others}")
+
+
+def _why_not(kind: str, effect: str, parameter: str | None, listed: bool) -> str:
+    """Why a parameter of a listed effect is no candidate, as far as its declaration tells."""
+    declared = Effect.registry.find(effect).parameters.get(parameter or "") if listed else None
+    if declared is None:
+        return ""
+    if kind == "set" and Effect.registry.find(effect).stage in ("light", "detection"):
+        return (
+            ": a common factor is the same as another light level, which every fit and compare give (light, of what is "
+            "stated)"
+        )
+    if declared.search is None:
+        return ": it has no range in which it is looked for"
+    if kind == "per_pixel" and declared.per != "pixel":
+        return ": it is one number for all pixels"
+    return ": its values are a map, a table or a distribution" if kind == "set" else ""
