@@ -234,7 +234,8 @@ def _another(path: ModelPath, notes: Notes) -> bool:
         return False
     if scan.only_rates(path.evaluation) and _by_setup(path, notes):
         return False
-    first = ", ".join(" of ".join(b.cell[::-1]).removesuffix(" of ") for b in failed[:4])
+    clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
+    first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
     notes.tried = scan.scan(path.evaluation, known=notes.tried)
     return _added(path, notes, failed)

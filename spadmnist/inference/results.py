@@ -90,6 +90,10 @@ class Step:
     jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
 
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name} {shown(v)}" for name, v in self.values.items())
+        return f"<{title(self.candidate)}: {numbers}>" if numbers else f"<{title(self.candidate)}>"
+
     def as_data(self) -> dict[str, Any]:
         kind = "per_pixel" if self.candidate.kind == "per_pixel" else self.candidate.kind
         return {
@@ -345,6 +349,10 @@ def _limit(entry: Mapping[str, Any]) -> str:
 
 def sentence(found: Diagnosis) -> str:
     """The verdict in words."""
+    if not found.finished and found.verdict == "unexplained":
+        so_far = f" beside {' and '.join(title(s.candidate) for s in found.steps)}" if found.steps else ""
+        what = f" What differs: {remains(found)}." if found.unexplained else ""
+        return f"not finished: the budget ended before an explanation was found{so_far}.{what}"
     if not found.finished:
         return "not finished; the verdict is that of the steps so far: " + sentence(
             dataclasses.replace(found, finished=True)
@@ -355,7 +363,7 @@ def sentence(found: Diagnosis) -> str:
     if found.verdict == "adequate":
         return "nothing is missing that this measurement could show."
     if found.verdict == "setup":
-        return "the set-up explains the deviations; no change of the sensor is needed."
+        return "the set-up explains the deviations; nothing here asks for a change of the sensor."
     if found.verdict == "explained":
         return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model."
     if found.verdict == "confused" and found.setup and not found.steps:

@@ -251,7 +251,7 @@ def _signature(
             if cell not in evaluation.residuals:
                 continue
             if values.shape[1] != len(evaluation.residuals[cell]):
-                return f"{id}: its {name} has other cells than the measurement's"
+                return f"{id}: its {name} comes out in other bins than those of the measurement"
             null = evaluation.nulls[cell]
             nothing = nothing and np.array_equal(values, base.values[name][some])
             # chips with odd pixels may have many more detections; the expectation holds within the range of the

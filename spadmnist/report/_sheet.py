@@ -229,7 +229,8 @@ def _round(value: float, up: bool) -> float:
 
 def _cells_of(shown: _Shown, times: tuple[float, float] | None) -> list[_Cell]:
     """The cells of one row."""
-    cells = [_Cell("original", "grey level", *_grey(shown.originals))]
+    of = "grey level, of 16 bits" if shown.originals.dtype == np.uint16 else "grey level"
+    cells = [_Cell("original", of, *_grey(shown.originals))]
     if shown.first is not None and shown.counts is not None:
         caption = f"{number(float(shown.counts.mean()))} detections/pixel"
         cells.append(_Cell("TR", "time of the first detection", _in_colours(shown.first, times), caption))
@@ -275,8 +276,14 @@ def _grey(values: np.ndarray, white: float | None = None, clip: float = math.inf
     if largest > white > 0:
         caption = f"white: {white:.4g} (max {f'{largest:,.0f}' if largest < 1e7 else f'{largest:.0e}'})"
     elif white > 0:
-        caption = f"white: {white:.4g}, mean {float(values.mean(dtype=np.float64)):.3g}"
+        mean = float(values.mean(dtype=np.float64))
+        caption = f"white: {_plain(white, 4)}, mean {_plain(mean, 3)}"
     return _bytes_of(rgb), caption
+
+
+def _plain(value: float, digits: int) -> str:
+    """A number of a caption: grey levels of 16 bits are no powers of ten."""
+    return f"{value:,.0f}" if 1000 <= value < 1e6 else f"{value:.{digits}g}"
 
 
 def _in_colours(first: np.ndarray, times: tuple[float, float] | None) -> np.ndarray:
