@@ -335,17 +335,17 @@ class Sensor:
         dark = rate - light
         for effect in self.at("arrival"):
             if effect.acts_on == "light":
-                light = effect.expected_rate(light, conditions)
+                light = self._call(effect, "expected_rate", light, conditions)
             else:
-                dark = effect.expected_rate(dark, conditions)
+                dark = self._call(effect, "expected_rate", dark, conditions)
         rate = light + dark if self.at("arrival") else rate
         for stage in ("gate", "correlated"):
             for effect in self.at(stage):
-                rate = effect.expected_rate(rate, conditions)
+                rate = self._call(effect, "expected_rate", rate, conditions)
         candidates = rate
         for stage in ("dead_time", "timing", "readout"):
             for effect in self.at(stage):
-                rate = effect.expected_rate(rate, conditions)
+                rate = self._call(effect, "expected_rate", rate, conditions)
         return candidates * conditions.exposure, rate * conditions.exposure
 
     def caused(self) -> dict[str, float]:

@@ -444,7 +444,7 @@ def _expected_rate(trial: _Trial) -> str | None:
 
     Within 5 standard errors and 2 % of the change that the effect makes: some laws are first orders or bounds.
     """
-    if trial.kind.expected_rate is Effect.expected_rate:
+    if trial.kind.expected_rate is Effect.expected_rate and not trial.kind.has_mean:
         return "it has none of its own"
     lacking = ("correlated", "dead_time")
     sensor, plain = trial.sensor("device", lacking=lacking), _sensor(None, "device", None, trial.kind.name, lacking)

@@ -28,9 +28,10 @@ is simulated part by part, where all effects that draw count their draws and no 
 
 Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
 it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
-of its mean; an arrival effect gets the part of the rate that it acts on. And `influence()`, how far its events reach.
-With `by_pixel = True` on the class, closed forms of a part of a chip are computed for that part alone: set it where
-`apply` of rates and `expected_rate` give each pixel a value that depends on that pixel alone.
+of its mean; an arrival effect gets the part of the rate that it acts on, and by default the mean of `factor` or `open`
+is taken. And `influence()`, how far its events reach. With `by_pixel = True` on the class, closed forms of a part of a
+chip are computed for that part alone: set it where `apply` of rates and `expected_rate` give each pixel a value that
+depends on that pixel alone.
 """
 
 from __future__ import annotations
@@ -62,6 +63,11 @@ STAGES: dict[str, tuple[str, ...]] = {
     "timing": ("apply",),
     "readout": ("apply", "limit"),
 }
+
+
+_TIMES = 1 << 14  # at which a default mean is taken: within 1e-3 of it, or 4e-3 for what opens and shuts in each frame
+_GOLDEN = (math.sqrt(5) - 1) / 2  # of the exposure: times that are even, and in step with no period
+_NO_CHANGE = 1e-3  # a default mean nearer to 1 is 1: the error of the times
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,8 @@ class Effect(Plugin, abstract=True):
     shown: ClassVar[dict[str, Any]] = {}
     mimic: ClassVar[Mimic | None] = None
 
+    has_mean: ClassVar[bool] = False  # `expected_rate` has the mean of `factor` or `open` to take
+
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         if stage is not None:
             cls.stage = stage
@@ -175,6 +183,7 @@ class Effect(Plugin, abstract=True):
         if not any(set(group.split("+")) <= have for group in STAGES[chosen]):
             ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
             raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
+        cls.has_mean = "open" in have or ("factor" in have and "modulate" not in have)
         super().__init_subclass__(**keywords)
         if not keywords.get("abstract") and not vars(cls).get("cause"):
             cls.cause = cls.name
@@ -183,8 +192,17 @@ class Effect(Plugin, abstract=True):
         """Work out what is fixed for a chip; called once, when all parameters have their values."""
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        """Mean rate behind this effect (1/s) from that before it; for planning. Default: unchanged."""
-        return rate
+        """Mean rate behind this effect (1/s) from that before it; for planning, and for the light of a capture.
+
+        Default: times the mean of `factor`, or of `open`, over the exposure; unchanged where there is neither.
+        """
+        if not self.has_mean:
+            return rate
+        hook = "factor" if self.stage == "arrival" else "open"
+        times = conditions.exposure * np.modf((np.arange(_TIMES) + 0.5) * _GOLDEN)[0]
+        mean = float(np.mean(getattr(self, hook)(times, conditions)))
+        # what is no mean is refused where the effect acts; a mean of 1 keeps every digit
+        return rate if not 0 <= mean < math.inf or abs(mean - 1) < _NO_CHANGE else rate * mean
 
     def influence(self) -> float:
         """Pitches up to which what happens in one pixel may change what others record; inf: the whole array.
