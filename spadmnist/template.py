@@ -80,7 +80,7 @@ _EXAMPLES = {
         "The lamp grows brighter (or fainter) at an even pace during the exposure; the mean stays.",
         *("slope", "0.2", "", "relative change from the beginning to the end", "(-2, 2)", "(0.01, 1.0)"),
         """
-    # the mean stays, so that there is no expected_rate to be written
+    # expected_rate, the mean, need not be written here: it is that of factor over the exposure
 
     def maximum(self, conditions):
         # the largest factor there is: the sensor draws at this rate, and thins

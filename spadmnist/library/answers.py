@@ -329,6 +329,8 @@ def _rounded(value: Any) -> Any:
 
 
 def _nth(drawn: Sequence[T], i: int, what: str) -> T:
+    if not drawn:
+        raise InputError(f"figure {i!r}: there are no {what} to draw")
     if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < len(drawn):
         raise InputError(f"figure {i!r}: there are {len(drawn)} {what}, counted from 0")
     return drawn[i]
