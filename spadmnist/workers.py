@@ -39,6 +39,9 @@ _THREADS = (
     "VECLIB_MAXIMUM_THREADS",
 )
 
+# loky ends a worker that has grown by 300 MB and starts another one; here workers keep freed memory on purpose
+_NO_LEAK = {"LOKY_MAX_MEMORY_LEAK_SIZE": os.environ.get("LOKY_MAX_MEMORY_LEAK_SIZE", "1e18")}  # bytes
+
 
 def executor(jobs: int | Executor) -> Executor:
     """The executor that works with so many processes of this machine; one that is an executor already is returned."""
@@ -275,6 +278,8 @@ class Loky(Executor):
             self._started = max(self._started, min(self.threads, number))
             # a worker that ends when it is idle, as it should, while a task comes: loky starts another one
             warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+            # and one that it takes to leak, where it keeps freed memory: of a loky that does not know _NO_LEAK
+            warnings.filterwarnings("ignore", "A worker was restarted while some jobs", UserWarning)
             # those that were started before are still importing while more of them are asked for
             warnings.filterwarnings("ignore", "Trying to resize an executor with running jobs", UserWarning)
             yield
@@ -292,7 +297,7 @@ class Loky(Executor):
             "timeout": _IDLE,
             "initializer": _start_worker,
             "initargs": (os.getpid(), leftovers.own(os.getpid())),
-            "env": {name: os.environ.get(name, each) for name in _THREADS},
+            "env": {**{name: os.environ.get(name, each) for name in _THREADS}, **_NO_LEAK},
         }
         # workers, which this may start, never see Ctrl-C: not while they import what they need, either
         with system.without_interrupt():

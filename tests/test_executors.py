@@ -197,6 +197,14 @@ def test_a_task_that_ends_its_worker_is_not_blamed_on_memory() -> None:
         Loky(2).run(leave_at_two, iter, range(4), lambda key, result: None)
 
 
+@pytest.mark.slow
+def test_a_worker_that_keeps_memory_is_no_leak(recwarn: pytest.WarningsRecorder) -> None:
+    Loky(1)._end()
+    found: dict[int, tuple[int, int]] = {}
+    Loky(1).run(memory_of, iter, range(6), found.__setitem__)
+    assert len({process for process, _ in found.values()}) == 1 and not [str(w.message) for w in recwarn.list]
+
+
 # --- scale --------------------------------------------------------------------------------------------------------
 
 
@@ -208,6 +216,16 @@ def test_a_hundred_thousand_tasks() -> None:
     StandIn().run(square, iter, range(100_000), found.__setitem__)
     assert time.monotonic() - started < 200
     assert len(found) == 100_000 and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+
+
+def memory_of(number: int) -> tuple[int, int]:
+    """(this process, bytes that it holds from now on)."""
+    held.append(b"x" * (400 << 20) if number == 2 else b"")  # what a worker had before is not counted
+    time.sleep(1.2)  # loky looks once a second
+    return os.getpid(), sum(map(len, held))
+
+
+held: list[bytes] = []
 
 
 def leave_at_two(number: int) -> None:
