@@ -43,6 +43,8 @@ from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 240 * 2**20  # bytes (measured: 110 to 230 MB, by the kernels that there are)
+_FEW = 2000  # images at all levels: fewer may well be made by this process alone
+_ALONE = 1.0  # s of one core: less work is done by this process, for workers take 1 to 2 s of both cores to start
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 
@@ -433,6 +435,24 @@ def most_workers(experiment: Experiment, splits: Mapping[str, Images], processor
     """How many workers there may be: one for each processor, as far as memory goes, and one at least."""
     needed = memory_per_worker(experiment, splits, dataset.shards_of(experiment, splits))
     return max(1, min(processors, system.memory() // needed))
+
+
+def few_images(experiment: Experiment) -> bool:
+    """Whether so few images are known to come that workers are not started before it is clear that they are needed."""
+    limit = None if experiment.limit is None else 2 * experiment.limit  # of two splits
+    known = [n for n in (limit, experiment.source.drawn()) if n is not None]
+    return bool(known) and min(known) * len(experiment.levels) <= _FEW
+
+
+def is_small(experiment: Experiment, splits: Mapping[str, Images]) -> bool:
+    """Whether all images are made sooner than workers start."""
+    levels = [level.text for level in experiment.levels]
+    cost = sum(
+        experiment.wanted(images) * _work(experiment, splits, level, split)
+        for split, images in splits.items()
+        for level in levels
+    )
+    return cost < _ALONE
 
 
 def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shards: Sequence[Shard]) -> int:

@@ -278,6 +278,10 @@ class _Source(Section):
         """The splits, each image once; of each split the first `limit` images will do."""
         raise NotImplementedError
 
+    def drawn(self) -> int | None:
+        """How many images there will be, where they are drawn; None where they are read."""
+        return None
+
     def describe(self) -> str:
         """The source in a few words, without reading anything."""
         raise NotImplementedError
@@ -890,6 +894,9 @@ class Digits(_Source):
     columns: int = Field(default=28, ge=8, le=4096, description="columns of pixels")
     seed: int = Field(default=1, ge=0, lt=2**63, description="another seed, other handwriting")
 
+    def drawn(self) -> int | None:
+        return (self.train + self.test) * self.repetitions
+
     def describe(self) -> str:
         return f"{self.train} + {self.test} digits drawn from seed {self.seed}"
 
@@ -923,6 +930,9 @@ class Uniform(_Source):
     source: Literal["uniform"] = "uniform"
     repetitions: int = Field(default=10, ge=1, le=1_000_000, description="number of images")
     grey: int = Field(default=255, ge=0, le=255, description="grey level; 255, white, is the scene's full light")
+
+    def drawn(self) -> int | None:
+        return self.repetitions
 
     def describe(self) -> str:
         return f"{self.repetitions} uniform images of grey {self.grey}"

@@ -93,6 +93,7 @@ def generate(
     from .. import config as configs
     from .. import factory
     from .. import images as sources
+    from ..workers import executor
 
     one = None if part is None else factory.Part.parse(part)
     options.load_plugins(plugin_files)
@@ -101,7 +102,7 @@ def generate(
         terminal.say(f"Note: {note}")
     with options.workers_of(jobs, cluster, no_shared) as workers:
         # they import their libraries while this process reads images; plug-ins may set what they inherit
-        if not (dry_run or plugin_files or (root / "manifest.json").exists()):
+        if not (dry_run or plugin_files or factory.few_images(experiment) or (root / "manifest.json").exists()):
             workers.start("spadmnist.factory")
         images = experiment.load_images(images_dir)
         for note in sources.notes(images):
@@ -117,6 +118,8 @@ def generate(
                 terminal.print_lines(plan.text(estimate, root))
             return
         workers = workers if jobs else workers.limited(most)
+        if jobs is None and workers.local and factory.is_small(experiment, images):
+            workers = executor(1)
         with terminal.progress() as progress:
             outcome = factory.generate(experiment, images, root, workers, progress, one)
     if as_json:
