@@ -65,7 +65,7 @@ lint: $(VENV)/installed
 	$(RUN)/ruff format --check spadmnist scripts tests docs/conf.py docs/_pages
 	$(RUN)/mypy
 
-bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about 4 minutes; never fails on time)
+bench: $(VENV)/installed  ## measure the benchmark's table on this machine (about ten minutes; never fails on time)
 	$(RUN)/python scripts/benchmark.py $(if $(IMAGES),--images-dir $(IMAGES)) --output benchmarks.md
 
 # For example OPTIONS="--limit 20000 --lux all --threads"
