@@ -12,7 +12,9 @@ import pytest
 from scipy import stats
 from tinylab import bench_of
 
+import spadmnist as sp
 from spadmnist.effects import Conditions
+from spadmnist.effects.afterpulsing import Afterpulsing
 from spadmnist.inference.count_model import CountModel
 from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, failing
 from spadmnist.inference.findings import nuisances
@@ -84,6 +86,29 @@ def test_a_sensor_without_dark_counts_is_not_judged_by_how_many_there_are(lab) -
     evaluation = evaluate(replicates, {})
     assert replicates.seen["dark"].total > 300 and totals_space(replicates, evaluation)[0] == ["flat"]
     assert np.all(np.isfinite(evaluation.residuals[TOTALS]))
+
+
+class Unsaid(Afterpulsing, stage="correlated", abstract=True):
+    """Afterpulsing that does not say how many detections it adds."""
+
+    name = "unsaid"
+    states_mean = False
+
+    def expected_rate(self, rate, conditions):
+        return rate
+
+
+def test_an_effect_that_does_not_say_what_it_adds_is_simulated_as_bright_as_the_data(lab) -> None:
+    """A quarter more detections: the replicates have the measured total, and nothing is extrapolated to it."""
+    sensor, _ = lab()
+    own = Sensor(sensor.layout, [*sensor.effects, Unsaid(probability=0.2, lifetime=200e-9)], sensor.rules)
+    flat = sp.Capture("flat", "tr", wavelength=500e-9, irradiance=1e-3, relative_uncertainty=0.02, exposure=20e-3)
+    data = sp.simulate(own, [flat], seed=1)
+    replicates = Replicates(own, data, 0, Serial(), 16)
+    evaluation = evaluate(replicates, {})
+    made, total = evaluation.made["flat"].totals, replicates.seen["flat"].total
+    assert made.min() < total < made.max()
+    assert evaluation.rates["flat"].level == pytest.approx(evaluation.rates["flat"].stated)
 
 
 def test_totals_have_the_share_of_false_alarms_that_compare_gives_them() -> None:

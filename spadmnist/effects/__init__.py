@@ -169,6 +169,7 @@ class Effect(Plugin, abstract=True):
     mimic: ClassVar[Mimic | None] = None
 
     has_mean: ClassVar[bool] = False  # `expected_rate` has the mean of `factor` or `open` to take
+    states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         if stage is not None:
@@ -184,6 +185,9 @@ class Effect(Plugin, abstract=True):
             ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
             raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
         cls.has_mean = "open" in have or ("factor" in have and "modulate" not in have)
+        changes = {"modulate", "spawn", "blind_time", "sensitivity"} & have or (chosen == "readout" and "apply" in have)
+        if "states_mean" not in vars(cls):
+            cls.states_mean = cls.has_mean or not changes or cls.expected_rate is not Effect.expected_rate
         super().__init_subclass__(**keywords)
         if not keywords.get("abstract") and not vars(cls).get("cause"):
             cls.cause = cls.name

@@ -110,6 +110,7 @@ class SourceNoise(Effect, stage="arrival"):
     by_pixel = True
     counted = True
     moves = ("far_pairs", "neighbours", "autocorrelation", "spectrum", "fano", "intervals", "frames_lag", "ceiling")
+    states_mean = True  # the mean light stays
 
     contrast = parameter(0.1, "", "relative standard deviation of the power", bounds=(0, 1), off=0.0, search=(1e-3, 1))
     coherence_time = parameter(

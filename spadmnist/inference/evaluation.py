@@ -19,16 +19,17 @@ from . import replicate_cache
 from .candidates import with_values
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
-from .light_levels import CaptureNull, central_level, law_of, of_mean, own_totals, totals_residuals
+from .light_levels import CaptureNull, central_level, law_of, levels_about, of_mean, own_totals, totals_residuals
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
-from .replicates import TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
+from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
 _PIECES = 4  # tasks of one capture: the number of workers that share it
 _SEEN = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
 # of the log of the ratio of two scatters: the most that counts, and the least that is significant
 _WIDEST, _WIDER = 2.3, 0.5
+_NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
 _FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
 
 
@@ -139,11 +140,12 @@ def _evaluate(
     about, wanted, entries = {}, [], dict[str, str | None]()
     before = dict(known.made) if known else {}
     evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {})
+    centres = _centres(replicates, sensors)
     for id, seen in replicates.seen.items():
         if seen.counts is None:
             evaluation.rates[id], evaluation.factors[id] = of_mean(sensors.usual(id), seen.capture, seen.total, n)
             continue
-        centre, stated, expected, half = central_level(replicates, sensors.usual(id), seen)
+        centre, stated, expected, half = centres[id]
         factors = np.exp(half * spread)
         about[id] = centre, stated, expected, factors
         # the entry does not depend on the data
@@ -186,6 +188,37 @@ def _evaluate(
         [own_totals(replicates, evaluation, k, float(draws[k])) for k in range(n)]
     )
     return evaluation
+
+
+_Centre = tuple[float, float | None, Callable[[float], float], float]  # see `central_level`
+
+
+def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
+    """Of each capture that is simulated, the result of `central_level`.
+
+    Where an effect does not say what it does to the mean, a few replicates do: at another brightness than the measured
+    one, every expectation would be extrapolated to the measured total.
+    """
+    out = {
+        id: central_level(replicates, sensors.usual(id), seen)
+        for id, seen in replicates.seen.items()
+        if seen.counts is not None
+    }
+    some = [id for id in out if not all(effect.states_mean for effect in sensors.usual(id).effects)]
+    numbers = np.arange(FEW, dtype=np.uint64)
+    pilots = replicates.simulate([(sensors, id, np.full(FEW, out[id][0]), numbers) for id in some]) if some else []
+    for id, made in zip(some, pilots, strict=True):
+        if isinstance(made, str):
+            continue  # the replicates themselves will say so
+        centre, stated, expected, half = out[id]
+        logs = np.log(np.maximum(made.totals, 0.5))
+        off = float(logs.mean()) - math.log(expected(centre))
+        if abs(off) > half + _NOISE * float(np.std(logs, ddof=1)) / math.sqrt(FEW):
+            seen = replicates.seen[id]
+            # the total at which the closed form would have to be, for the measured one to come out
+            centre, half = levels_about(expected, seen.total / math.exp(off), stated, seen.capture)
+            out[id] = centre, stated, expected, half
+    return out
 
 
 def far_wider(scatter: float, expected: float) -> bool:
