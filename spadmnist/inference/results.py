@@ -25,6 +25,13 @@ from .replicates import Cell
 if TYPE_CHECKING:
     from .pixel_maps import PixelMap
 
+# the values of a map in words, in which the one after the other is read
+_OF_A_MAP = {
+    "sigma": "spread of the bulk",
+    "low_fraction": "share far below it",
+    "low_ratio": "these at",
+    "high_fraction": "share far above it",
+}
 NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
 # what remains, in words, by what a statistic compares (`Statistic.among`)
 _WHO = {
@@ -230,7 +237,8 @@ def table(found: Diagnosis) -> str:
     """The result as text for a terminal: the verdict, the steps, the ladder."""
     lines = [*textwrap.wrap(f"{found.verdict.upper().replace('_', ' ')}: {sentence(found)}", 100), ""]
     for number, step in enumerate(found.steps, 1):
-        parts = [f"{name} {shown(v)}" for name, v in step.values.items()]
+        words = _OF_A_MAP if step.candidate.carrier else {}
+        parts = [f"{words.get(name, name)} {shown(v)}" for name, v in step.values.items()]
         text = f"{number}. {title(step.candidate)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
         text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
         lines += textwrap.wrap(text, 100, subsequent_indent="   ")
