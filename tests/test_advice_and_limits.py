@@ -120,6 +120,27 @@ def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
     assert path.ladder[-1].model == "- afterpulsing"
 
 
+def test_what_was_fitted_beside_a_needless_step_is_fitted_from_its_own_templates(lab):
+    """A lifetime of 450 ns has no gradient that leads to the true one of 25 ns."""
+    path = begin(bench_of(lab("    afterpulsing: {probability: 5 %, lifetime: 25 ns}\n")))
+    taken(path, "add crosstalk", {CROSSTALK: 1e-4}, fitted=False)
+    taken(path, "add afterpulsing", {PROBABILITY: 2e-3, LIFETIME: 450e-9}, fitted=False)
+    drop_needless(path)
+    assert names(path) == ["add afterpulsing"]
+    assert path.values[LIFETIME] == pytest.approx(25e-9, rel=0.3)
+    assert path.values[PROBABILITY] == pytest.approx(0.05, rel=0.3)
+
+
+def test_going_back_restores_the_values_of_the_steps_before(lab):
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
+    taken(path, "add crosstalk", {CROSSTALK: 0.03})
+    kept, values = path.kept(), dict(path.steps[0].values)
+    taken(path, "add afterpulsing", {PROBABILITY: 1e-3, LIFETIME: 50e-9})
+    assert path.steps[0].values != values  # all steps are fitted together
+    path.back_to(kept)
+    assert names(path) == ["add crosstalk"] and path.steps[0].values == values
+
+
 def test_a_step_that_is_needed_stays(lab):
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n    afterpulsing: {probability: 5 %}\n")))
     taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 25e-9}, fitted=False)

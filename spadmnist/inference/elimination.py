@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..errors import SpadError
 from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
 from .gauss_newton import Fit, gauss_newton
 from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
@@ -101,11 +102,14 @@ def _fit_from_templates(path: ModelPath) -> None:
         found = path.scan.looked_at(evaluation, step.candidate, path.scan.begun(evaluation, step.candidate))
         best = max(found, key=lambda one: one.gain, default=None)
         rest, accepted = path.values, path.scan.accepted
-        if best is not None:
-            best = fit_trial(path.replicates, evaluation, best)
-            path.steps, path.scan.accepted = steps, [*accepted, step.candidate]
-            path.values = {**rest, **best.values}
-            fit_all(path)
+        try:
+            if best is not None:
+                best = fit_trial(path.replicates, evaluation, best)
+                path.steps, path.scan.accepted = steps, [*accepted, step.candidate]
+                path.values = {**rest, **best.values}
+                fit_all(path)
+        except SpadError:  # it cannot be simulated there
+            best = None
         if best is None or square(path.evaluation.residuals) > square(before[0].residuals) - _NEEDLESS:
             path.back_to(before)
 
