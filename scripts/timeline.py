@@ -244,10 +244,13 @@ def traced_executor(inner: Any, run: Run) -> Any:
         def __init__(self) -> None:
             self.__dict__.update(inner.__dict__)
 
+        def __enter__(self) -> Any:
+            watch_parent(run)  # the verb has imported its libraries
+            return super().__enter__()
+
         def start(self, module: str) -> None:
             with SPANS.span("start the workers"):
                 super().start(module)
-            watch_parent(run)  # only now: the verb imports its libraries after it has started its workers
 
         def run(
             self, function: Callable[[Any], Any], make: Any, keys: Sequence[Any], done: Callable[[Any, Any], None]

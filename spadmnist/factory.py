@@ -264,9 +264,10 @@ def _leave(root: Path) -> None:
             if not (state / "plan.json").exists() and not (state / "repairing").exists():
                 shutil.rmtree(state)
         elif not any((state / "shards").rglob("*.json")):
-            for folder in (root / "data.zarr", root / "data"):
+            shards = (root / "data.zarr", root / "data")
+            for folder in shards:
                 _remove_empty(folder)
-            if os.listdir(root) == [STATE]:  # a shard whose note could not be written needs the plan
+            if not any(folder.exists() for folder in shards):  # a shard whose note could not be written needs the plan
                 shutil.rmtree(state)
                 os.rmdir(root)
 

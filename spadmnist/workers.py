@@ -32,7 +32,7 @@ Done = Callable[[Any, Any], None]  # called with a key and its result
 _IDLE = 300  # s without a task, after which a worker ends; a verb's next tasks come sooner
 _IN_A_ROW = 3  # deaths, without a result between, after which workers are taken to die of whatever they are given
 _AHEAD = 8  # workers at most that are started before it is known how many tasks there are; the others come with these
-_STATUS = re.compile(r"\b[A-Z]+\((-?\d+)\)")  # how loky says that a worker ended: EXIT(1), SIGKILL(-9)
+_STATUS = re.compile(r"\b[A-Z]+\((-?\d+)\)")  # how loky says that a worker ended: EXIT(1); a signal is negative
 # the variables by which libraries are told how many threads they may use
 _THREADS = (
     *(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")),
