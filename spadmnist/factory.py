@@ -44,7 +44,9 @@ from .workers import Executor, Serial, executor
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
 _LIBRARIES = 240 * 2**20  # bytes (measured: 110 to 230 MB, by the kernels that there are)
 _FEW = 2000  # images at all levels: fewer may well be made by this process alone
-_ALONE = 1.0  # s of one core: less work is done by this process, for workers take 1 to 2 s of both cores to start
+# s of one core: less work is done by this process. Workers take 1 to 2 s of both cores to start: configs/quick.yaml, of
+# 0.6 s by this estimate, took 3.6 s without them and 6.3 s with two
+_ALONE = 1.0
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 

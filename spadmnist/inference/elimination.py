@@ -89,7 +89,7 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
 def _fit_from_templates(path: ModelPath) -> None:
     """Fit the steps that have shapes once more, each from its own templates; kept where the squares fall.
 
-    A shape that was fitted beside the dropped step may lie where no gradient leads to the better one.
+    A shape that was fitted together with the dropped step may lie in another minimum, which no gradient leaves.
     """
     for step in path.steps:
         if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates:

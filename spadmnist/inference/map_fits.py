@@ -304,9 +304,8 @@ def _normal_equations(
         assert counts is not None
         expected = line.expected(now)
         scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
-        line.level *= min(
-            max(scale, 1 / _LEVEL_STEP), _LEVEL_STEP
-        )  # until the level is that of these maps and no factor is needed
+        # until the level is that of these maps, and no factor is needed
+        line.level *= min(max(scale, 1 / _LEVEL_STEP), _LEVEL_STEP)
         jacobian = np.stack([(line.expected(o) - expected) / _DIFFERENCE for o in other], axis=1) * scale
         expected = expected * scale
         variance = line.variance(np.maximum(expected, 0.5), dead)

@@ -25,12 +25,12 @@ from .replicates import Cell
 if TYPE_CHECKING:
     from .pixel_maps import PixelMap
 
-# the values of a map in words, in which the one after the other is read
-_OF_A_MAP = {
-    "sigma": "spread of the bulk",
-    "low_fraction": "share far below it",
-    "low_ratio": "these at",
-    "high_fraction": "share far above it",
+# the values of a map, by name, in words
+OF_A_MAP = {
+    "sigma": "relative spread of the bulk of the pixels",
+    "low_fraction": "share of pixels that lie far below the bulk",
+    "low_ratio": "mean of these, relative to the middle of all",
+    "high_fraction": "share of pixels that lie far above the bulk",
 }
 NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
 # what remains, in words, by what a statistic compares (`Statistic.among`)
@@ -237,7 +237,7 @@ def table(found: Diagnosis) -> str:
     """The result as text for a terminal: the verdict, the steps, the ladder."""
     lines = [*textwrap.wrap(f"{found.verdict.upper().replace('_', ' ')}: {sentence(found)}", 100), ""]
     for number, step in enumerate(found.steps, 1):
-        words = _OF_A_MAP if step.candidate.carrier else {}
+        words = OF_A_MAP if step.candidate.carrier else {}
         parts = [f"{words.get(name, name)} {shown(v)}" for name, v in step.values.items()]
         text = f"{number}. {title(step.candidate)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
         text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
@@ -358,9 +358,10 @@ def _limit(entry: Mapping[str, Any]) -> str:
 def sentence(found: Diagnosis) -> str:
     """The verdict in words."""
     if not found.finished and found.verdict == "unexplained":
-        so_far = f" beside {' and '.join(title(s.candidate) for s in found.steps)}" if found.steps else ""
         what = f" What differs: {remains(found)}." if found.unexplained else ""
-        return f"not finished: the budget ended before an explanation was found{so_far}.{what}"
+        fitted = " and ".join(title(s.candidate) for s in found.steps)
+        so_far = f"the rest was explained; fitted so far: {fitted}" if fitted else "an explanation was found"
+        return f"not finished: the budget ended before {so_far}.{what}"
     if not found.finished:
         return "not finished; the verdict is that of the steps so far: " + sentence(
             dataclasses.replace(found, finished=True)

@@ -52,12 +52,6 @@ _KINDS = {
     "set": "a number of the model that is another",
     "per_pixel": "a number of the model that varies from pixel to pixel",
 }
-_OF_A_MAP = {
-    "sigma": "relative spread of the bulk of the pixels",
-    "low_fraction": "share of pixels that lie far below the bulk",
-    "low_ratio": "mean of these, relative to the middle of all",
-    "high_fraction": "share of pixels that lie far above the bulk",
-}
 
 
 def diagnosis(found: Diagnosis, folder: Path, source: Source | None = None) -> Path:
@@ -197,7 +191,7 @@ def _name(entry: Mapping[str, Any]) -> str:
 
 def _step(step: Step) -> _Card:
     declared = _described(step.candidate.effect)["parameters"]
-    words = _OF_A_MAP if step.candidate.carrier else {}
+    words = results.OF_A_MAP if step.candidate.carrier else {}
     numbers = []
     for name, value in step.values.items():
         own = declared.get(name, {})
