@@ -757,6 +757,16 @@ def test_a_damaged_plan_is_said(made: tuple[Path, Path], tmp_path: Path) -> None
         make(made[0], tmp_path / "out")
 
 
+def test_a_small_dataset_needs_no_workers(tmp_path: Path) -> None:
+    """And a large one is known to be large, before its images are and after."""
+    small = config.read(write_config(tmp_path / "small.yaml"))
+    large = config.read(write_config(tmp_path / "large.yaml", levels=("100 lux",), train=900_000))
+    assert factory.few_images(small) and factory.is_small(small, small.load_images())
+    assert not factory.few_images(large) and factory.few_images(replace(large, limit=10))
+    few = replace(large, limit=1000)
+    assert not factory.is_small(few, few.load_images())
+
+
 def test_a_shard_whose_record_could_not_be_written_is_no_strange_file(
     made: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

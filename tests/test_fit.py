@@ -437,6 +437,8 @@ def test_what_cannot_be_fitted_is_told_with_what_can(made):
         _named(*known, "set", "dead_time", "durations")
     with pytest.raises(InputError, match=r"crosstalks cannot be fitted here; .*Did you mean crosstalk\?"):
         _named(*known, "add", "crosstalks", None)
+    with pytest.raises(InputError, match=r"detection\.pdp cannot be fitted here: .* the same as another light level"):
+        _named(*known, "set", "detection", "pdp")
     with pytest.raises(
         InputError, match=r"--add dead_time: the sensor lists it already; .*--free dead_time\.PARAMETER"
     ):
