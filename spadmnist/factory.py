@@ -42,7 +42,9 @@ from .shard_facts import Facts
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
-_LIBRARIES = 240 * 2**20  # bytes (measured: 110 to 230 MB, by the kernels that there are)
+# bytes; interpreter, libraries and kernels. Measured: 110 to 250 MB by the kernels that there are, and 100 MB more where
+# a process compiles them
+_LIBRARIES = 340 * 2**20
 _FEW = 2000  # images at all levels: fewer may well be made by this process alone
 # s of one core: less work is done by this process. Workers take 1 to 2 s of both cores to start: configs/quick.yaml, of
 # 0.6 s by this estimate, took 3.6 s without them and 6.3 s with two
