@@ -35,7 +35,7 @@ from .images import Images, cache_folder
 from .readout import Frames, Recorded, summarised
 from .reconstruct import medians_of_nonzero
 from .sources import Source
-from .store import Column, Encoding, Expected, ShardReader
+from .store import Column, Encoding, Expected, ShardReader, read_joined
 from .tiles import Tiles, of_facts
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
@@ -1035,7 +1035,7 @@ class _Stored:
     def reconstruction(self, method: str, start: int, stop: int) -> np.ndarray:
         pieces, made = self._pieces(self._shards, start, stop), self._on_reading
         if made is None:
-            return _joined([reader.read(f"reconstruction/{method}", a, b) for reader, a, b in pieces])
+            return read_joined(list(pieces), f"reconstruction/{method}")
         fluxes = _joined([made.fluxes(reader, method, a, b) for reader, a, b in pieces])
         return fluxes.reshape(-1, *self._facts["shape"])
 
@@ -1046,7 +1046,7 @@ class _Stored:
         return _alike(self.normalisation(method), start, stop)
 
     def originals(self, start: int, stop: int) -> np.ndarray:
-        return _joined([reader.read("pixels", a, b) for reader, a, b in self._pieces(self._originals, start, stop)])
+        return read_joined(list(self._pieces(self._originals, start, stop)), "pixels")
 
     def labels(self) -> np.ndarray | None:
         if not self._originals[0][2].has("labels"):

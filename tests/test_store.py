@@ -18,6 +18,7 @@ import textwrap
 import time
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -33,7 +34,7 @@ from zarr.storage import ZipStore
 
 from spadmnist import disk
 from spadmnist.errors import InputError, SpadError
-from spadmnist.store import Column, Encoding, ShardReader, chunks, encoding
+from spadmnist.store import Column, Encoding, ShardReader, chunks, encoding, shards
 from spadmnist.store.hdf5 import _decode as decode_hdf5
 
 ENCODINGS = list(Encoding.every.values())
@@ -68,8 +69,8 @@ def some_columns(images: int = 7, seed: int = 1) -> dict[str, Column]:
     }
 
 
-def more_columns(images: int = 7) -> dict[str, Column]:
-    rng = np.random.default_rng(2)
+def more_columns(images: int = 7, seed: int = 2) -> dict[str, Column]:
+    rng = np.random.default_rng(seed)
     return {
         "reconstruction/counts": Column(
             rng.random((images, 4, 5)).astype(np.float32), IMAGE, "1/s", "flux", "floats", 4
@@ -128,6 +129,39 @@ def test_what_is_written_is_read_back(tmp_path: Path, format: Encoding) -> None:
         reader.read("tr/tick")
     with pytest.raises(IndexError, match="rows 3 to 900 were asked for; it has rows 0 to"):
         reader.read("tr/ticks", 3, 900)
+
+
+@pytest.mark.parametrize("format", ENCODINGS, ids=str)
+@pytest.mark.parametrize("threads", [False, True])
+def test_rows_of_several_shards_are_joined(
+    tmp_path: Path, format: Encoding, threads: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By one thread or by several; damage is told out of a thread, and another type is not made this one."""
+    monkeypatch.setattr(shards, "_MANY", 0 if threads else 1 << 60)
+    made = {f"a/b/{i}": some_columns(7 + i, i) | more_columns(7 + i, 2 + i) for i in range(5)}
+    for path, columns in made.items():
+        format.write(tmp_path, path, columns, {})
+    readers = [format.reader(tmp_path, path) for path in made]
+    pieces = [(reader, i % 3, 7 + i - i % 2) for i, reader in enumerate(readers)]
+    for name in ("reconstruction/exact", "tr/counts", "index"):
+        wanted = np.concatenate([reader.read(name, start, stop) for reader, start, stop in pieces])
+        for some in (pieces, pieces[:1]):
+            found = shards.read_joined(some, name)
+            assert found.dtype == wanted.dtype and np.array_equal(found, wanted[: len(found)])
+
+    other = made["a/b/3"] | {"index": replace(made["a/b/3"]["index"], data=np.arange(10, dtype=np.int32))}
+    format.write(tmp_path, "a/b/3", other, {})
+    pieces[3] = format.reader(tmp_path, "a/b/3"), 0, 5
+    with pytest.raises(InputError, match="index: its type or shape is not that of the shard before"):
+        shards.read_joined(pieces, "index")
+
+    array = readers[4]._array("reconstruction/exact")
+    offset, length = array.places[-1]
+    data = bytearray((tmp_path / array.file).read_bytes())
+    data[offset + length // 2] ^= 1
+    (tmp_path / array.file).write_bytes(data)
+    with pytest.raises(InputError, match="reconstruction/exact: .* cannot be decoded|checksum"):
+        shards.read_joined(pieces[:3] + pieces[4:], "reconstruction/exact")
 
 
 @pytest.mark.parametrize("format", ENCODINGS, ids=str)

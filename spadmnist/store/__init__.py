@@ -20,7 +20,7 @@ from __future__ import annotations
 from ..errors import InputError
 from . import container, folder, hdf5
 from .columns import ROWS_OF_TICKS, Column, is_name, smaller
-from .shards import Encoding, Expected, ShardReader
+from .shards import Encoding, Expected, ShardReader, read_joined
 
 FORMATS = tuple(dict.fromkeys(one.format for one in Encoding.every.values()))
 

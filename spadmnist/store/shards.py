@@ -11,13 +11,15 @@ import os
 import stat
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from .. import system
 from ..disk import Files, commit_file, inside, install, put_tree, temporary, workspace, writing
 from ..errors import InputError
 from ..foreign import quoted
@@ -184,6 +186,8 @@ class Expected:
 
 
 _numbers = itertools.count()  # of the readers of this process
+_MANY = 8 << 20  # bytes of an array: less is decoded (5 ms) before threads pay
+_THREADS = 4  # that decode at most: what they write reaches the speed of memory
 
 
 class Missing(InputError):
@@ -315,13 +319,32 @@ class ShardReader(ABC):
 
     def _rows(self, handles: dict[str, File], name: str, start: int, stop: int) -> np.ndarray:
         array = self._array(name)
-        length, rows = array.shape[0], array.rows
-        if not 0 <= start <= stop <= length:
-            raise IndexError(f"{name}: rows {start} to {stop} were asked for; it has rows 0 to {length}")
+        if not 0 <= start <= stop <= array.shape[0]:
+            raise IndexError(f"{name}: rows {start} to {stop} were asked for; it has rows 0 to {array.shape[0]}")
+        out = self._room(array, name, start, stop)
+        self._fill(handles, name, start, stop, out)
+        return out
+
+    def _room(self, array: Array, name: str, start: int, stop: int) -> np.ndarray:
+        """An array for so many rows."""
         try:
-            out = np.empty((stop - start, *array.shape[1:]), array.dtype)
+            return np.empty((stop - start, *array.shape[1:]), array.dtype)
+        except MemoryError:
+            raise self._too_much(array, name, start, stop) from None
+
+    def _too_much(self, array: Array, name: str, start: int, stop: int) -> InputError:
+        return InputError(
+            f"{self.root / array.file}: rows {start} to {stop} of {name} need more memory than there is; "
+            "read fewer at a time"
+        )
+
+    def _fill(self, handles: dict[str, File], name: str, start: int, stop: int, out: np.ndarray) -> None:
+        """Read rows into a contiguous array of their shape and type."""
+        array = self._array(name)
+        rows = array.rows
+        try:
             if not out.size:
-                return out
+                return
             flat = out.reshape(-1).view(np.uint8)
             row = out.nbytes // len(out)
             if array.file not in handles:
@@ -338,13 +361,9 @@ class ShardReader(ABC):
                     chunk = self._whole_chunk(handle, array, name, i, rows * row)
                     target[:] = chunk[(low - i * rows) * row : (high - i * rows) * row]
         except MemoryError:
-            raise InputError(
-                f"{self.root / array.file}: rows {start} to {stop} of {name} need more memory than there is; "
-                "read fewer at a time"
-            ) from None
+            raise self._too_much(array, name, start, stop) from None
         except Damaged as error:
             raise self._refuse(array.file, f"{name}: {error}") from None
-        return out
 
     def _whole_chunk(self, handle: File, array: Array, name: str, i: int, size: int) -> np.ndarray:
         """A chunk of so many bytes, of which a part is wanted; see `recent`."""
@@ -445,6 +464,40 @@ class ShardReader(ABC):
             raise self._why_not(file, error) from None
         finally:
             handle.close()
+
+
+def read_joined(pieces: Sequence[tuple[ShardReader, int, int]], name: str) -> np.ndarray:
+    """Rows of an array of several shards, each as (reader, start, stop), one after the other.
+
+    Many rows of this machine are decoded by all of its processors: the codecs let go of Python's lock.
+    """
+    reader, start, stop = pieces[0]
+    if len(pieces) == 1:
+        return reader.read(name, start, stop)
+    like = reader._array(name)
+    total = sum(stop - start for _, start, stop in pieces)
+    out = reader._room(like, name, 0, total)
+    ends = np.cumsum([stop - start for _, start, stop in pieces])
+
+    def fill(piece: tuple[ShardReader, int, int], end: int) -> None:
+        reader, start, stop = piece
+        array, handles = reader._array(name), dict[str, File]()
+        if (array.dtype, array.shape[1:]) != (like.dtype, like.shape[1:]):
+            raise reader._refuse(array.file, f"{name}: its type or shape is not that of the shard before")
+        try:
+            reader._fill(handles, name, start, stop, out[end - (stop - start) : end])
+        finally:
+            for handle in handles.values():
+                handle.close()
+
+    if out.nbytes < _MANY or not isinstance(reader._source, Local):
+        for piece, end in zip(pieces, ends, strict=True):
+            fill(piece, end)
+        return out
+    with ThreadPoolExecutor(min(system.processors(), _THREADS)) as pool:
+        for _ in pool.map(fill, pieces, ends):
+            pass  # raises what a thread raised
+    return out
 
 
 def _said(value: Any) -> str:
