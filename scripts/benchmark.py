@@ -33,7 +33,7 @@ import algorithm1  # noqa: E402
 import plain_numpy  # noqa: E402
 
 import spadmnist  # noqa: E402
-from spadmnist import config, dataset, factory, measurement, reconstruct, twin  # noqa: E402
+from spadmnist import config, dataset, factory, measurement, reconstruct, shard_columns, shard_plan, twin  # noqa: E402
 from spadmnist.effects import Conditions, Effect  # noqa: E402
 from spadmnist.errors import SpadError  # noqa: E402
 from spadmnist.events import Layout  # noqa: E402
@@ -440,16 +440,16 @@ def writing_share(experiment, splits, folder: Path) -> float:  # type: ignore[no
     """Encoding, hashing, writing and synchronising of a shard, against simulating it; one process, median of ten."""
     root = folder / "shards"
     (root / ".spadmnist" / "tmp").mkdir(parents=True)
-    shards = [s for s in dataset.shards_of(experiment, splits) if s.level is not None][:14]
+    shards = [s for s in shard_plan.shards_of(experiment, splits) if s.level is not None][:14]
     job = factory.job_of(experiment)
     ratios = []
     for shard in shards:
         task = factory.task_of(experiment, job, root, shard, splits[shard.split])
         started = time.perf_counter()
         made = experiment.simulate_block(experiment.levels[0], shard.split, task.pixels, task.white, task.first)
-        images = dataset.reconstruction_columns(experiment, made, (28, 28))
+        images = shard_columns.reconstruction_columns(experiment, made, (28, 28))
         middle = time.perf_counter()
-        experiment.encoding.write(root, shard.path, dataset.stream_columns(made, (28, 28)) | images, {})
+        experiment.encoding.write(root, shard.path, shard_columns.stream_columns(made, (28, 28)) | images, {})
         ratios.append((time.perf_counter() - middle) / (middle - started))
     return statistics.median(ratios[4:])
 

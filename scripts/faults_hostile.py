@@ -169,11 +169,11 @@ class Hostile:
 
 
 def _sealed(data: bytes) -> bytes:
-    from spadmnist import dataset
+    from spadmnist import manifest_file
 
     try:
         manifest = json.loads(data)
-        return dataset.seal({name: value for name, value in manifest.items() if name != "sha256"})
+        return manifest_file.seal({name: value for name, value in manifest.items() if name != "sha256"})
     except (ValueError, AttributeError, TypeError, RecursionError):
         return data
 

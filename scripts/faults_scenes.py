@@ -21,9 +21,9 @@ from faults_injected import End, Fault, command, run
 
 import spadmnist
 from spadmnist import measurement
-from spadmnist.dataset import STATE
 from spadmnist.errors import SpadError
 from spadmnist.events import Events
+from spadmnist.manifest_file import STATE
 from spadmnist.readout import Frames
 from spadmnist.recording import Recording
 

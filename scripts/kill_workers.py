@@ -20,7 +20,7 @@ from pathlib import Path
 
 import distributed
 
-from spadmnist import dataset
+from spadmnist import manifest_file
 
 
 def main() -> int:
@@ -58,7 +58,7 @@ def main() -> int:
     if run.returncode:
         print(f"After {kills[0]} kills in {seconds:.0f} s the run ended with status {run.returncode}")
         return 1
-    seals = [dataset.intact_manifest(root)["sha256"] for root in (alone, killed)]
+    seals = [manifest_file.intact_manifest(root)["sha256"] for root in (alone, killed)]
     same = seals[0] == seals[1]
     print(f"{kills[0]} workers killed in {seconds:.0f} s; {'the same seal' if same else f'other seals: {seals}'}")
     return 0 if same else 1

@@ -26,7 +26,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from spadmnist import config, dataset, disk, document, factory, store
+from spadmnist import config, disk, document, factory, shard_plan, store
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.workers import Executor, Loky
@@ -121,7 +121,7 @@ def tasks(number: int, root: Path) -> Iterator[tuple[str, float]]:
     """Make so many shards but the last few, go on with them, and seal; (name, figure) of each. root: is made."""
     experiment = config.build(document.parse(CONFIG.replace("TASKS", str(number)), "scale.yaml"), Path())
     images = experiment.load_images()
-    most, dataset._IMAGES_PER_SHARD = dataset._IMAGES_PER_SHARD, 1
+    most, shard_plan._IMAGES_PER_SHARD = shard_plan._IMAGES_PER_SHARD, 1
     try:
         stub = factory.make_shard = Stub(number - LEFT)
         before = time.perf_counter()
@@ -142,7 +142,7 @@ def tasks(number: int, root: Path) -> Iterator[tuple[str, float]]:
         yield "s to seal", time.perf_counter() - ended[0]
         yield "MB at most", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     finally:
-        factory.make_shard, dataset._IMAGES_PER_SHARD = REAL, most
+        factory.make_shard, shard_plan._IMAGES_PER_SHARD = REAL, most
 
 
 # --- executors ----------------------------------------------------------------------------------------------------

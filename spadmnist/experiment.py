@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from . import kernels, light, standing, units
+from . import estimators, light, standing, units
 from .effects import Conditions
 from .errors import InputError, UnknownName
 from .images import Images, check_size
@@ -119,7 +119,7 @@ class Experiment:
             return (each * whites[:, None]).reshape(flat.shape)
         if flat.dtype == np.uint8:
             # a table is the same arithmetic, once for each of the 256 grey levels
-            return kernels.lookup(np.arange(256) / white * self.white(level), flat.ravel()).reshape(flat.shape)
+            return estimators.lookup(np.arange(256) / white * self.white(level), flat.ravel()).reshape(flat.shape)
         return flat / white * self.white(level)
 
     def seen(self, photons: np.ndarray) -> np.ndarray:

@@ -26,9 +26,22 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, golden, leftovers, plugins, reconstruct, shard_facts, store, system
+from . import (
+    config,
+    disk,
+    document,
+    golden,
+    leftovers,
+    manifest_file,
+    plugins,
+    reconstruct,
+    shard_columns,
+    shard_facts,
+    shard_plan,
+    store,
+    system,
+)
 from .compiled import compiling
-from .dataset import CONFIG, MANIFEST, STATE, Likeness, OnReading, Shard
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
@@ -36,14 +49,17 @@ from .foreign import from_json
 from .golden import versions
 from .identity import FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other, written_as
 from .images import Images
+from .manifest_file import CONFIG, MANIFEST, STATE
 from .reconstruct import median_of_nonzero
 from .sensor import BYTES_PER_EVENT
+from .shard_columns import OnReading
 from .shard_facts import Facts
+from .shard_plan import Likeness, Shard
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
-# bytes; interpreter, libraries and kernels. Measured: 110 to 250 MB by the kernels that there are, and 100 MB more where
-# a process compiles them
+# bytes; interpreter, libraries and kernels. Measured: 110 to 250 MB by the kernels that there are, and 100 MB more
+# where a process compiles them
 _LIBRARIES = 340 * 2**20
 _FEW = 2000  # images at all levels: fewer may well be made by this process alone
 # s of one core: less work is done by this process. Workers take 1 to 2 s of both cores to start: configs/quick.yaml, of
@@ -186,15 +202,15 @@ def shard_content(experiment: Experiment, task: Task) -> tuple[dict[str, store.C
     skip, end = shard.start - task.first, shard.stop - task.first
     if shard.level is None:
         images = Images(task.pixels, task.labels, task.white)
-        return _described(experiment, shard, dataset.image_columns(images, skip, end), None), attributes
+        return _described(experiment, shard, shard_columns.image_columns(images, skip, end), None), attributes
     level = experiment.level(shard.level)
     recorded = experiment.simulate_block(level, shard.split, task.pixels, task.white, task.first)
     if (skip, end) != (0, len(task.pixels)):
         recorded = recorded.images(skip, end)
     shape = task.pixels.shape[1:]
     labels = None if task.labels is None else task.labels[skip:end]
-    columns = _described(experiment, shard, dataset.shard_columns(experiment, recorded, shape), labels)
-    return columns, {**attributes, "statistics": json.dumps(dataset.statistics(experiment, recorded))}
+    columns = _described(experiment, shard, shard_columns.recorded_columns(experiment, recorded, shape), labels)
+    return columns, {**attributes, "statistics": json.dumps(shard_columns.statistics(experiment, recorded))}
 
 
 def _described(
@@ -203,7 +219,7 @@ def _described(
     """The columns of a shard with their coordinates, where the encoding has any."""
     if not experiment.encoding.coordinates:
         return columns
-    return columns | dataset.coordinate_columns(columns, range(shard.start, shard.stop), labels)
+    return columns | shard_columns.coordinate_columns(columns, range(shard.start, shard.stop), labels)
 
 
 def _record_path(root: Path, shard: Shard) -> Path:
@@ -342,7 +358,7 @@ def generate(
     """
     started = time.monotonic()
     check_volume(experiment, splits)
-    shards = dataset.shards_of(experiment, splits)
+    shards = shard_plan.shards_of(experiment, splits)
     workers = executor(jobs)
     if workers.local:
         check_memory(experiment, splits, shards, workers.threads)
@@ -438,7 +454,7 @@ def check_memory(experiment: Experiment, splits: Mapping[str, Images], shards: S
 
 def most_workers(experiment: Experiment, splits: Mapping[str, Images], processors: int) -> int:
     """How many workers there may be: one for each processor, as far as memory goes, and one at least."""
-    needed = memory_per_worker(experiment, splits, dataset.shards_of(experiment, splits))
+    needed = memory_per_worker(experiment, splits, shard_plan.shards_of(experiment, splits))
     return max(1, min(processors, system.memory() // needed))
 
 
@@ -476,7 +492,7 @@ def memory_per_worker(experiment: Experiment, splits: Mapping[str, Images], shar
     streams = bits = scratch = 0.0
     each = _PER_EVENT_CAUSED if experiment.causes else BYTES_PER_EVENT
     for (level, split), n in most.items():
-        events, size = dataset.expected_per_image(experiment, experiment.level(level), splits[split])
+        events, size = shard_plan.expected_per_image(experiment, experiment.level(level), splits[split])
         scratch = max(scratch, each * experiment.sensor.at_once(events, experiment.readouts))
         packed = splits[split].pixels[0].size * -(-experiment.conditions.frames // 8) * framed
         streams, bits = max(streams, n * (size - packed)), max(bits, n * packed)
@@ -495,7 +511,7 @@ def _there(root: Path) -> tuple[dict[str, Any], bool]:
         if not root.is_dir():
             raise SpadError(f"{root} is a file; choose another place with -o")
         if (root / MANIFEST).exists():
-            return dataset.read_manifest(root)[0], True
+            return manifest_file.read_manifest(root)[0], True
         content = set(os.listdir(root))
         plan = root / STATE / "plan.json"
         if not plan.exists():
@@ -535,7 +551,7 @@ def begin(root: Path, wanted: dict[str, Any], part: Part | None = None) -> None:
                 shutil.rmtree(root / STATE / "shards", ignore_errors=True)
             elif part:
                 refuse_other(root, wanted, _plan(root))
-            disk.commit_file(root / STATE / "plan.json", dataset.canonical(wanted), disk.temporary(root))
+            disk.commit_file(root / STATE / "plan.json", manifest_file.canonical(wanted), disk.temporary(root))
 
 
 def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images], present: int) -> None:
@@ -546,7 +562,7 @@ def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images
     raw = 0.0
     for images in splits.values():
         for level in experiment.levels:
-            _, size = dataset.expected_per_image(experiment, level, images)
+            _, size = shard_plan.expected_per_image(experiment, level, images)
             raw += size * experiment.wanted(images)
     free = shutil.disk_usage(root).free
     needed = raw / 4 - present
@@ -672,7 +688,7 @@ def _work(experiment: Experiment, splits: Mapping[str, Images], level: str | Non
     if level is None:
         return 2e-6
     images = splits[split]
-    events, size = dataset.expected_per_image(experiment, experiment.level(level), images)
+    events, size = shard_plan.expected_per_image(experiment, experiment.level(level), images)
     return 8e-9 * events + 5e-9 * size + 3e-8 * images.pixels[0].size
 
 
@@ -723,8 +739,8 @@ def _warm(experiment: Experiment, progress: Progress) -> None:
         channels = (len(experiment.wavelengths),) if experiment.wavelengths else ()
         shape = (*channels, *experiment.sensor.layout.shape)
         made = experiment.simulate_block(experiment.levels[0], "warm", np.zeros((1, *shape), np.uint8), 255, 0)
-        dataset.shard_columns(experiment, made, shape)
-        dataset.statistics(experiment, made)
+        shard_columns.recorded_columns(experiment, made, shape)
+        shard_columns.statistics(experiment, made)
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------
@@ -751,8 +767,8 @@ def add_methods(addition: Addition) -> tuple[str, Files]:
     root, shard = Path(addition.root), addition.shard
     encoding = experiment.encoding
     reader = shard.reader(root, encoding, addition.like, addition.files)
-    recorded, shape = dataset.read_shard(reader, experiment)
-    columns = dataset.reconstruction_columns(experiment, recorded, shape, addition.methods)
+    recorded, shape = shard_columns.read_shard(reader, experiment)
+    columns = shard_columns.reconstruction_columns(experiment, recorded, shape, addition.methods)
     labels = next((reader.read(name) for name in reader.names if name.endswith("/label")), None)
     files = encoding.append(root, shard.path, _described(experiment, shard, columns, labels))
     return shard.path, files
@@ -763,10 +779,10 @@ def _as_read(root: Path, shard: Shard, experiment: Experiment, like: Likeness) -
     reader = shard.reader(root, experiment.encoding, like)
     columns = {name: reader.column(name) for name in reader.names}
     if shard.level is not None:
-        recorded, shape = dataset.read_shard(reader, experiment)
+        recorded, shape = shard_columns.read_shard(reader, experiment)
         stored = () if experiment.on_reading else experiment.methods
         methods = [method for method in stored if reader.has(f"reconstruction/{method}")]
-        columns |= dataset.reconstruction_columns(experiment, recorded, shape, methods)
+        columns |= shard_columns.reconstruction_columns(experiment, recorded, shape, methods)
     return _joined(experiment.encoding.encoded(shard.path, columns, reader.attributes))
 
 
@@ -780,8 +796,8 @@ def add_reconstructions(
 
     Returns (methods that were added, manifest). An interrupted run is taken up by the same call. jobs: see `generate`.
     """
-    workers, manifest = executor(jobs), dataset.intact_manifest(root)
-    encoding = dataset.encoding_in(manifest, root)
+    workers, manifest = executor(jobs), manifest_file.intact_manifest(root)
+    encoding = manifest_file.encoding_in(manifest, root)
     before = config.build(document.parse(config_text(manifest["config"]), str(root / CONFIG)), root)
     before = replace(before, encoding=encoding)
     if before.on_reading:
@@ -803,7 +819,7 @@ def add_reconstructions(
     after = before.with_methods((*before.methods, *new))
     refuse_other(root, {**held(manifest), "stream": STREAM}, manifest)
     wanted = {**held(manifest), "config": portable(after)[0], "plugins": plugin_sources(after)}
-    shards = dataset.shards_in(manifest)
+    shards = manifest_file.shards_in(manifest)
     with locked(root):
         plan = root / STATE / "plan.json"
         if plan.exists():
@@ -819,7 +835,7 @@ def add_reconstructions(
         makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s).made_by for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
         begin(root, wanted)
-        files = dataset.files_by_shard(manifest["files"], encoding)
+        files = shard_plan.files_by_shard(manifest["files"], encoding)
 
         def files_of(shard: Shard) -> dict[str, Files]:
             place = encoding.location(shard.path)
@@ -929,7 +945,7 @@ def finish(
         ),
         "files": files,
     }
-    sealed = dataset.seal({**manifest, "provenance": {**versions(), "python": platform.python_version()}})
+    sealed = manifest_file.seal({**manifest, "provenance": {**versions(), "python": platform.python_version()}})
     disk.commit_file(root / MANIFEST, sealed, temporary)
     clear_state(root)
     return json.loads(sealed)

@@ -12,9 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from . import dataset, disk, remote, verify
-from .dataset import MANIFEST
+from . import dataset, disk, manifest_file, remote, verify
 from .errors import InputError, SpadError
+from .manifest_file import MANIFEST
 from .remote import Remote
 from .sources import Local, Source
 
@@ -42,7 +42,7 @@ def fetch(url: str | Path, sha256: str, to: str | Path, progress: Callable[[str]
         coming.mkdir(exist_ok=True)
         source = _source(str(url), coming, say)
         try:
-            manifest = dataset.intact_manifest(source)
+            manifest = manifest_file.intact_manifest(source)
         except InputError:
             shutil.rmtree(coming)
             raise
@@ -59,14 +59,14 @@ def fetch(url: str | Path, sha256: str, to: str | Path, progress: Callable[[str]
             raise
         shutil.rmtree(coming)
         _remove_others(part, manifest["files"])
-        (part / MANIFEST).write_bytes(dataset.seal(manifest))
+        (part / MANIFEST).write_bytes(manifest_file.seal(manifest))
     return to
 
 
 def _there_already(to: Path, sha256: str) -> Path:
     other = SpadError(f"{to}: is there already, and is not this dataset as it was sealed; remove it, or name another")
     try:
-        if dataset.intact_manifest(to)["sha256"] != sha256 or verify.verify(to):
+        if manifest_file.intact_manifest(to)["sha256"] != sha256 or verify.verify(to):
             raise other
     except InputError:
         raise other from None

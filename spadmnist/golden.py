@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from . import __version__, config, dataset, plugins, reconstruct, store
+from . import __version__, config, manifest_file, plugins, reconstruct, shard_columns, shard_plan, store
 from .errors import SpadError
 from .experiment import Experiment, Level
 from .identity import STREAM, portable
@@ -96,7 +96,7 @@ def key(experiment: Experiment) -> str:
     kept = {name: value for name, value in resolved.items() if name not in ("seed", "limit")}
     kept |= {"encoding": experiment.encoding.number} if experiment.encoding.number > 1 else {}
     of = {**kept, "scene": scene, "maps": {name: hashlib.sha256(data).hexdigest() for name, data in maps.items()}}
-    return hashlib.sha256(dataset.canonical(of)).hexdigest()
+    return hashlib.sha256(manifest_file.canonical(of)).hexdigest()
 
 
 def digest(experiment: Experiment) -> str:
@@ -111,14 +111,14 @@ def digest(experiment: Experiment) -> str:
     # noise that no library draws
     noise = hashlib.shake_256(b"golden").digest(IMAGES * math.prod(shape))
     pixels = np.frombuffer(noise, np.uint8).reshape(IMAGES, *shape)
-    events, _ = dataset.expected_per_image(experiment, _LIGHT, Images(pixels, None, 255.0))
+    events, _ = shard_plan.expected_per_image(experiment, _LIGHT, Images(pixels, None, 255.0))
     white = 255.0 * 2.0 ** math.frexp(events * IMAGES / _EVENTS)[1]  # a power of two: what is left of it is exact
-    _, size = dataset.expected_per_image(experiment, _LIGHT, Images(pixels, None, white))
+    _, size = shard_plan.expected_per_image(experiment, _LIGHT, Images(pixels, None, white))
     pixels = pixels[: max(1, min(IMAGES, int(_BYTES / size)))]
     made = experiment.simulate_block(_LIGHT, "golden", pixels, white, 0)
-    columns = dataset.shard_columns(experiment, made, shape)
+    columns = shard_columns.recorded_columns(experiment, made, shape)
     if experiment.encoding.coordinates:
-        columns |= dataset.coordinate_columns(columns, range(len(pixels)), np.arange(len(pixels), dtype=np.uint8))
+        columns |= shard_columns.coordinate_columns(columns, range(len(pixels)), np.arange(len(pixels), dtype=np.uint8))
     files = experiment.encoding.encoded("golden", columns, {})
     sums = hashlib.sha256()
     for name, pieces in sorted(files.items()):

@@ -19,7 +19,7 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from . import dataset, disk, document, kernels, units
+from . import dataset, disk, document, manifest_file, packing, units
 from .dataset import Part
 from .errors import SpadError
 from .experiment import Level, level_of
@@ -108,7 +108,7 @@ class Block:
             if events.ticks is None or events.tick is None:
                 yield Column("times", events.times, "TR: stamps since the start of the exposure", "s", starts)
             else:
-                steps = kernels.row_differences(events.ticks, events.offsets)
+                steps = packing.row_differences(events.ticks, events.offsets)
                 about = "TR: of each pixel, as many as `counts` says, its first stamp and then the steps to the next"
                 yield Column("ticks", steps, about, units.show(events.tick, "s", 12), starts)
         if {"str", "qis"} & set(self.readouts):
@@ -143,7 +143,7 @@ class Chosen:
 
 def chosen(root: Path, choice: Choice) -> Chosen:
     """Raises SpadError for a level, split, method or readout that the dataset has not; InputError where it is none."""
-    manifest = dataset.intact_manifest(root)
+    manifest = manifest_file.intact_manifest(root)
     stored = dataset.stored(root)
     every = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
     try:
@@ -178,11 +178,11 @@ def is_of_images(path: Path, format: str, choice: Choice) -> bool:
     A dataset of uniform light or of a chart is a measurement, too: as `npz` it gives captures, unless it is said which
     images are wanted.
     """
-    if format not in ImageTarget.every or not (path / dataset.MANIFEST).is_file():
+    if format not in ImageTarget.every or not (path / manifest_file.MANIFEST).is_file():
         return False
     if format != "npz" or choice.named:
         return True
-    source = dataset.intact_manifest(path)["config"]["scene"]["images"]["source"]
+    source = manifest_file.intact_manifest(path)["config"]["scene"]["images"]["source"]
     return source not in ("uniform", "chart")
 
 

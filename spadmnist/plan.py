@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import dataset, factory, large
+from . import factory, large, shard_columns, shard_plan
 from .experiment import Experiment
 from .foreign import visible
 from .images import Images
@@ -29,7 +29,7 @@ def estimate(experiment: Experiment, splits: Mapping[str, Images], jobs: int) ->
     that are simulated and encoded here.
     """
     factory.check_volume(experiment, splits)
-    shards = dataset.shards_of(experiment, splits)
+    shards = shard_plan.shards_of(experiment, splits)
     memory = factory.check_memory(experiment, splits, shards, jobs)
     # compile first, so that the probe times the work alone
     _probe(experiment, experiment.levels[0], next(iter(splits.values())), 1)
@@ -99,7 +99,7 @@ def _uniform(experiment: Experiment) -> bool:
 
 def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tuple[float, float, int]:
     """(images, seconds to simulate and encode them, bytes); of a large image a share of it."""
-    events = dataset.expected_per_image(experiment, level, images)[0]
+    events = shard_plan.expected_per_image(experiment, level, images)[0]
     fit = int(_EVENTS / max(events, 1.0))
     block = experiment.sensor.block
     count = min(max(min(count, fit), block if block > 1 else 0), len(images))
@@ -108,7 +108,7 @@ def _probe(experiment: Experiment, level: Any, images: Images, count: int) -> tu
         experiment, pixels, share = _rows(experiment, level, pixels, images.white)
     started = time.perf_counter()
     made = experiment.simulate_block(level, "probe", pixels, images.white, 0)
-    columns = dataset.shard_columns(experiment, made, pixels.shape[1:])
+    columns = shard_columns.recorded_columns(experiment, made, pixels.shape[1:])
     size = experiment.encoding.size(columns)
     return share, time.perf_counter() - started, size
 

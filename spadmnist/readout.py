@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import kernels
+from . import bit_planes, estimators, kernels
 from .errors import SpadError
 from .events import Events
 
@@ -71,7 +71,7 @@ class Frames:
         """(images, frames, pixels) uint8, 0 or 1: QIS."""
         out = np.empty((len(self.bits) // self.pixels, self.frames, self.pixels), np.uint8)
         for image, rows in enumerate(self._rows(len(out))):
-            kernels.bits_first(self.bits[rows], out[image])
+            bit_planes.bits_first(self.bits[rows], out[image])
         return out
 
     def stamps(self, kind: type[np.floating] = np.float64) -> np.ndarray:
@@ -85,7 +85,7 @@ class Frames:
         times, offsets = self.first.times.astype(kind, copy=False), self.first.offsets
         for image, rows in enumerate(self._rows(len(out))):
             out[image] = self.frame_time  # just before, so that it is still in the cache
-            kernels.stamps_first(self.bits[rows], offsets[rows.start : rows.stop + 1], times, out[image])
+            bit_planes.stamps_first(self.bits[rows], offsets[rows.start : rows.stop + 1], times, out[image])
         return out
 
     def _rows(self, images: int) -> list[slice]:
@@ -238,7 +238,7 @@ def summarised(pixels: int, tr: Events | None, frames: Frames | None, tally: np.
     """The streams with the sums that reconstructions need (`waited` only where STR was recorded)."""
     recorded = Recorded(pixels, tally=tally)
     if tr is not None:
-        counts, span = kernels.spans(tr.times if tr.ticks is None else tr.ticks, tr.offsets)
+        counts, span = estimators.spans(tr.times if tr.ticks is None else tr.ticks, tr.offsets)
         recorded = Recorded(pixels, tr, counts, span if tr.tick is None else span * tr.tick, tally=tally)
     if frames is None:
         return recorded

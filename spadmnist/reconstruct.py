@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from . import kernels
+from . import estimators, kernels
 from .plugins import Plugin, Registry
 from .readout import Recorded
 
@@ -75,7 +75,7 @@ class Method(Plugin, abstract=True):
         if largest is not None and largest < _ROWS_AT_ONCE:
             # a function of one small integer is worked out once for each value that occurs
             whole = np.arange(largest + 1)
-            values = kernels.lookup(self._finite(settings, whole).astype(np.float32), columns[0])
+            values = estimators.lookup(self._finite(settings, whole).astype(np.float32), columns[0])
             # where no value is saturated no pixel need be looked at again
             return values, self.saturated(settings, *columns) if self.saturated(settings, whole) else 0
         for start in range(0, len(values), _ROWS_AT_ONCE):
@@ -147,7 +147,7 @@ class InterPhoton(Method):
     def _worked_out(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> tuple[np.ndarray, int]:
         # without a converter two stamps still lie a rounding error apart
         half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.exposure)
-        return kernels.inter_photon(counts, span, settings.pdp, settings.dead_time, half)
+        return estimators.inter_photon(counts, span, settings.pdp, settings.dead_time, half)
 
     def estimate(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
         return self._worked_out(settings, counts, span)[0]
@@ -170,7 +170,7 @@ class StrFlux(Method):
 
     def _worked_out(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> tuple[np.ndarray, int]:
         half = settings.tick / 2 if settings.tick > 0 else np.spacing(settings.frame_time)
-        return kernels.first_photon(ones, waited, settings.pdp, settings.frames * half)
+        return estimators.first_photon(ones, waited, settings.pdp, settings.frames * half)
 
     def estimate(self, settings: Settings, ones: np.ndarray, waited: np.ndarray) -> np.ndarray:
         return self._worked_out(settings, ones, waited)[0]

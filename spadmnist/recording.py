@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from . import kernels
+from . import bit_planes
 from .effects import Conditions
 from .errors import InputError
 from .events import Events, Layout
@@ -172,7 +172,7 @@ class Recording:
                 yield start, self.frames.found.of(start, stop)
             else:
                 flat = np.ascontiguousarray(self.frames[start:stop]).reshape(stop - start, -1)
-                yield start, FirstStamps(*kernels.stamps_of_frames(flat, self.none))
+                yield start, FirstStamps(*bit_planes.stamps_of_frames(flat, self.none))
 
     def bits(self) -> Iterator[tuple[int, np.ndarray]]:
         """(number of the first frame, (frames, rows, ceil(columns / 8)) uint8): which pixels have a detection.
@@ -210,7 +210,7 @@ class Recording:
             return None
         of_pixels, of_frames = np.zeros(self.pixels), np.zeros(self.n_frames)
         for start, found in self.stamped():
-            kernels.add_waits(*found, first, last, of_pixels, of_frames[start : start + len(found.offsets) - 1])
+            bit_planes.add_waits(*found, first, last, of_pixels, of_frames[start : start + len(found.offsets) - 1])
         return of_pixels, of_frames
 
     def kept(self, name: str, make: Callable[[], T]) -> T:
@@ -228,7 +228,7 @@ class Recording:
                 out += part.reshape(len(part), -1).sum(axis=0, dtype=np.int64)
             return out
         for _, packed in self.bits():
-            kernels.column_sums(np.ascontiguousarray(packed), self.layout.columns, out)
+            bit_planes.column_sums(np.ascontiguousarray(packed), self.layout.columns, out)
         return out
 
     def named(self, capture: Capture) -> Recording:
@@ -343,7 +343,7 @@ class StampedFrames:
         first, last = (start, max(start, stop)) if step > 0 else (min(start, stop) + 1, start + 1)
         out = np.full((max(0, last - first), self.shape[1] * self.shape[2]), self.none, np.uint32)
         if len(out):
-            kernels.fill_stamps(*self.found.of(first, last), out)
+            bit_planes.fill_stamps(*self.found.of(first, last), out)
         return out.reshape(-1, *self.shape[1:])[::step]
 
 
@@ -398,7 +398,7 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
         return Recording(capture, layout, None, one.tally.T.reshape(-1, rows, columns), None, dead_time)
     assert one.frames is not None
     if capture.modality == "qis":
-        packed = kernels.frames_first(one.frames.bits, one.frames.frames, rows, columns)
+        packed = bit_planes.frames_first(one.frames.bits, one.frames.frames, rows, columns)
         return Recording(capture, layout, None, packed, None, dead_time)
     first = one.frames.first
     assert first is not None
@@ -408,7 +408,7 @@ def of_image(recorded: Recorded, image: int, capture: Capture, layout: Layout, d
     if none >= 1 << 32:
         frame, tick = (show(x, "s") for x in (capture.conditions.frame_time, first.tick))
         raise InputError(f"{capture.id}: STR stamps of {tick} in frames of {frame} need more than 32 bits")
-    found = FirstStamps(*kernels.stamps_by_frame(one.frames.bits, first.offsets, first.ticks, one.frames.frames))
+    found = FirstStamps(*bit_planes.stamps_by_frame(one.frames.bits, first.offsets, first.ticks, one.frames.frames))
     frames = StampedFrames(found, none, (one.frames.frames, rows, columns))
     totals: dict[str, object] = {"totals": np.diff(first.offsets)}
     return Recording(capture, layout, None, frames, first.tick, dead_time, totals)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from . import kernels, units
+from . import bit_planes, kernels, units
 from .effects import Chip, Conditions, Effect, in_order
 from .effects.afterpulsing import Afterpulsing
 from .effects.dead_time import DeadTime
@@ -591,7 +591,7 @@ class Sensor:
         """(rows, count frames) sums of binary frames."""
         most = conditions.largest_count
         out = np.empty((len(bits), conditions.count_frames), counts_type(most))
-        kernels.sums_of_frames(bits, most, out)
+        bit_planes.sums_of_frames(bits, most, out)
         return self._limited(out, window)
 
     def _counted(self, events: Events, conditions: Conditions, window: Window | None) -> np.ndarray:

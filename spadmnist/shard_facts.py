@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import dataset, store
-from .dataset import Likeness, Shard
+from . import shard_plan, store
 from .disk import Files
 from .errors import InputError
 from .foreign import from_json
+from .shard_plan import Likeness, Shard
 from .sources import Source
 
 
@@ -20,8 +20,8 @@ from .sources import Source
 class Facts:
     """What a shard says of itself for the manifest.
 
-    statistics: `dataset.statistics`; saturated: pixels by method, of methods that `statistics` does not name; kinds:
-    bytes by kind of data.
+    statistics: `shard_columns.statistics`; saturated: pixels by method, of methods that `statistics` does not name;
+    kinds: bytes by kind of data.
     """
 
     statistics: dict[str, dict[str, int]]
@@ -63,7 +63,7 @@ def statistics_of(
     Raises InputError where another one cannot be read.
     """
     pixels = math.prod(like.shape)
-    by_shard = dataset.files_by_shard(files, encoding)
+    by_shard = shard_plan.files_by_shard(files, encoding)
     out: dict[str, Any] = {level: {} for level in levels}
     for shard in shards:
         if shard.level is None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import kernels, light, recording, standing
+from . import bit_planes, light, recording, standing
 from .errors import InputError
 from .events import Layout
 from .measurement import Measurement, write
@@ -137,7 +137,7 @@ def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Stream
     out = np.empty((c.frames, rows, -(-columns // 8)), np.uint8)
     for row, bits in standing.bits(sensor, c, flux, streams):
         count = len(bits) // columns
-        out[:, row : row + count] = kernels.frames_first(bits, c.frames, count, columns)
+        out[:, row : row + count] = bit_planes.frames_first(bits, c.frames, count, columns)
         told(count / rows)
     return Recording(capture, sensor.layout, None, out, None, sensor.nominal_dead_time)
 

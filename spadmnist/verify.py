@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from . import config, dataset, disk, document, factory, golden, shard_facts, store
-from .dataset import CONFIG, MANIFEST, STATE, Shard
+from . import config, disk, document, factory, golden, manifest_file, shard_facts, shard_plan, store
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
 from .factory import Progress
 from .identity import POSITIONS, held, identity
 from .images import Images
+from .manifest_file import CONFIG, MANIFEST, STATE
+from .shard_plan import Shard
 from .sources import Local, Source, Unreadable
 from .tiles import of_facts
 from .workers import Executor, executor
@@ -55,7 +56,7 @@ def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # n
     Raises InputError where it never was a dataset, or cannot be reached. What a damaged manifest says of other files is
     not to be trusted: then it alone is named (and a lost config).
     """
-    manifest = _manifest(root) if isinstance(root, Path) else dataset.intact_manifest(root)
+    manifest = _manifest(root) if isinstance(root, Path) else manifest_file.intact_manifest(root)
     if manifest is None:
         assert isinstance(root, Path)
         lost = tuple(name for name in (CONFIG, MANIFEST) if not os.path.lexists(root / name))
@@ -80,7 +81,7 @@ def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # n
     progress.stop()
     if not changed and not missing and not _adds_up(root, manifest):
         changed.append(MANIFEST)
-    read += len(dataset.canonical(manifest))
+    read += len(manifest_file.canonical(manifest))
     extra = sorted(found - set(listed) - {MANIFEST})
     return Damage(tuple(changed), tuple(sorted(missing)), tuple(extra), len(present) + 1, read)
 
@@ -88,10 +89,10 @@ def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # n
 def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
     """Are the manifest's statistics those that its shards, which are as they were made, say of themselves?"""
     config, levels = manifest["config"], [level["text"] for level in manifest["levels"]]
-    like, shards, files = dataset.Likeness.of(manifest), dataset.shards_in(manifest), manifest["files"]
+    like, shards, files = shard_plan.Likeness.of(manifest), manifest_file.shards_in(manifest), manifest["files"]
     methods = config["reconstruct"]
     try:
-        encoding = dataset.encoding_in(manifest, root)
+        encoding = manifest_file.encoding_in(manifest, root)
         told = shard_facts.statistics_of(root, encoding, levels, methods, like, shards, files)
     except InputError:
         return False
@@ -101,7 +102,7 @@ def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
 def _manifest(root: Path) -> dict[str, Any] | None:
     """The manifest as it was sealed; None where a dataset has lost it. Raises InputError where there never was one."""
     try:
-        manifest, intact = dataset.read_manifest(root)
+        manifest, intact = manifest_file.read_manifest(root)
         return manifest if intact else None
     except InputError:
         if (root / STATE / "repairing").exists():
@@ -177,7 +178,7 @@ def repair(
                 f"{root}: cannot be made again from what is here: {', '.join(lines)} differ from the manifest's; "
                 "give the same images (--images-dir) and plug-ins (--plugin)"
             )
-    shards = dataset.shards_of(experiment, splits)
+    shards = shard_plan.shards_of(experiment, splits)
     bad = {*damage.changed, *damage.missing} - {POSITIONS}
     if manifest is not None:
         labelled = all(images.labels is not None for images in splits.values())
@@ -187,7 +188,7 @@ def repair(
             disk.commit_file(root / STATE / "repairing", b"", disk.temporary(root))
             again = shards
         else:
-            hurt = dataset.files_by_shard({name: {} for name in bad}, experiment.encoding)
+            hurt = shard_plan.files_by_shard({name: {} for name in bad}, experiment.encoding)
             again = [s for s in shards if experiment.encoding.location(s.path) in hurt]
         did += _set_aside(root, damage.extra)
         remade, lines = _remake(experiment, splits, root, again, manifest, workers, progress)
@@ -223,7 +224,7 @@ def _check_asked(
 ) -> None:
     """Raise SpadError where the manifest does not list what its config asks for: then nothing is moved away."""
     small = {*factory.small_files(experiment, shards, manifest["normalisation"])[0], MANIFEST, POSITIONS}
-    wrong = "" if dataset.shards_in(manifest) == shards else "its shards are not those that its config makes"
+    wrong = "" if manifest_file.shards_in(manifest) == shards else "its shards are not those that its config makes"
     for name in extra:
         if name in small or any(_is_asked(name, s, experiment, labelled) for s in shards):
             wrong = wrong or f"it does not list {name}, which its config asks for"
@@ -273,7 +274,7 @@ def _experiment(root: Path, manifest: dict[str, Any] | None, damage: Damage, did
             disk.commit_file(root / POSITIONS, manifest["maps"][POSITIONS]["text"].encode(), disk.temporary(root))
             did.append(f"made again: {POSITIONS}")
     made = config.build(document.parse(text, str(root / CONFIG)), root)
-    return replace(made, encoding=dataset.encoding_in(manifest, root))
+    return replace(made, encoding=manifest_file.encoding_in(manifest, root))
 
 
 def _images(
@@ -289,11 +290,11 @@ def _images(
     """
     bad = {*damage.changed, *damage.missing}
     if manifest is not None and images_dir is None and experiment.sensor.block == 1:
-        own = [s for s in dataset.shards_in(manifest) if s.level is None]
+        own = [s for s in manifest_file.shards_in(manifest) if s.level is None]
         if not any(_belongs(name, s, experiment.encoding) for s in own for name in bad):
             splits: dict[str, Images] = {}
-            like = dataset.Likeness.of(manifest)
-            files = dataset.files_by_shard(manifest["files"], experiment.encoding)
+            like = shard_plan.Likeness.of(manifest)
+            files = shard_plan.files_by_shard(manifest["files"], experiment.encoding)
             for split in dict.fromkeys(s.split for s in own):
                 mine = [s for s in own if s.split == split]
                 readers = [s.reader(root, experiment.encoding, like, files) for s in mine]

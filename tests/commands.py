@@ -25,9 +25,9 @@ _SERVER = """
 import json, os, sys
 import h5py, loky, numpy, scipy.special, scipy.stats, yaml, zarr
 import spadmnist.cli, spadmnist.inference.model_selection, spadmnist.factory, spadmnist.verify
-from spadmnist import kernels
+from spadmnist import kernels, packing
 
-kernels.row_sums(numpy.zeros(1), numpy.zeros(2, numpy.int64))  # what compiled code needs at first
+packing.row_sums(numpy.zeros(1), numpy.zeros(2, numpy.int64))  # what compiled code needs at first
 for line in sys.stdin:
     asked = json.loads(line)
     child = os.fork()

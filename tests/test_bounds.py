@@ -25,7 +25,6 @@ from test_factory import write_config
 from spadmnist import (
     capture_files,
     config,
-    dataset,
     events,
     exporters,
     factory,
@@ -33,10 +32,10 @@ from spadmnist import (
     measurement,
     plan,
     report,
+    shard_plan,
     store,
     system,
 )
-from spadmnist.dataset import Shard
 from spadmnist.disk import Files
 from spadmnist.effects import Conditions
 from spadmnist.errors import ConfigError, InputError
@@ -49,6 +48,7 @@ from spadmnist.importers.frames import Npz, Tif
 from spadmnist.inference.reduction import statistics_for
 from spadmnist.readout import Recorded
 from spadmnist.recording import Capture, Light, Recording
+from spadmnist.shard_plan import Shard
 from spadmnist.statistics import _order
 from spadmnist.statistics.integrity import Gaps
 
@@ -358,7 +358,7 @@ def test_every_file_has_its_shard(encoding: store.Encoding) -> None:
         place = encoding.location(shard.path)
         names = [place] if encoding.one_file else [f"{place}/zarr.json", f"{place}/tr/c.0"]
         files |= {name: {} for name in names}
-    found = dataset.files_by_shard(files, encoding)
+    found = shard_plan.files_by_shard(files, encoding)
     for shard in shards:
         place = encoding.location(shard.path)
         assert list(found[place]) == [n for n in files if n == place or n.startswith(f"{place}/")]

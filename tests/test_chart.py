@@ -11,7 +11,7 @@ import pytest
 from pydantic import TypeAdapter
 
 import spadmnist
-from spadmnist import dataset, factory, images, tiles, verify
+from spadmnist import factory, images, manifest_file, tiles, verify
 from spadmnist.errors import InputError, SpadError
 from spadmnist.images import Array, Chart, Digits, Images, Uniform
 
@@ -192,7 +192,7 @@ def test_a_dataset_of_a_chart_is_verified_and_repaired(tmp_path: Path) -> None:
     before = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
     hurt = next(p for p in sorted(before) if "1_lux" in str(p) and p.suffix == ".zip")
     hurt.write_bytes(b"x")
-    (root / dataset.CONFIG).unlink()
+    (root / manifest_file.CONFIG).unlink()
     verify.repair(root, verify.verify(root), 1)
     assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
 
@@ -208,7 +208,7 @@ def test_a_dataset_of_a_chart_is_verified_and_repaired(tmp_path: Path) -> None:
 )
 def test_a_manifest_that_lies_of_tiles_is_refused(change: Any, sentence: str, tmp_path: Path) -> None:
     root = made(config_in(tmp_path), tmp_path / "out")
-    manifest = json.loads((root / dataset.MANIFEST).read_text())
+    manifest = json.loads((root / manifest_file.MANIFEST).read_text())
     change(manifest["images"]["splits"]["train"]["tiles"])
     assert any(sentence in problem for problem in spadmnist.manifest.problems(manifest, "manifest.json"))
 

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 import pytest
 
-from spadmnist import compiled, kernels
+from spadmnist import compiled, packing
 
 PACKAGE = Path(compiled.__file__).parent
 NOWHERE = "/dev/null/nowhere"  # what nobody can make, whoever runs the tests
@@ -37,7 +37,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 
 
 def test_kernels_are_not_kept_beside_the_program() -> None:
-    place = kernels.row_sums.stats.cache_path
+    place = packing.row_sums.stats.cache_path
     assert Path(place).parent == compiled.folder()
     assert not Path(place).is_relative_to(PACKAGE)
 
@@ -157,7 +157,7 @@ def copied(tmp_path: Path) -> Path:
     return root
 
 
-WHERE = "from spadmnist import compiled, kernels; print(compiled.folder())"
+WHERE = "from spadmnist import compiled, kernels, packing; print(compiled.folder())"
 
 
 def where(copied: Path, **more: str) -> tuple[str, str]:
@@ -217,7 +217,7 @@ def test_what_is_compiled_is_told_and_what_is_there_is_not(
     monkeypatch.setattr(compiled, "_SILENCE", 0.0)
     said: list[str] = []
     for hits in (0, 1):  # a second dispatcher finds what the first has kept
-        total = compiled.kernel()(kernels.row_sums.py_func)
+        total = compiled.kernel()(packing.row_sums.py_func)
         with compiled.compiling(lambda: said.append("compiling")):
             total(np.zeros(3), np.array([0, 3]))
         assert sum(total.stats.cache_hits.values()) == hits

@@ -18,7 +18,7 @@ from test_store import ATTRIBUTES, check, members, more_columns, some_columns
 from zarr.storage import ZipStore
 
 import spadmnist
-from spadmnist import archive, config, dataset, factory, verify
+from spadmnist import archive, config, factory, manifest_file, shard_columns, shard_plan, verify
 from spadmnist.errors import InputError, SpadError
 from spadmnist.sources import Local
 from spadmnist.store import Column, encoding
@@ -61,7 +61,7 @@ def test_xarray_selects_by_label(made: Path) -> None:
 
 
 def test_images_are_numbered_through_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "_IMAGES_PER_SHARD", 32)
+    monkeypatch.setattr(shard_plan, "_IMAGES_PER_SHARD", 32)
     make(write_config(tmp_path / "small.yaml", **FEW), tmp_path / "out")  # type: ignore[arg-type]
     stores = [ZipStore(path) for path in shards(tmp_path / "out", "2560_mlux/train")]
     fluxes = xr.open_mfdataset(stores, engine="zarr", group="reconstruction")
@@ -82,9 +82,9 @@ def test_images_without_labels_have_numbers_alone(tmp_path: Path) -> None:
 
 def test_an_array_cannot_have_the_name_of_a_coordinate() -> None:
     labels = np.zeros(3, np.uint8)
-    assert set(dataset.coordinate_columns(["tr/ticks"], range(3), labels)) == {"tr/image", "tr/label"}
+    assert set(shard_columns.coordinate_columns(["tr/ticks"], range(3), labels)) == {"tr/image", "tr/label"}
     with pytest.raises(InputError, match="reconstruction/label: is the name of a coordinate"):
-        dataset.coordinate_columns(["reconstruction/label"], range(3), labels)
+        shard_columns.coordinate_columns(["reconstruction/label"], range(3), labels)
 
 
 # --- bytes --------------------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_an_encoding_of_a_later_program_is_named(made: Path, tmp_path: Path) -> 
     root = tmp_path / "out"
     shutil.copytree(made, root)
     manifest = {**json.loads((root / "manifest.json").read_text()), "encoding": 3}
-    (root / "manifest.json").write_bytes(dataset.seal(manifest))
+    (root / "manifest.json").write_bytes(manifest_file.seal(manifest))
     says = r"manifest\.json: encoding 3 of format zarr is not known; .* 1, 2: install a newer spadmnist"
     for read in (spadmnist.open, lambda place: factory.add_reconstructions(place, METHODS, 1)):
         with pytest.raises(InputError, match=says):

@@ -27,7 +27,7 @@ from commands import COMMAND, run, run_anew
 from test_guard import LOSSY_BUS
 
 import spadmnist
-from spadmnist import config, dataset, factory, golden, plugins, reconstruct
+from spadmnist import config, factory, golden, plugins, reconstruct, shard_plan
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.store import Encoding
@@ -252,7 +252,7 @@ def test_an_image_alone_is_the_one_that_is_stored(made: tuple[Path, Path]) -> No
 @pytest.mark.parametrize("frames", [3, 8, 100])
 def test_cuts_and_numbers_of_frames(frames: int, format: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dataset in many shards reads as one, whatever the number of frames."""
-    monkeypatch.setattr(dataset, "_IMAGES_PER_SHARD", 11)
+    monkeypatch.setattr(shard_plan, "_IMAGES_PER_SHARD", 11)
     file = write_config(tmp_path / "c.yaml", format, ("2560 mlux",), frames=frames)
     outcome = make(file, tmp_path / "out")
     assert outcome.made == 2 + 4 + 2

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from spadmnist import config, factory, shard_facts, verify
+from spadmnist import config, factory, shard_facts, shard_plan, verify
 from spadmnist.shard_facts import Facts
 
 
@@ -16,7 +16,7 @@ def test_each_shards_facts_are_taken_once(tmp_path: Path, monkeypatch: pytest.Mo
     """As it is made; a run that is taken up reads none that was noted, and one whose note is damaged."""
     experiment = config.read(config.shipped("quick.yaml"), lux=("2560 mlux",), limit=64)
     images = experiment.load_images()
-    monkeypatch.setattr(factory.dataset, "_IMAGES_PER_SHARD", 32)
+    monkeypatch.setattr(shard_plan, "_IMAGES_PER_SHARD", 32)
     read: list[str] = []
     real = shard_facts.facts_of
 

@@ -25,7 +25,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "system"},
     {"compiled", "import_options", "leftovers"},
-    {"disk", "kernels", "large", "sources", "workers"},
+    {"bit_planes", "disk", "estimators", "kernels", "large", "packing", "sources", "workers"},
     {"archive"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
     {"validated", "scene", "zipped", "by_value", "yaml_edit"},
@@ -36,6 +36,8 @@ LAYERS = [
     {"experiment", "signatures"},
     {"config"},
     {"identity", "manifest", "sensor_file"},
+    {"shard_plan"},
+    {"manifest_file", "shard_columns"},
     {"dataset"},
     {"golden", "measurement", "shard_facts"},
     {"factory", "look", "reference", "schema", "template", "twin"},

@@ -19,7 +19,7 @@ from pydantic import create_model
 from test_factory import assert_same, make, tree
 from test_guard import files_of, known, said_of_files, said_of_values, values_of, versions
 
-from spadmnist import config, dataset, images, verify
+from spadmnist import config, images, manifest_file, verify
 from spadmnist.errors import SpadError
 from spadmnist.section import LATER
 
@@ -47,7 +47,7 @@ def assert_same_but_for_the_seal(root: Path, before: dict[str, bytes | str], man
     assert set(now) - set(manifest) == {"provenance", "provenance_sha256"}
     for key in set(manifest) - {"versions", "sha256"}:
         assert now[key] == manifest[key], key
-    (root / "manifest.json").write_bytes(dataset.seal(manifest))
+    (root / "manifest.json").write_bytes(manifest_file.seal(manifest))
     assert_same(root, before)
 
 

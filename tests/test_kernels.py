@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from spadmnist import kernels
+from spadmnist import bit_planes, estimators, kernels, packing
 from spadmnist.effects import Conditions, Effect
 from spadmnist.effects.afterpulsing import Afterpulsing
 from spadmnist.effects.dead_time import DeadTime
@@ -342,11 +342,11 @@ def test_non_paralyzable_and_take(data: tuple[np.ndarray, np.ndarray], dead: lis
 def test_row_differences_and_back(data: tuple[np.ndarray, np.ndarray], kind: type) -> None:
     times, offsets = data
     values = (times * np.iinfo(kind).max).astype(kind)
-    differences = kernels.row_differences(values, offsets)
+    differences = packing.row_differences(values, offsets)
     assert differences.dtype == kind
     for row, plain in zip(rows_of(differences, offsets), rows_of(values, offsets), strict=True):
         assert row == plain[:1] + [b - a for a, b in itertools.pairwise(plain)]
-    back = kernels.row_sums(differences, offsets)
+    back = packing.row_sums(differences, offsets)
     assert back.dtype == kind and np.array_equal(back, values)
 
 
@@ -364,7 +364,7 @@ def test_row_totals_are_exact(data: tuple[np.ndarray, np.ndarray], kind: type) -
 @given(ragged())
 def test_spans(data: tuple[np.ndarray, np.ndarray]) -> None:
     times, offsets = data
-    counts, span = kernels.spans(times, offsets)
+    counts, span = estimators.spans(times, offsets)
     plain = rows_of(times, offsets)
     assert counts.dtype == np.int32 and counts.tolist() == [len(row) for row in plain]
     assert span.tolist() == [row[-1] - row[0] if len(row) > 1 else 0.0 for row in plain]
@@ -706,22 +706,22 @@ def test_stamps_in_frames(pixels: int, frames: int, share: float, seed: int) -> 
         ticks = rng.integers(0, 1000, int(offsets[-1])).astype(kind)
         wanted = np.full((pixels, frames), 1000, np.uint32)
         wanted[ones] = ticks
-        begins, stamps, whose = kernels.stamps_by_frame(np.packbits(ones, axis=1), offsets, ticks, frames)
+        begins, stamps, whose = bit_planes.stamps_by_frame(np.packbits(ones, axis=1), offsets, ticks, frames)
         frame, pixel = np.nonzero(wanted.T < 1000)
         assert stamps.dtype == np.uint32 and stamps.tolist() == wanted.T[frame, pixel].tolist()
         assert whose.tolist() == pixel.tolist()
         assert np.diff(begins).tolist() == ones.sum(axis=0).tolist()
-        again = kernels.stamps_of_frames(np.ascontiguousarray(wanted.T), 1000)
+        again = bit_planes.stamps_of_frames(np.ascontiguousarray(wanted.T), 1000)
         assert all(np.array_equal(*both) for both in zip(again, (begins, stamps, whose), strict=True))
         filled = np.full((frames, pixels), 1000, np.uint32)
-        kernels.fill_stamps(begins, stamps, whose, filled)
+        bit_planes.fill_stamps(begins, stamps, whose, filled)
         assert np.array_equal(filled, wanted.T)
 
         found = np.full((frames, pixels), 1000, np.uint32)
-        kernels.stamps_first(np.packbits(ones, axis=1), offsets, ticks, found)
+        bit_planes.stamps_first(np.packbits(ones, axis=1), offsets, ticks, found)
         assert np.array_equal(found, wanted.T)
     bits = np.full((frames, pixels), 7, np.uint8)
-    kernels.bits_first(np.packbits(ones, axis=1), bits)
+    bit_planes.bits_first(np.packbits(ones, axis=1), bits)
     assert np.array_equal(bits, ones.T)
 
 
@@ -732,6 +732,6 @@ def test_packed_rows_lie_next_to_each_other(width: int, rows: int) -> None:
     set_ = np.random.default_rng(width).random((3 * rows, width)) < 0.4
     set_[::3], set_[1::5] = False, True
     bits = np.packbits(set_, axis=1)
-    packed = kernels.pack_rows(bits, width, rows)
+    packed = packing.pack_rows(bits, width, rows)
     assert np.array_equal(packed, np.packbits(set_.reshape(3, rows * width), axis=1))
-    assert np.array_equal(kernels.unpack_rows(packed, width, rows), bits)
+    assert np.array_equal(packing.unpack_rows(packed, width, rows), bits)

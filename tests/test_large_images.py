@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import spadmnist.sensor
-from spadmnist import config, document, experiment, factory, kernels, plan, standing, streams, twin
+from spadmnist import config, document, experiment, factory, kernels, plan, shard_plan, standing, streams, twin
 from spadmnist.effects import Conditions, Effect
 from spadmnist.errors import InputError
 from spadmnist.events import Events, Layout
@@ -444,7 +444,7 @@ def test_memory_that_is_told_counts_what_is_simulated_at_once() -> None:
 
     def memory(made: Experiment) -> int:
         images = made.load_images()
-        return factory.memory_per_worker(made, images, spadmnist.dataset.shards_of(made, images))
+        return factory.memory_per_worker(made, images, shard_plan.shards_of(made, images))
 
     events = float(tied.sensor.expected(np.full((1, 480 * 640), tied.white(tied.levels[0])), tied.conditions)[0].sum())
     assert memory(tied) - memory(parts) == pytest.approx(50 * (events - 4e6), rel=0.01)

@@ -16,7 +16,7 @@ from commands import run
 from test_factory import assert_same, assert_sentence, make, tree, write_config
 
 import spadmnist
-from spadmnist import cli, dataset, disk, manifest, report, verify
+from spadmnist import cli, disk, manifest, manifest_file, report, verify
 from spadmnist.errors import InputError, SpadError
 from spadmnist.events import Layout
 from spadmnist.measurement import write
@@ -40,7 +40,7 @@ def sealed(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change the manifest, and seal it as it should be."""
     found = json.loads((root / "manifest.json").read_bytes())
     change(found)
-    (root / "manifest.json").write_bytes(dataset.seal(found))
+    (root / "manifest.json").write_bytes(manifest_file.seal(found))
 
 
 def leaves(value: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -53,7 +53,7 @@ def leaves(value: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 def use(root: Path) -> None:
     """Everything that takes a manifest at its word."""
-    found = dataset.intact_manifest(root)
+    found = manifest_file.intact_manifest(root)
     report.level_table(found)
     report.level_rows(found)
     opened = spadmnist.open(root)
@@ -85,7 +85,7 @@ def test_every_entry_is_checked(root: Path) -> None:
                 del group[place[-1]]
             else:
                 group[place[-1]] = value
-            (root / "manifest.json").write_bytes(dataset.seal(changed))
+            (root / "manifest.json").write_bytes(manifest_file.seal(changed))
             try:
                 use(root)
                 verify.verify(root)

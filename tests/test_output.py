@@ -14,7 +14,7 @@ from test_factory import assert_same, make, tree, write_config
 from zarr.storage import ZipStore
 
 import spadmnist
-from spadmnist import config, dataset, factory, verify
+from spadmnist import config, factory, manifest_file, verify
 from spadmnist.errors import ConfigError, InputError
 
 ON_READING = "reconstructions: on_reading"
@@ -69,7 +69,7 @@ def test_the_values_are_those_of_any_other_dataset(
             assert np.array_equal(one.tr[:].ticks, two.tr[:].ticks)
             assert np.array_equal(one.frames[:].first.ticks, two.frames[:].first.ticks)
             assert np.array_equal(one.qis[:], two.qis[:])
-    said = [dataset.read_manifest(place)[0] for place in places]
+    said = [manifest_file.read_manifest(place)[0] for place in places]
     for level, splits in said[0]["statistics"].items():
         for split, facts in splits.items():
             assert {**facts, "bytes": 0} == {**said[1]["statistics"][level][split], "bytes": 0}
@@ -81,12 +81,12 @@ def test_the_values_are_those_of_any_other_dataset(
 
 def test_a_manifest_names_neither_where_it_is_as_before(tmp_path: Path) -> None:
     root = made(tmp_path / "stored", "compression: fast", "reconstructions: stored")
-    assert dataset.read_manifest(root)[0]["config"]["output"] == {"format": "zarr"}
+    assert manifest_file.read_manifest(root)[0]["config"]["output"] == {"format": "zarr"}
 
 
 def test_small_is_smaller_and_zarr_opens_it(tmp_path: Path) -> None:
     roots = made(tmp_path / "fast"), made(tmp_path / "small", SMALL)
-    fast, small = (sum(f["bytes"] for f in dataset.read_manifest(root)[0]["files"].values()) for root in roots)
+    fast, small = (sum(f["bytes"] for f in manifest_file.read_manifest(root)[0]["files"].values()) for root in roots)
     assert small < 0.99 * fast
     places = [root / "data/2560_mlux/train/00000.zarr.zip" for root in roots]
     shards = [zarr.open_group(ZipStore(place), mode="r") for place in places]

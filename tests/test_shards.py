@@ -18,7 +18,7 @@ from commands import run
 from test_factory import assert_same, assert_sentence, interrupted, make, tree, write_config
 
 import spadmnist
-from spadmnist import dataset, factory, verify
+from spadmnist import factory, shard_plan, verify
 from spadmnist.errors import InputError, SpadError
 from spadmnist.store import Encoding, encoding
 
@@ -31,7 +31,7 @@ HERE, THERE = "40_mlux/train/00001", "2560_mlux/train/00001"  # the shard that i
 def small_shards() -> Iterator[None]:
     """Ten images a shard, so that a split has several."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "_IMAGES_PER_SHARD", 10)
+        patch.setattr(shard_plan, "_IMAGES_PER_SHARD", 10)
         yield
 
 

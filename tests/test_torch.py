@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "lab.yaml").write_text(CONFIG.replace("READOUTS", "[tr, str, qis, counts]"))
     # small shards, so that there is something to shuffle
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spadmnist.dataset._IMAGES_PER_SHARD", 10)
+        patch.setattr("spadmnist.shard_plan._IMAGES_PER_SHARD", 10)
         experiment = config.read(root / "lab.yaml")
         factory.generate(experiment, experiment.load_images(), root / "out", 1)
     return root

@@ -25,7 +25,7 @@ from test_factory import (
 )
 
 import spadmnist
-from spadmnist import dataset, factory, verify
+from spadmnist import factory, manifest_file, verify
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.store import encoding
@@ -251,12 +251,12 @@ def test_a_manifest_cannot_make_verify_wait(root: Path) -> None:
 
 def test_names_in_a_manifest_lead_nowhere_else(root: Path, tmp_path: Path) -> None:
     """A hostile manifest, sealed as it should be, lists a file outside."""
-    from spadmnist import dataset
+    from spadmnist import manifest_file
 
     (tmp_path / "precious").write_text("mine")
-    manifest, _ = dataset.read_manifest(root)
+    manifest, _ = manifest_file.read_manifest(root)
     manifest["files"]["../precious"] = {"bytes": 4, "sha256": "0" * 64}
-    (root / "manifest.json").write_bytes(dataset.seal(manifest))
+    (root / "manifest.json").write_bytes(manifest_file.seal(manifest))
     with contextlib.suppress(SpadError):
         verify.repair(root, verify.verify(root), 1)
     assert (tmp_path / "precious").read_text() == "mine"
@@ -393,12 +393,12 @@ def made_elsewhere(root: Path, plant: bool = False) -> None:
     manifest = json.loads((root / "manifest.json").read_text())
     manifest["provenance"]["numpy"] = "1.0"
     if plant:
-        encoding = dataset.encoding_in(manifest, root)
+        encoding = manifest_file.encoding_in(manifest, root)
         column = encoding.reader(root, PLANTED).column("reconstruction/counts")
         other = replace(column, data=column.data + np.float32(1))
         manifest["files"] |= encoding.append(root, PLANTED, {"reconstruction/counts": other})
         shutil.rmtree(root / ".spadmnist")
-    (root / "manifest.json").write_bytes(dataset.seal(manifest))
+    (root / "manifest.json").write_bytes(manifest_file.seal(manifest))
 
 
 def a_file(root: Path) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import spadmnist
-from spadmnist import capture_files, config, dataset, document, factory, store
+from spadmnist import capture_files, config, document, factory, shard_plan, store
 from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.comparison import Check, Comparison
 from spadmnist.inference.light_levels import Nuisance
@@ -135,7 +135,7 @@ def _dataset(place: Path) -> str:
     experiment = config.build(document.parse(_DATASET, "config"), Path())
     factory.generate(experiment, experiment.load_images(), place, 1)
     rows = []
-    for shard in dataset.shards_of(experiment, experiment.load_images()):
+    for shard in shard_plan.shards_of(experiment, experiment.load_images()):
         reader = experiment.encoding.reader(place, shard.path)
         for name in reader.names:
             where = f"{shard.folder}/{shard.split}: {name}"

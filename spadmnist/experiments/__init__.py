@@ -36,7 +36,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .. import dataset, disk, factory, pages, plugins, reference, report
+from .. import disk, factory, manifest_file, pages, plugins, reference, report
 from ..errors import SpadError
 from ..factory import Progress
 from ..pages import Story, Table
@@ -217,7 +217,7 @@ def run(experiment: PaperExperiment, setting: Setting) -> Outcome:
         def done(key: str, numbers: dict[str, Any]) -> None:
             nonlocal drawn
             results[key] = {**common, **tasks[key].about, **numbers}
-            disk.put_file(_place(setting.out, key), dataset.canonical(results[key]))
+            disk.put_file(_place(setting.out, key), manifest_file.canonical(results[key]))
             there = f"{sum(key in results for key in tasks)} of {len(tasks)}"
             setting.progress.notice(f"{there}: {experiment.tell(results[key])}{left.after(tasks[key].work)}")
             if time.monotonic() - drawn > _PAUSE:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import config, dataset, factory, fluxes, measurement, plugins, tiles, twin
+from .. import config, dataset, factory, fluxes, manifest_file, measurement, plugins, tiles, twin
 from ..effects import Conditions, Effect
 from ..errors import InputError
 from ..experiment import Experiment
@@ -393,7 +393,7 @@ def _by_light(shots: Sequence[_Shot]) -> list[list[_Shot]]:
 
 
 def _digest(of: Any) -> str:
-    return hashlib.sha256(dataset.canonical({"of": of})).hexdigest()
+    return hashlib.sha256(manifest_file.canonical({"of": of})).hexdigest()
 
 
 def _picture(name: str, digits: np.ndarray) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import config, dataset, measurement, pictures, twin
+from .. import config, manifest_file, measurement, pictures, twin
 from ..effects import Conditions
 from ..errors import InputError
 from ..experiment import Experiment
@@ -359,7 +359,7 @@ def _edges(frames: int) -> list[float]:
 
 
 def _digest(of: Any) -> str:
-    return hashlib.sha256(dataset.canonical({"of": of})).hexdigest()
+    return hashlib.sha256(manifest_file.canonical({"of": of})).hexdigest()
 
 
 # --- what is shown ------------------------------------------------------------------------------------------------

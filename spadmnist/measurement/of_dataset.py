@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import config, dataset, recording
+from .. import config, dataset, manifest_file, recording
 from ..document import Document
 from ..errors import InputError
 from ..events import Layout
@@ -27,7 +27,7 @@ def of_dataset(root: Path, readout: str | None) -> Measurement:
     readout: which one to take; without it the first of `MODALITIES` that was recorded. Raises InputError where the
     images are neither uniform nor grey charts, or the readout was not recorded.
     """
-    manifest = dataset.intact_manifest(root)
+    manifest = manifest_file.intact_manifest(root)
     experiment = config.build(Document(str(root), manifest["config"]), root)
     source = experiment.source
     if not isinstance(source, Uniform | Chart):

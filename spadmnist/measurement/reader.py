@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import capture_files, dataset, disk, document, manifest, scene, tiles, units
+from .. import capture_files, disk, document, manifest, manifest_file, scene, tiles, units
 from ..document import Document, Path_
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
@@ -48,7 +48,7 @@ def open(path: str | Path, readout: str | None = None, planned: bool = False) ->
     path = Path(path)
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if path.is_dir() and not file.exists():
-        if (path / dataset.MANIFEST).exists():
+        if (path / manifest_file.MANIFEST).exists():
             return of_dataset(path, readout)
         raise InputError(
             f"{path} is not a measurement: it has no {FILE} (spadmnist import makes one of files of other programs)"

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import capture_files, dataset, disk, document, system, units
+from .. import capture_files, disk, document, manifest_file, system, units
 from ..errors import InputError, SpadError
 from ..events import Layout
 from ..positions import positions_text
@@ -178,7 +178,7 @@ def _tiles(captures: Sequence[Capture]) -> dict[bytes, str]:
 
 
 def _laid(tiles: Tiles) -> bytes:
-    return dataset.canonical(tiles.facts())
+    return manifest_file.canonical(tiles.facts())
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .. import dataset as datasets
+from ..manifest_file import seal, shards_in
 from . import _text as text
 
 
@@ -30,7 +30,7 @@ def level_rows(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _splits(manifest: Mapping[str, Any]) -> list[str]:
     """In the config's order, which the manifest's shards keep and its sorted names do not."""
-    return list(dict.fromkeys(shard.split for shard in datasets.shards_in(manifest)))
+    return list(dict.fromkeys(shard.split for shard in shards_in(manifest)))
 
 
 def _numbers(facts: Mapping[str, Any], frames: int) -> dict[str, Any]:
@@ -76,7 +76,7 @@ def _about(manifest: Mapping[str, Any]) -> str:
     each = " and ".join(f"{images['splits'][split]['images']:,} {split}" for split in _splits(manifest))
     size = " x ".join(str(n) for n in images["shape"])
     levels = f"{len(manifest['levels'])} light level{'s' if len(manifest['levels']) > 1 else ''}"
-    stored = sum(facts["bytes"] for facts in manifest["files"].values()) + len(datasets.seal(dict(manifest)))
+    stored = sum(facts["bytes"] for facts in manifest["files"].values()) + len(seal(dict(manifest)))
     framed = ""
     if set(recording["readouts"]) & {"str", "qis"}:
         framed = f", {recording['frames']:,} frames of {recording['frame_time']}"

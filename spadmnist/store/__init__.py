@@ -61,5 +61,6 @@ __all__ = [
     "folder",
     "hdf5",
     "is_name",
+    "read_joined",
     "smaller",
 ]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simple_sensor import one_of_each, stamped
 
-from spadmnist import kernels
+from spadmnist import bit_planes
 from spadmnist.inference.reduction import statistics_for
 from spadmnist.recording import FirstStamps, Recording, StampedFrames
 from spadmnist.statistics._frames import add_pixels, first_stamps, frame_sums
@@ -40,7 +40,7 @@ def test_frames_that_are_held_as_their_stamps(frames: int) -> None:
     """They are read like any others, and statistics find in them the same."""
     dense = stamped(3, (frames, 6, 11), 0.2)
     whole = np.asarray(dense.frames[:])  # type: ignore[index]
-    found = FirstStamps(*kernels.stamps_of_frames(whole.reshape(frames, -1), dense.none))
+    found = FirstStamps(*bit_planes.stamps_of_frames(whole.reshape(frames, -1), dense.none))
     held = replace(dense, frames=StampedFrames(found, dense.none, whole.shape), _kept={})
     assert held.frames is not None and held.n_frames == frames
     for part in (slice(None), slice(1, 3), slice(3, 1), slice(-2, None), slice(None, None, -3), slice(2, None, 2)):
@@ -60,7 +60,7 @@ def test_how_long_first_detections_were_waited_for(frames: int, pixels: int, sha
     rng = np.random.default_rng(seed)
     stamps = np.where(rng.random((frames, pixels)) < share, rng.integers(3, 900, (frames, pixels)), 1000)
     of_pixels, of_frames = np.zeros(pixels), np.zeros(frames)
-    kernels.add_waits(*kernels.stamps_of_frames(stamps.astype(np.uint32), 1000), 3, 900, of_pixels, of_frames)
+    bit_planes.add_waits(*bit_planes.stamps_of_frames(stamps.astype(np.uint32), 1000), 3, 900, of_pixels, of_frames)
     wanted_pixels, wanted_frames = [0.0] * pixels, [0.0] * frames
     for f in range(frames):
         for p in range(pixels):
