@@ -89,6 +89,13 @@ def _recording(sensor: Sensor, made: Recorded, image: int, capture: Capture) -> 
     return recording.of_image(made, image, capture, sensor.layout, sensor.nominal_dead_time)
 
 
+def draws_bits(sensor: Sensor, capture: Capture) -> bool:
+    """Whether `model_recordings` draws the bits of a capture's frames without their events, where it may."""
+    c = capture.conditions
+    part = replace(c, frames=1, exposure=c.frame_period)
+    return capture.modality == "qis" and not sensor.at("gate") and standing.tying(sensor, c, part) is None
+
+
 _Told = Callable[[float], None]  # which share is made
 _Part = Callable[[np.ndarray, Streams, _Told], Recording]
 

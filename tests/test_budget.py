@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 import tinylab
 
+from spadmnist import twin
+from spadmnist.effects import Conditions, Effect
 from spadmnist.errors import InputError
-from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of
+from spadmnist.events import Layout
+from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of, work_of
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.journal import Journal
@@ -20,6 +23,8 @@ from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.next_step import after_comparison, after_diagnosis
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.results import Diagnosis, canonical, sentence, table
+from spadmnist.recording import Capture, Light
+from spadmnist.sensor import Sensor
 from spadmnist.workers import Serial
 
 AFTERPULSING = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
@@ -73,6 +78,26 @@ def test_work_is_counted_before_it_is_done():
     one.spend(100.0)
     assert one.spent == 104.0
     Budget().spend(1e9)
+
+
+def test_bits_without_their_events_are_little_work():
+    """Of 32 x 32 pixels and 1,000 frames, those that do not depend on each other."""
+    conditions = Conditions(1e-2, 1000, 1e-5, 1e-5, 5e-7)
+    qis = Capture("flat", "qis", Light(5e-7, 1e-3), conditions)
+    layout = Layout(32, 32, 1e-10, 1.0)
+    find = Effect.registry.find
+    alone = [find("detection")(pdp=0.5), find("dark_counts")(rate=100.0)]
+    tied = [*alone, find("afterpulsing")(probability=0.01)]
+    gated = [*alone, find("short_gate")(fraction=0.5)]
+    assert twin.draws_bits(Sensor(layout, alone, "device"), qis)
+    assert not twin.draws_bits(Sensor(layout, tied, "device"), qis)
+    assert not twin.draws_bits(Sensor(layout, gated, "device"), qis)
+    assert not twin.draws_bits(Sensor(layout, alone, "device"), replace(qis, modality="tr"))
+    bits = 32 * 32 * 1000
+    for share in (0.1, 0.9):
+        drawn, simulated = (work_of(qis, share * bits, 32 * 32, by_bits) for by_bits in (True, False))
+        assert drawn < simulated / 2
+    assert math.isclose(work_of(qis, 0.1 * bits, 1024, True), work_of(qis, 0.9 * bits, 1024, True))
 
 
 def test_the_clock_ends_what_takes_three_times_as_long():

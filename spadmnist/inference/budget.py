@@ -15,9 +15,10 @@ from .. import units
 from ..errors import InputError
 from ..recording import Capture
 
-# s of two idle cores, measured with `rules: device` and all statistics: per detection, per pixel of a frame, per
+# s of two idle cores, measured with `rules: device` and all statistics: per detection with a stamp, per detection in
+# frames, per bit that is drawn without its events (of those that are rarer, 0 or 1), per pixel of a frame, and per
 # recording
-_DETECTION, _PIXEL_FRAME, _RECORDING = 1.5e-7, 2e-9, 2e-3
+_STAMP, _IN_FRAMES, _DRAWN_BIT, _PIXEL_FRAME, _RECORDING = 1.5e-7, 5e-8, 1e-8, 1e-9, 2e-3
 _LONG, _LONG_UNITS = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(min|h)\s*", re.ASCII), {"min": 60.0, "h": 3600.0}
 _SLOW = 3.0  # times the budget, after which the clock ends a run
 _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis
@@ -104,13 +105,17 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def work_of(capture: Capture, detections: float, pixels: int) -> float:
+def work_of(capture: Capture, detections: float, pixels: int, by_bits: bool = False) -> float:
     """The work of simulating and reducing one recording of a capture, s of two idle cores.
 
     Args:
         capture: its modality and its frames decide the cost of the pixels.
         detections: of the whole array.
         pixels: of the array.
+        by_bits: the bits of its frames are drawn without their events (`twin.draws_bits`).
     """
     frames = 0 if capture.modality == "tr" else capture.conditions.frames * pixels
-    return _RECORDING + _DETECTION * detections + _PIXEL_FRAME * frames
+    drawn = (_IN_FRAMES if capture.modality in ("qis", "counts") else _STAMP) * detections
+    if by_bits:
+        drawn = _DRAWN_BIT * min(detections, frames - detections)
+    return _RECORDING + drawn + _PIXEL_FRAME * frames

@@ -252,11 +252,12 @@ class Replicates:
             )
         return workers
 
-    def _work(self, id: str) -> float:
+    def _work(self, sensor: Sensor, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
         seen = self.seen[id]
+        capture = seen.capture if seen.half_of is None else seen.half_of[0]
         whole = 1 if seen.half_of is None else 2  # for a half the whole is simulated
-        return work_of(seen.capture, whole * seen.total, self.start.layout.pixels)
+        return work_of(capture, whole * seen.total, self.start.layout.pixels, twin.draws_bits(sensor, capture))
 
     # --- simulating ----------------------------------------------------------------------------------------------
 
@@ -278,14 +279,16 @@ class Replicates:
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | str] = [""] * len(wanted)
         names = [self._name(one, pieces, hasty) for one in wanted]
-        most = 0.0  # bytes of a replicate
+        most = work = 0.0  # bytes of a replicate; s of two idle cores
         for k, (sensors, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
             try:
                 if len(numbers):
-                    most = max(most, self._bytes(sensors.of(id, int(numbers[0])), id, photons))
+                    first = sensors.of(id, int(numbers[0]))
+                    most = max(most, self._bytes(first, id, photons))
+                    work += len(numbers) * self._work(first, id)
                 for part in parts:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
                     models = [Packed.of(sensors.of(id, number), self.workers.apart) for number in each]
@@ -293,9 +296,8 @@ class Replicates:
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
                 tasks[k], out[k] = [], why_not(error)
-        asked = [(id, len(numbers)) for some, (_, id, _, numbers) in zip(tasks, wanted, strict=True) if some]
-        self.budget.spend(sum(number * self._work(id) for id, number in asked))
-        self.simulations += sum(number for _, number in asked)
+        self.budget.spend(work)
+        self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
         for k, some in enumerate(tasks):
             if some and self.journal and (before := self.journal.recall(names[k])) is not None:
                 tasks[k], out[k] = [], before
