@@ -5,10 +5,10 @@ DEMO := demo
 # MNIST, where it is at hand: tests and benchmarks that need the real digits look there
 IMAGES ?= $(firstword $(wildcard $(SPADMNIST_DATA)) $(wildcard ../shared/mnist))
 
-.PHONY: help demo test verify docs docs-two faults bench profile matrix package challenge lint clean
+.PHONY: help demo test verify verify-all docs docs-two faults bench profile matrix package challenge lint clean
 
 help:  ## say what there is
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(VENV)/installed: pyproject.toml
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
@@ -28,13 +28,16 @@ demo: $(VENV)/installed  ## set up, and run the main job in seconds: digits, fou
 
 # Neighbours stay together, for what they share, until a worker has nothing left to do. The tests start programs by the
 # hundred: compiled modules are kept for them, wherever the environment says that none be written
-test verify: export PYTHONDONTWRITEBYTECODE =
+test verify verify-all: export PYTHONDONTWRITEBYTECODE =
 PYTEST = $(RUN)/python -m pytest -q -n 2 --dist worksteal
 
 test: $(VENV)/installed lint  ## set up, and run the tests (a quarter of an hour)
 	$(PYTEST) -m "not slow"
 
 verify: $(VENV)/installed  ## the slow statistical and fault tests
+	$(PYTEST) -m "slow and not long"
+
+verify-all: $(VENV)/installed  ## the same, and the tests that take minutes each
 	$(PYTEST) -m slow
 
 # Tries of each class at most, drawn by lot, which take an hour on two slow cores. TRIES=700 takes all kills and full disks

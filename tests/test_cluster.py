@@ -338,9 +338,9 @@ def test_a_connection_that_breaks_under_a_result_is_no_error_of_the_task() -> No
 
 
 def test_ctrl_c_ends_within_five_seconds(many: tuple[Path, Path], site: Site, tmp_path: Path) -> None:
-    code = (
-        "import sys; from pathlib import Path; from spadmnist import interrupts; interrupts.install();"
-        "interrupts.under_way(True)\n"
+    code = (  # where the tests run in the background of a shell, SIGINT is ignored
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from spadmnist import interrupts; interrupts.install(); interrupts.under_way(True)\n"
         "from spadmnist.cluster import Cluster\nimport time\n"
         "print('ready', flush=True)\n"
         "try:\n    Cluster(sys.argv[1]).run(time.sleep, iter, [60, 61], print)\n"

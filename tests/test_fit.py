@@ -348,6 +348,7 @@ def answer_of(tmp_path, sensor, name):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
     """The same numbers of the same data; simulated only where the sensor has what the likelihood does not know."""
     start = SENSOR.replace("tdc:", "afterpulsing: {probability: 0.7 %, lifetime: 25 ns}\n    tdc:")

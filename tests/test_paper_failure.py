@@ -92,6 +92,7 @@ def test_the_uniform_model_knows_nothing_of_it(recorded: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_diagnose_finds_all_three(tmp_path: Path) -> None:
     chip = failure.record(tmp_path, SIDE, 2 * FRAMES)
     answer = failure.diagnosed(tmp_path, quick=True)

@@ -152,7 +152,11 @@ def test_what_numbers_take_from_residuals_is_beyond_what_they_leave() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "modality"),
-    [(one, modality) for modality in ("qis", "tr") for one in (*PRINTS, *OTHERS)],
+    [  # each effect in one of the two; `long`: in the other, too
+        pytest.param(one, modality, marks=pytest.mark.long if (n + k) % 2 else ())
+        for k, modality in enumerate(("qis", "tr"))
+        for n, one in enumerate((*PRINTS, *OTHERS))
+    ],
 )
 def test_what_is_hidden_in_a_scene_is_named(hidden: Any, modality: str) -> None:
     """By its own name; of a print with an interval of 95 % that holds its value, with this seed."""

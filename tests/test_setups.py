@@ -175,6 +175,7 @@ def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_what_swings_is_found_with_its_frequency_and_its_phases(tmp_path):
     data = lab(tmp_path, "    flicker: {amplitude: 0.4, frequency: 120 Hz, phase: 1 rad}\n")
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
