@@ -21,7 +21,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,6 +36,17 @@ PER = ("", "pixel", "row", "column", "code")  # what a parameter may have a valu
 
 
 # --- parameters ---------------------------------------------------------------------------------------------------
+
+
+# How a search and a fit move a parameter:
+#   smooth     by gradients
+#   time       by gradients where it is a shape; as a strength in steps, for no signature is proportional to it
+#   edge       a time at which something begins or ends at once: also in steps of a few thousandths
+#   count      from one whole number to the next
+#   frequency  of a line: it is tried where the data have one
+#   phase      of a line: another one in each capture
+#   switch     yes or no
+KINDS = ("smooth", "time", "edge", "count", "frequency", "phase", "switch")
 
 
 @dataclass(frozen=True)
@@ -56,6 +67,7 @@ class Parameter:
     required: bool = False
     needs: str = ""  # the parameter without which this one does nothing
     later: bool = False  # datasets of earlier programs do not name it
+    kind: str = ""  # how a search and a fit move it (see `KINDS`); "" until its class is made
     name: str = ""
 
     @property
@@ -66,7 +78,7 @@ class Parameter:
     @property
     def phase(self) -> bool:
         """It says where in its swing something is: an angle without which the effect is no weaker."""
-        return self.unit == "rad" and self.off is None
+        return self.kind == "phase"
 
     def allowed(self) -> str:
         """`"between 0 and 1"`, for people."""
@@ -110,6 +122,7 @@ def parameter(
     required: bool = False,
     needs: str = "",
     later: bool = False,
+    kind: str = "",
 ) -> Any:
     """Declare a parameter in the body of a plug-in's class.
 
@@ -119,7 +132,8 @@ def parameter(
     converter; the effect declares a parameter `period`, their number) instead of "pixel". by_wavelength: it may be a
     table over the wavelength. choices: the words that are allowed, where it is no number. needs: another parameter,
     without which this one does nothing. later: datasets have been made with this effect before it had this parameter,
-    whose default does what was done then: a manifest names it only where it has another value.
+    whose default does what was done then: a manifest names it only where it has another value. kind: how a search and a
+    fit move it, one of `KINDS`; default: what `_kind_of` makes of the unit.
     """
     per = "pixel" if per_pixel else per
     if per not in PER:
@@ -128,12 +142,34 @@ def parameter(
         raise TypeError(f"{default!r} is none of the choices {', '.join(choices)}")
     if unit != "bool" and not units.is_known(unit):
         raise TypeError(f"{unit!r} is not an SI unit that is known here")
+    if kind not in ("", *KINDS):
+        raise TypeError(f"{kind!r} is none of the kinds {', '.join(KINDS)}")
     if later and required:
         raise TypeError(f"{about}: it came later, so that old configs lack it: it cannot be required")
     return Parameter(
         *(default, unit, about, symbol, bounds, open_bounds, off, search, per),
-        *(by_wavelength, choices, required, needs, later),
+        *(by_wavelength, choices, required, needs, later, kind),
     )
+
+
+def _kind_of(one: Parameter, others: Iterable[Parameter]) -> str:
+    """The kind of a parameter that declares none, by its unit; others: all parameters of the effect."""
+    if one.unit == "bool":
+        return "switch"
+    if _is_angle(one):
+        return "phase"
+    if one.unit == "Hz" and any(map(_is_angle, others)):
+        return "frequency"
+    if one.unit == "s":
+        return "time"
+    if one.search is not None and not one.unit and one.search[0] >= 1 and one.bounds[0] is not None:
+        return "count" if all(x == int(x) for x in (*one.search, one.default)) else "smooth"
+    return "smooth"
+
+
+def _is_angle(one: Parameter) -> bool:
+    """Whether it says where in its swing something is: without it the effect is no weaker."""
+    return one.kind == "phase" or (not one.kind and one.unit == "rad" and one.off is None)
 
 
 # --- values as a config gives them --------------------------------------------------------------------------------
@@ -444,7 +480,8 @@ class Plugin:
             if isinstance(value, Parameter):
                 declared[key] = Parameter(**{**value.__dict__, "name": key})
                 setattr(cls, key, value.default)
-        cls.parameters = declared
+        kinds = {key: p.kind or _kind_of(p, declared.values()) for key, p in declared.items()}
+        cls.parameters = {key: replace(p, kind=kinds[key]) for key, p in declared.items()}
         if not abstract:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
             cls.registry.add(cls)

@@ -31,6 +31,7 @@ class _Example:
     search: str
     hooks: str
     per_pixel: bool = False
+    kind: str = ""
 
 
 _EXAMPLES = {
@@ -136,6 +137,7 @@ _EXAMPLES = {
         return rate / (1 + rate * self.duration)
 ''',
         per_pixel=True,
+        kind="edge",
     ),
     "timing": _Example(
         "A detection is seen a random time too early or too late.",
@@ -187,7 +189,7 @@ class {cls}(Effect, stage="{stage}"):
         bounds={bounds},  # what is possible
         off=0.0,  # where the effect vanishes
         search={search},  # where it is looked for in a measurement
-{per_pixel}    )
+{kind}{per_pixel}    )
 {hooks}'''
 
 
@@ -208,6 +210,9 @@ def text(name: str, stage: str = STAGE) -> str:
         cls=cls,
         stage=stage,
         unit_says="its unit" if example.unit else 'its unit: "" is a number without one',
+        kind=f'        kind="{example.kind}",  # something begins or ends at this time at once\n'
+        if example.kind
+        else "",
         per_pixel=varies if example.per_pixel else "",
         **{field: getattr(example, field) for field in _TEXTS},
     )

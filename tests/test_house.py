@@ -318,3 +318,15 @@ def test_no_file_names_a_machine_or_a_registry() -> None:
 def test_types_reach_those_who_import_the_package() -> None:
     """Without this file type checkers take everything here for untyped."""
     assert (PACKAGE / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("file", sorted(f for f in MODULES if f.startswith("inference/")))
+def test_the_search_asks_for_no_unit_and_no_stage(file: str) -> None:
+    """What is special is declared: the kind of a parameter, what an effect acts on. One table of stages is left."""
+    if file == "inference/exact_likelihood.py":
+        return
+    for node in ast.walk(parsed(file)):
+        if isinstance(node, ast.Compare):
+            names = {side.attr for side in [node.left, *node.comparators] if isinstance(side, ast.Attribute)}
+            told = any(isinstance(x, ast.Constant) for side in node.comparators for x in ast.walk(side))
+            assert not (names & {"unit", "stage"} and told), f"{file}:{node.lineno}"

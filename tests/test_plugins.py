@@ -14,8 +14,13 @@ import pytest
 from spadmnist import plugins
 from spadmnist.effects import STAGES, Effect
 from spadmnist.errors import EffectError, InputError
+from spadmnist.events import Layout
+from spadmnist.inference.candidates import candidates, first_strengths
+from spadmnist.inference.coordinates import is_edge
+from spadmnist.inference.trial import frequencies_of
 from spadmnist.plugins import ByWavelength, Distribution, MapFile, Parameter
 from spadmnist.reconstruct import Method
+from spadmnist.sensor import Sensor
 
 HEAD = "from spadmnist import Effect, parameter\n\n\n"
 HALF = (
@@ -125,7 +130,7 @@ def test_a_class_in_a_file_is_an_effect(tmp_path: Path) -> None:
     cls: Any = Effect.registry.find("half_light")
     assert plugins.source_file(cls) == str(path) and cls.summary() == "Half of the light is lost on the way."
     assert cls.parameters["share"] == Parameter(
-        0.5, "", "share that passes", bounds=(0, 1), off=1.0, per="pixel", name="share"
+        0.5, "", "share that passes", bounds=(0, 1), off=1.0, per="pixel", kind="smooth", name="share"
     )
     assert cls().share == 0.5 and cls(share=0.25).apply(np.array([4.0]), None) == [1.0]
     with pytest.raises(TypeError, match=r"half_light has no parameter shar\. Did you mean share\?"):
@@ -432,3 +437,53 @@ def test_an_installed_package_that_is_not_there_is_told(installed: list[importli
     installed.append(entry("no_such_module_at_all"))
     with pytest.raises(EffectError, match="no_such_module_at_all"):
         list(Effect.registry)
+
+
+# --- kinds of parameters -------------------------------------------------------------------------------------------
+
+BEAT = (
+    HEAD
+    + '''class Beat(Effect, stage="arrival"):
+    """The light beats: a frequency and a phase in units of nobody else's, and a time that ends at once."""
+
+    depth = parameter(0.0, "", "depth", bounds=(0, 1), off=0.0, search=(0.01, 1))
+    kilohertz = parameter(1.0, "", "frequency in kHz", bounds=(0, None), search=(0.1, 10), kind="frequency")
+    turn = parameter(0.0, "", "phase in turns", search=(0, 1), kind="phase")
+    ticks = parameter(50.0, "", "until here nothing beats, in ticks", bounds=(1, None), search=(1.5, 1e3), kind="edge")
+
+    def factor(self, times, conditions):
+        return 1 + 0 * times
+
+    def maximum(self, conditions):
+        return 1 + self.depth
+'''
+)
+
+
+def test_a_parameter_is_moved_as_its_kind_says_whatever_its_unit(tmp_path: Path) -> None:
+    plugins.load_file(written(tmp_path, BEAT))
+    sensor = Sensor(Layout(2, 2, 1e-10, 1.0), [Effect.registry.find("detection")(pdp=0.5)], "device").resolved()
+    (added,) = [c for c in candidates(sensor) if c.name == "add beat"]
+    assert added.phases == (("beat", "turn"),)
+    assert [d.key for d in frequencies_of(added)] == [("beat", "kilohertz")]
+    assert [d.key for d in added.shapes] == [("beat", "kilohertz"), ("beat", "ticks")]
+    beside = Sensor(sensor.layout, [*sensor.effects, Effect.registry.find("beat")(depth=0.1)], "device").resolved()
+    moved = {c.parameter: c for c in candidates(beside) if c.effect == "beat" and c.kind == "set"}
+    assert set(moved) == {"depth", "ticks"}  # another frequency is another candidate, another phase none
+    (ticks,) = moved["ticks"].strengths
+    assert is_edge(ticks) and np.allclose(
+        np.array(first_strengths(ticks)) / 50 - 1, [0.1, 0.01, 0.003, -0.003, -0.01, -0.1]
+    )
+    (depth,) = moved["depth"].strengths
+    assert not is_edge(depth) and len(first_strengths(depth)) == 1
+
+
+def test_kinds_are_told_by_units_where_nothing_is_declared() -> None:
+    kinds = {f"{e}.{name}": p.kind for e in Effect.registry for name, p in Effect.registry.find(e).parameters.items()}
+    assert all(kind in plugins.KINDS for kind in kinds.values())
+    told = {"flicker.frequency": "frequency", "flicker.phase": "phase", "dark_counts.rate": "smooth"}
+    told |= {"dead_time.duration": "edge", "jitter.sigma": "time", "dead_time.paralyzable": "switch"}
+    told |= {"readout_loss.queue": "count", "blinking_dark_counts.rate_on": "smooth", "print_tilt.angle": "smooth"}
+    assert {key: kinds[key] for key in told} == told
+    with pytest.raises(TypeError, match="'line' is none of the kinds smooth, time, edge"):
+        plugins.parameter(1.0, "Hz", "", kind="line")

@@ -555,7 +555,7 @@ def test_a_signed_bench_is_not_simulated_twice_where_there_is_no_sign(lab) -> No
 @pytest.mark.parametrize(("truth", "first"), [(4, 8), (64, 8), (1, 32), (5, 2)])
 def test_a_whole_number_is_fitted_by_its_neighbours(truth: int, first: int) -> None:
     """The other number follows it along a narrow valley; from afar the valley's floor is not reached at once."""
-    coordinate = Coordinate("bus", "queue", "", 1.0, 256.0, None, whole=True)
+    coordinate = Coordinate("bus", "queue", "", 1.0, 256.0, None, "count")
 
     def fit(values: dict[Any, Any]) -> Fit:
         queue = float(values[coordinate.key])
@@ -577,8 +577,8 @@ def test_a_whole_number_that_was_fitted_from_afar_is_fitted_again(dependent: flo
     Then 4 is known to be it, and the time with it; or where cells depend on each other 3 and 5 are not excluded, and
     what the time is with these is not either.
     """
-    places = Coordinate("bus", "queue", "", 1.0, 256.0, None, whole=True)
-    time = Coordinate("bus", "time", "s", 1e-9, 1e-6, None)
+    places = Coordinate("bus", "queue", "", 1.0, 256.0, None, "count")
+    time = Coordinate("bus", "time", "s", 1e-9, 1e-6, None, "time")
 
     def best(queue: float) -> float:
         return 2.0 * math.log(queue)

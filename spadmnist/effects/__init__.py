@@ -170,6 +170,12 @@ class Effect(Plugin, abstract=True):
     shown: ClassVar[dict[str, Any]] = {}
     mimic: ClassVar[Mimic | None] = None
 
+    # what a search knows of it; by its stage, where it does not say so itself
+    on_light: ClassVar[bool] = False  # it acts on the light alone: a common factor is another light level
+    is_pattern: ClassVar[bool] = False  # it is a shape over the array, or of the scene
+    adds_rate: ClassVar[bool] = False  # it adds events of each pixel, whatever the light
+    moves_dark: ClassVar[bool] = False  # it makes what comes without light fluctuate
+
     has_mean: ClassVar[bool] = False  # `expected_rate` has the mean of `factor` or `open` to take
     states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
 
@@ -186,6 +192,15 @@ class Effect(Plugin, abstract=True):
         if not any(set(group.split("+")) <= have for group in STAGES[chosen]):
             ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
             raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
+        by_stage = {
+            "on_light": chosen in ("light", "detection"),
+            "is_pattern": chosen == "light",
+            "adds_rate": chosen == "dark",
+            "moves_dark": chosen == "arrival" and cls.acts_on != "light",
+        }
+        for name, value in by_stage.items():
+            if name not in vars(cls):
+                setattr(cls, name, value)
         cls.has_mean = "open" in have or ("factor" in have and "modulate" not in have)
         changes = {"modulate", "spawn", "blind_time", "sensitivity"} & have or (chosen == "readout" and "apply" in have)
         if "states_mean" not in vars(cls):

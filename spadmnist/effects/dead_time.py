@@ -32,6 +32,7 @@ class DeadTime(Effect, stage="dead_time"):
         off=0.0,
         search=(1e-9, 1e-6),
         per_pixel=True,
+        kind="edge",
     )
     paralyzable = parameter(False, "bool", "a lost event starts the dead time anew", off=False)
 

@@ -33,6 +33,7 @@ class SlowRecovery(Effect, stage="dead_time"):
         bounds=(0, None),
         off=0.0,
         search=(0.1e-9, 200e-9),
+        kind="edge",
     )
 
     def sensitivity(self, u: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from ..errors import UNABLE, SpadError, why
 from ..plugins import ByWavelength, Parameter
 from ..recording import Capture
 from ..sensor import Sensor
-from .coordinates import Coordinate, Key, Values, coordinate_of
+from .coordinates import Coordinate, Key, Values, coordinate_of, is_edge
 
 _SHAPES = 4  # the largest number of values of a shape within its search range
 _MOST = 6  # the largest number of templates per strength of one candidate
@@ -105,7 +105,7 @@ def has_random_pixels(sensor: Sensor) -> bool:
 
 
 def _numeric(declared: Parameter) -> bool:
-    return declared.unit != "bool" and not declared.choices and declared.search is not None
+    return declared.kind != "switch" and not declared.choices and declared.search is not None
 
 
 def candidates(sensor: Sensor, captures: Iterable[Capture] = (), fitted: Collection[Key] = ()) -> list[Candidate]:
@@ -168,13 +168,13 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Candi
 def _settings(effect: Effect) -> Iterator[Candidate]:
     for name, declared in effect.parameters.items():
         value = getattr(effect, name)
-        if declared.unit == "bool" and declared.off is not None:
+        if declared.kind == "switch" and declared.off is not None:
             yield Candidate("set", effect.name, name, (), fixed=(((effect.name, name), not value),))
         if not _numeric(declared) or declared.per not in ("", "pixel") or not isinstance(value, (int, float)):
             continue
-        if declared.phase or (effect.stage in ("light", "detection") and not effect.of_scene):
+        if declared.kind == "phase" or (effect.on_light and not effect.of_scene):
             continue  # a common factor on the light belongs to the light level, not to the sensor
-        if declared.unit == "Hz" and any(p.phase for p in effect.parameters.values()):
+        if declared.kind == "frequency":
             continue  # a periodic effect at another frequency is another candidate
         low, high = declared.search  # type: ignore[misc]
         low, high = min(low, value) if value > 0 else low, max(high, value)
@@ -194,7 +194,7 @@ def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[C
         key = effect.name, carrier
         if isinstance(at, (ByWavelength, bool)) or key in fitted:
             continue
-        blinds = declared.unit == "s" and _blinds(sensor, key, value)
+        blinds = declared.kind in ("time", "edge") and _blinds(sensor, key, value)
         yield Candidate("per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds)
 
 
@@ -261,13 +261,12 @@ def first_strengths(coordinate: Coordinate) -> list[float]:
             near = (coordinate.value(coordinate.coordinate(x)) for x in (0.5 * off, max(1.5 * off, off + 1)))
             return [x for x in near if x != off]
         # a short move of an edge is not found by a longer one
-        edge = coordinate.unit == "s" and getattr(Effect.registry.find(coordinate.effect), "stage", "") == "dead_time"
-        moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if edge else (0.1,)
+        moves = (0.1, 0.01, 0.003, -0.003, -0.01, -0.1) if coordinate.kind == "edge" else (0.1,)
         return [min(max(off * (1 + x), coordinate.low), coordinate.high) for x in moves]
     typical = math.sqrt(coordinate.low * coordinate.high) if coordinate.low > 0 else coordinate.low + 0.2 * whole
     # a time is an edge, too: a short one has another signature than a part of a long one
     return (
         [typical, math.sqrt(coordinate.low * typical)]
-        if coordinate.unit == "s" and coordinate.low > 0 and coordinate.off == 0
+        if is_edge(coordinate) and coordinate.low > 0 and coordinate.off == 0
         else [typical]
     )

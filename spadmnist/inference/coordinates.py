@@ -25,7 +25,7 @@ class Coordinate:
         low, high: the search range, in the parameter's unit.
         off: the value at which the effect vanishes; None for a shape. Where it is the upper end of the range, the
             coordinate is the log of the distance to that end.
-        whole: the parameter has whole values only.
+        kind: how it moves, one of `plugins.KINDS`.
         bounds: the least and the largest value that exist; None where there is no such bound.
     """
 
@@ -35,12 +35,17 @@ class Coordinate:
     low: float
     high: float
     off: float | None
-    whole: bool = False
+    kind: str = "smooth"
     bounds: tuple[float | None, float | None] = (None, None)
 
     @property
     def key(self) -> Key:
         return self.effect, self.parameter
+
+    @property
+    def whole(self) -> bool:
+        """Whether the parameter has whole values only."""
+        return self.kind == "count"
 
     @property
     def log(self) -> bool:
@@ -104,9 +109,7 @@ def coordinate_of(effect: str, declared: Parameter, off: float | None) -> Coordi
     """
     assert declared.search is not None
     low, high = map(float, declared.search)
-    ends = (low, high, float(declared.default))
-    whole = not declared.unit and low >= 1 and declared.bounds[0] is not None and all(x == int(x) for x in ends)
-    return Coordinate(effect, declared.name, declared.unit, low, high, off, whole, declared.bounds)
+    return Coordinate(effect, declared.name, declared.unit, low, high, off, declared.kind, declared.bounds)
 
 
 def point_of(coordinates: Sequence[Coordinate], values: Mapping[Key, Any]) -> np.ndarray:
@@ -123,4 +126,4 @@ def room_of(coordinate: Coordinate, value: float) -> float:
 
 def is_edge(coordinate: Coordinate) -> bool:
     """Whether a strength is an edge, a time or a distance to its upper end: no signature is proportional to it."""
-    return coordinate.lacks or (coordinate.unit == "s" and coordinate.off is not None)
+    return coordinate.lacks or (coordinate.kind in ("time", "edge") and coordinate.off is not None)

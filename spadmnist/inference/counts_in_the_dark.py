@@ -37,14 +37,12 @@ def may_fit(sensor: Sensor, wanted: Sequence[Candidate]) -> bool:
     candidate = wanted[0]
     if len(wanted) > 1 or not candidate.carrier or candidate.per != "pixel" or not pixel_maps.by_counts(candidate):
         return False
-    return Effect.registry.find(candidate.effect).stage == "dark" and not any(
-        map(_couples, (sensor.chip or sensor).effects)
-    )
+    return Effect.registry.find(candidate.effect).adds_rate and not any(map(_couples, (sensor.chip or sensor).effects))
 
 
 def _couples(effect: Effect) -> bool:
     """Whether counts in the dark depend on more than a pixel's own rate: an effect reaches others, or fluctuates."""
-    return effect.influence() > 0 or (effect.stage == "arrival" and effect.acts_on != "light")
+    return effect.influence() > 0 or effect.moves_dark
 
 
 def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: Candidate) -> Diagnosis | str:

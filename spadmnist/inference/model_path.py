@@ -314,7 +314,7 @@ def _of_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_maps.PixelM
     replicates, one = path.replicates, path.evaluation.sensors.one
     lights = [c for c in path.scan.accepted if c.carrier in maps and pixel_maps.acts_on_light(one, c)]
     lit = [id for id, seen in replicates.seen.items() if seen.counts is not None and not seen.capture.light.dark]
-    pattern = getattr(Effect.registry.find(step.candidate.effect), "stage", "") == "light"
+    pattern = Effect.registry.find(step.candidate.effect).is_pattern
     if not (pattern and step.coordinates and lights and lit):
         return np.zeros(len(step.coordinates))
     id = max(lit, key=lambda i: replicates.seen[i].total)

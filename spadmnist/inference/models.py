@@ -85,7 +85,7 @@ class Model:
 
 def swinging(sensor: Sensor) -> list[Key]:
     """The parameters of a sensor that are phases."""
-    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.phase]
+    return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.kind == "phase"]
 
 
 class InTheDark(Sensor):

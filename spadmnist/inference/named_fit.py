@@ -260,7 +260,7 @@ def _why_not(kind: str, effect: str, parameter: str | None, listed: bool) -> str
     declared = Effect.registry.find(effect).parameters.get(parameter or "") if listed else None
     if declared is None:
         return ""
-    if kind == "set" and Effect.registry.find(effect).stage in ("light", "detection"):
+    if kind == "set" and Effect.registry.find(effect).on_light:
         return (
             ": a common factor is the same as another light level, which every fit and compare give (light, of what is "
             "stated)"

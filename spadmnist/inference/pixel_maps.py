@@ -271,8 +271,7 @@ def by_counts(candidate: Candidate) -> bool:
 
 def acts_on_light(sensor: Sensor, candidate: Candidate) -> bool:
     """Whether a parameter acts on the light alone; its mean is then confused with the light level."""
-    kind = Effect.registry.find(candidate.effect)
-    return getattr(kind, "stage", "") in ("light", "detection")
+    return Effect.registry.find(candidate.effect).on_light
 
 
 def map_values(map_: PixelMap) -> dict[str, Value]:

@@ -141,7 +141,7 @@ class Scan:
         captures = [seen.capture for seen in self.replicates.seen.values()]
         frames = [c.conditions.frame_time if c.modality == "qis" else 0.0 for c in captures]
         least = _INSTANT * min(frames, default=0.0)
-        times = [d.key for d in candidate.shapes if d.unit == "s"]
+        times = [d.key for d in candidate.shapes if d.kind in ("time", "edge")]
         kept = {tuple(max(t[k], least) if k in times else x for k, x in t.items()): dict(t) for t in tries}
         return list(kept.values())
 

@@ -160,7 +160,7 @@ def at_end(one: Trial) -> bool:
 
 def frequencies_of(candidate: Candidate) -> list[Coordinate]:
     """The frequencies of a periodic candidate; one over the exposure is their resolution."""
-    return [d for d in candidate.shapes if d.unit == "Hz"] if candidate.phases else []
+    return [d for d in candidate.shapes if d.kind == "frequency"]
 
 
 def of_scene(one: Trial) -> bool:
@@ -173,7 +173,7 @@ def is_pattern(one: Trial) -> bool:
     candidate = one.candidate
     if candidate.kind != "add":
         return of_scene(one)  # no other parameter of the light is set
-    return candidate.per in ("row", "column") or getattr(Effect.registry.find(candidate.effect), "stage", "") == "light"
+    return candidate.per in ("row", "column") or Effect.registry.find(candidate.effect).is_pattern
 
 
 def tie(gain: float) -> float:
