@@ -135,14 +135,14 @@ def traced(function: Callable[[Any], Any], task: Any) -> tuple[Any, Report]:
 def instrument() -> float:
     """Wrap the stages of a task, once in a process; s of its processor so far."""
     before = time.process_time()
-    from spadmnist import dataset, disk, factory
+    from spadmnist import disk, factory, shard_columns
     from spadmnist.experiment import Experiment
     from spadmnist.store import Encoding
 
     wrap(Experiment, "simulate_block", "simulate")
-    wrap(dataset, "reconstruction_columns", "simulate")
-    wrap(dataset, "statistics", "simulate")
-    wrap(dataset, "stream_columns", "encode")
+    wrap(shard_columns, "reconstruction_columns", "simulate")
+    wrap(shard_columns, "statistics", "simulate")
+    wrap(shard_columns, "stream_columns", "encode")
     wrap(Encoding, "put", "write")
     wrap(factory, "median_of_nonzero", "medians")
     disk.hashlib = _Hashes  # type: ignore[assignment, attr-defined]

@@ -11,7 +11,7 @@ import pytest
 from commands import run
 from test_factory import SLOW, assert_same, assert_sentence, make, running, tree, wait_for, write_config
 
-from spadmnist import config, factory
+from spadmnist import config, factory, shard_plan
 from spadmnist.errors import InputError, SpadError
 from spadmnist.factory import Part
 
@@ -32,7 +32,7 @@ def one(file: Path, root: Path, part: str) -> factory.Outcome:
 def test_parts_in_any_order_and_twice_make_the_same_bytes(whole: tuple[Path, Path], tmp_path: Path) -> None:
     """And there are more parts than shards; what no part has made is made at the end."""
     file, root = whole[0], tmp_path / "out"
-    total = len(factory.dataset.shards_of(config.read(file), config.read(file).load_images()))
+    total = len(shard_plan.shards_of(config.read(file), config.read(file).load_images()))
     order = random.Random(1).sample(range(1, 17), 16)
     left_out = min(total, 3)
     made = {k: one(file, root, f"{k}/16").made for k in order if k != left_out}

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from spadmnist import dataset, factory
+from spadmnist import factory, shard_plan
 
 sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 import scale
@@ -30,7 +30,7 @@ def test_what_is_looked_at_once_is_not_looked_at_for_each_shard(
 
         monkeypatch.setattr(of, name, call)
 
-    counted(dataset, "expected_per_image")
+    counted(shard_plan, "expected_per_image")
     counted(factory, "_noted")
     found = dict(scale.tasks(number, tmp_path / "out"))
     assert found["shards that were kept"] == number - scale.LEFT

@@ -55,7 +55,7 @@ def test_an_edge_is_probed_to_some_ten_picoseconds(monkeypatch) -> None:
     """A cusp: no slope leads to it, and a probe that is three times as far as it misses it."""
     truth = 50e-9
     coordinate = SimpleNamespace(
-        key=DURATION, log=True, lacks=False, unit="s", off=50e-9, coordinate=math.log, value=math.exp
+        key=DURATION, log=True, lacks=False, kind="edge", off=50e-9, coordinate=math.log, value=math.exp
     )
 
     def cost(values: dict[Any, float]) -> dict[Any, np.ndarray]:
