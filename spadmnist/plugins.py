@@ -75,11 +75,6 @@ class Parameter:
         """It may vary from pixel to pixel."""
         return self.per == "pixel"
 
-    @property
-    def phase(self) -> bool:
-        """It says where in its swing something is: an angle without which the effect is no weaker."""
-        return self.kind == "phase"
-
     def allowed(self) -> str:
         """`"between 0 and 1"`, for people."""
         if self.choices:

@@ -89,11 +89,15 @@ def _recording(sensor: Sensor, made: Recorded, image: int, capture: Capture) -> 
     return recording.of_image(made, image, capture, sensor.layout, sensor.nominal_dead_time)
 
 
-def draws_bits(sensor: Sensor, capture: Capture) -> bool:
-    """Whether `model_recordings` draws the bits of a capture's frames without their events, where it may."""
+def draws_bits(sensor: Sensor, capture: Capture, frames: int = 1) -> bool:
+    """Whether the bits of a capture's frames may be drawn without their events; frames: of a stretch of them."""
+    return capture.modality == "qis" and not sensor.at("gate") and _stand_alone(sensor, capture, frames)
+
+
+def _stand_alone(sensor: Sensor, capture: Capture, frames: int) -> bool:
+    """Whether stretches of so many frames may be simulated by themselves."""
     c = capture.conditions
-    part = replace(c, frames=1, exposure=c.frame_period)
-    return capture.modality == "qis" and not sensor.at("gate") and standing.tying(sensor, c, part) is None
+    return standing.tying(sensor, c, replace(c, frames=frames, exposure=frames * c.frame_period)) is None
 
 
 _Told = Callable[[float], None]  # which share is made
@@ -104,13 +108,10 @@ def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
     """How to simulate a large capture part by part; None where its frames depend on each other."""
     c = capture.conditions
     each = c.largest_count if capture.modality == "counts" and c.counting == "frames" else 1
-    frames = max(1, int(c.frames // each * _AT_ONCE / events / 2)) * each
-    part = replace(c, frames=frames, exposure=frames * c.frame_period)
-    if capture.modality == "tr" or standing.tying(sensor, c, part):
-        return None
-    if capture.modality == "qis" and not sensor.at("gate"):
+    frames = max(1, int(c.frames // each * _AT_ONCE / max(events, 1.0) / 2)) * each
+    if draws_bits(sensor, capture, frames):
         return lambda flux, streams, told: _by_bits(sensor, capture, flux, streams, told)
-    if events > _MOST:
+    if capture.modality == "tr" or events > _MOST or not _stand_alone(sensor, capture, frames):
         return None
     return lambda flux, streams, told: _by_stretches(sensor, capture, flux, streams, frames, told)
 

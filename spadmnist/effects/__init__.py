@@ -174,7 +174,6 @@ class Effect(Plugin, abstract=True):
     on_light: ClassVar[bool] = False  # it acts on the light alone: a common factor is another light level
     is_pattern: ClassVar[bool] = False  # it is a shape over the array, or of the scene
     adds_rate: ClassVar[bool] = False  # it adds events of each pixel, whatever the light
-    moves_dark: ClassVar[bool] = False  # it makes what comes without light fluctuate
 
     has_mean: ClassVar[bool] = False  # `expected_rate` has the mean of `factor` or `open` to take
     states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
@@ -192,15 +191,11 @@ class Effect(Plugin, abstract=True):
         if not any(set(group.split("+")) <= have for group in STAGES[chosen]):
             ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
             raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
-        by_stage = {
-            "on_light": chosen in ("light", "detection"),
-            "is_pattern": chosen == "light",
-            "adds_rate": chosen == "dark",
-            "moves_dark": chosen == "arrival" and cls.acts_on != "light",
-        }
-        for name, value in by_stage.items():
-            if name not in vars(cls):
-                setattr(cls, name, value)
+        if "stage" in vars(cls):  # a subclass without a stage of its own keeps what was declared
+            by_stage = {"on_light": ("light", "detection"), "is_pattern": ("light",), "adds_rate": ("dark",)}
+            for name, stages in by_stage.items():
+                if name not in vars(cls):
+                    setattr(cls, name, chosen in stages)
         cls.has_mean = "open" in have or ("factor" in have and "modulate" not in have)
         changes = {"modulate", "spawn", "blind_time", "sensitivity"} & have or (chosen == "readout" and "apply" in have)
         if "states_mean" not in vars(cls):
@@ -224,6 +219,11 @@ class Effect(Plugin, abstract=True):
         mean = float(np.mean(getattr(self, hook)(times, conditions)))
         # what is no mean is refused where the effect acts; a mean of 1 keeps every digit
         return rate if not 0 <= mean < math.inf or abs(mean - 1) < _NO_CHANGE else rate * mean
+
+    @property
+    def moves_dark(self) -> bool:
+        """Whether events without light (dark counts, or its own) fluctuate with it."""
+        return self.stage == "arrival" and self.acts_on != "light"
 
     def influence(self) -> float:
         """Pitches up to which what happens in one pixel may change what others record; inf: the whole array.

@@ -319,11 +319,14 @@ class ShardReader(ABC):
 
     def _rows(self, handles: dict[str, File], name: str, start: int, stop: int) -> np.ndarray:
         array = self._array(name)
-        if not 0 <= start <= stop <= array.shape[0]:
-            raise IndexError(f"{name}: rows {start} to {stop} were asked for; it has rows 0 to {array.shape[0]}")
+        self._check_rows(array, name, start, stop)
         out = self._room(array, name, start, stop)
         self._fill(handles, name, start, stop, out)
         return out
+
+    def _check_rows(self, array: Array, name: str, start: int, stop: int) -> None:
+        if not 0 <= start <= stop <= array.shape[0]:
+            raise IndexError(f"{name}: rows {start} to {stop} were asked for; it has rows 0 to {array.shape[0]}")
 
     def _room(self, array: Array, name: str, start: int, stop: int) -> np.ndarray:
         """An array for so many rows."""
@@ -482,6 +485,7 @@ def read_joined(pieces: Sequence[tuple[ShardReader, int, int]], name: str) -> np
     def fill(piece: tuple[ShardReader, int, int], end: int) -> None:
         reader, start, stop = piece
         array, handles = reader._array(name), dict[str, File]()
+        reader._check_rows(array, name, start, stop)
         if (array.dtype, array.shape[1:]) != (like.dtype, like.shape[1:]):
             raise reader._refuse(array.file, f"{name}: its type or shape is not that of the shard before")
         try:
