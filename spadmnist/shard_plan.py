@@ -38,7 +38,7 @@ class Shard:
 
     @property
     def attributes(self) -> dict[str, str | int]:
-        """What a shard says of itself on disk, by which it is told from any other of the dataset."""
+        """The attributes of the shard on disk; no other shard of the dataset has the same."""
         level = {} if self.level is None else {"level": self.level}
         return {"split": self.split, "start": self.start, "stop": self.stop, **level}
 

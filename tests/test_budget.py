@@ -25,6 +25,7 @@ from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.results import Diagnosis, canonical, sentence, table
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
+from spadmnist.streams import Streams
 from spadmnist.workers import Serial
 
 AFTERPULSING = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
@@ -98,6 +99,15 @@ def test_bits_without_their_events_are_little_work():
         drawn, simulated = (work_of(qis, share * bits, 32 * 32, by_bits) for by_bits in (True, False))
         assert drawn < simulated / 2
     assert math.isclose(work_of(qis, 0.1 * bits, 1024, True), work_of(qis, 0.9 * bits, 1024, True))
+
+
+def test_frames_in_the_dark_of_a_sensor_without_dark_counts_are_empty():
+    """No event is expected of them, and they are drawn all the same."""
+    conditions = Conditions(1e-2, 1000, 1e-5, 1e-5, None)
+    sensor = Sensor(Layout(4, 4, 1e-10, 1.0), [Effect.registry.find("detection")(pdp=0.5)], "device")
+    draws = Streams(0, "dark", "model", np.arange(1, dtype=np.uint64))
+    (made,) = twin.model_recordings(sensor, Capture("dark", "qis", Light(), conditions), 0.0, draws, draws.images, True)
+    assert made.totals.sum() == 0
 
 
 def test_the_clock_ends_what_takes_three_times_as_long():

@@ -136,7 +136,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, format: Encoding) -> None:
 def test_rows_of_several_shards_are_joined(
     tmp_path: Path, format: Encoding, threads: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By one thread or by several; damage is told out of a thread, and another type is not made this one."""
+    """By one thread or by several. A damaged chunk and another type are errors in both."""
     monkeypatch.setattr(shards, "_MANY", 0 if threads else 1 << 60)
     made = {f"a/b/{i}": some_columns(7 + i, i) | more_columns(7 + i, 2 + i) for i in range(5)}
     for path, columns in made.items():
