@@ -472,8 +472,8 @@ class ShardReader(ABC):
 def read_joined(pieces: Sequence[tuple[ShardReader, int, int]], name: str) -> np.ndarray:
     """Rows of an array of several shards, each as (reader, start, stop), one after the other.
 
-    Many rows of a local dataset are decoded by several threads: the codecs release Python's lock. Raises InputError where
-    a chunk is damaged, or the type or shape of a row differs between the shards.
+    Many rows of a local dataset are decoded by several threads: the codecs release Python's lock. Raises InputError
+    where a chunk is damaged, or the type or shape of a row differs between the shards.
     """
     reader, start, stop = pieces[0]
     if len(pieces) == 1:
