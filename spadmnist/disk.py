@@ -14,8 +14,8 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,6 +23,9 @@ from . import system
 from .errors import InputError, SpadError
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
+# bytes of a file after which the disk is given what there is. A file of 36 MiB was waited for at its end for 60 ms without,
+# 8 ms with 8 MiB, and 0.3 ms with 4 and 2 MiB
+_SYNC_EVERY = 4 << 20
 _SYNCS_AT_ONCE = 4  # threads that synchronise the files of a shard; 8 and 32 were no faster
 
 Files = dict[str, dict[str, Any]]  # path relative to the root -> {"bytes": ..., "sha256": ...}
@@ -283,38 +286,50 @@ def inside(root: Path, relative: str) -> Path:
     return root / relative
 
 
-def _put(path: Path, pieces: Iterable[bytes]) -> dict[str, Any]:
-    """Write a new file (not yet synchronised); its size and SHA-256, taken from memory.
+def _put(path: Path, pieces: Iterable[bytes], begin_syncing: Callable[[Path], None] | None = None) -> dict[str, Any]:
+    """Write a new file (not yet synchronised as a whole); its size and SHA-256, taken from memory.
 
     The pieces come from a generator that compresses them, so that only one at a time is in memory: fresh
     memory for all of them would cost more time than the compression.
+
+    Args:
+        begin_syncing: is called with the path whenever so much has been written that it is worth it.
     """
-    digest, size = hashlib.sha256(), 0
+    digest, size, handed_over = hashlib.sha256(), 0, 0
     with open(os.open(path, system.WRITE | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
         for piece in pieces:
             digest.update(piece)
             size += len(piece)
             file.write(piece)
+            if begin_syncing and size - handed_over >= _SYNC_EVERY:
+                begin_syncing(path)
+                handed_over = size
     return {"bytes": size, "sha256": digest.hexdigest()}
 
 
 def put_tree(folder: Path, files: Mapping[str, Iterable[bytes]]) -> Files:
     """Write new files below a folder that is made here, and synchronise all that is in it.
 
-    Other threads synchronise a file while the next ones are made, so that the processor does not wait for the disk.
+    Other threads synchronise a file while the rest of it and the next ones are made, so that the processor does not
+    wait for the disk.
     """
     folders = {folder}
     os.mkdir(folder)
     records = {}
     with ThreadPoolExecutor(_SYNCS_AT_ONCE) as pool:
-        syncs = []
+        syncs: list[Future[None]] = []
+
+        def begin_syncing(path: Path) -> None:
+            if not syncs or syncs[-1].done():  # a disk that does not keep up is not asked again
+                syncs.append(pool.submit(system.synchronise, path))
+
         for name, pieces in sorted(files.items()):
             path = folder / name
             missing = [parent for parent in path.parents if folder in parent.parents and parent not in folders]
             for parent in reversed(missing):
                 os.mkdir(parent)
                 folders.add(parent)
-            records[name] = _put(path, pieces)
+            records[name] = _put(path, pieces, begin_syncing)
             syncs.append(pool.submit(system.synchronise, path))
         syncs += [pool.submit(system.synchronise, parent) for parent in folders - {folder}]
         for sync in syncs:
