@@ -23,7 +23,7 @@ from . import system
 from .errors import InputError, SpadError
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
-# bytes of a file after which the disk is given what there is. A file of 36 MiB was waited for at its end for 60 ms without,
+# bytes of a file after which the disk is given what there is. The end of 36 MiB was waited for for 60 ms without it,
 # 8 ms with 8 MiB, and 0.3 ms with 4 and 2 MiB
 _SYNC_EVERY = 4 << 20
 _SYNCS_AT_ONCE = 4  # threads that synchronise the files of a shard; 8 and 32 were no faster
