@@ -1,4 +1,4 @@
-"""A file is given to the disk while it is still being made; what fails then is not lost."""
+"""A large file is synchronised while it is still being made; an error of that ends the write."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_an_early_synchronisation_that_fails_ends_the_write(tmp_path: Path, monk
 
     def broken_once(path: Path) -> None:
         calls.append(path)
-        if len(calls) == 1:  # the system tells of a lost page once
+        if len(calls) == 1:  # the system reports an error of a file once
             raise OSError(errno.EIO, "Input/output error")
         real(path)
 
