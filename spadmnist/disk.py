@@ -23,8 +23,8 @@ from . import system
 from .errors import InputError, SpadError
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
-# bytes of a file after which it is synchronised while the rest is made. Chosen by a file of 36 MiB that grew for 0.25 s:
-# the synchronisation at its end took 60 ms without any before, 8 ms with one each 8 MiB, 0.3 ms with one each 4 or 2 MiB
+# bytes of a file after which it is synchronised while the rest is made. Chosen by a file of 36 MiB that grew
+# in 0.25 s: the last wait took 60 ms without any such synchronisation, 8 ms with one each 8 MiB, 0.3 ms with 4 or 2 MiB
 _SYNC_EVERY = 4 << 20
 _SYNCS_AT_ONCE = 4  # threads that synchronise the files of a shard; 8 and 32 were no faster
 
