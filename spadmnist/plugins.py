@@ -8,6 +8,7 @@ has been imported: by `discover` (the package's own places and the entry points 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import importlib.abc
@@ -707,10 +708,25 @@ def load_carried(files: Iterable[Carried]) -> None:
             load_file(path)
 
 
-def blame(effect: Plugin, error: BaseException) -> EffectError:
+def blame(cls: type[Plugin], error: BaseException) -> EffectError:
     """An error that a plug-in's own code raised, as a sentence with the plug-in, its file and the line."""
-    file = source_file(type(effect))
-    return EffectError(f"{_place(error, Path(file))}: the {effect.registry.kind} {effect.name} failed: {_what(error)}")
+    place = _place(error, Path(source_file(cls)))
+    return EffectError(f"{place}: the {cls.registry.kind} {cls.name} failed: {_what(error)}")
+
+
+@contextlib.contextmanager
+def blaming(cls: type[Plugin]) -> Iterator[None]:
+    """A context in which code of a user's plug-in runs.
+
+    Raises:
+        EffectError: where it fails; it names the plug-in, its file and the line.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_built_in(cls):
+            raise
+        raise blame(cls, error) from error
 
 
 def _what(error: BaseException) -> str:

@@ -947,7 +947,7 @@ class Sensor:
         except (SpadError, InputError):
             raise
         except Exception as error:
-            raise blame(effect, error) from error
+            raise blame(type(effect), error) from error
 
     def _apply(self, effect: Effect, events: Events, streams: Streams, suffix: str = "") -> Events:
         """A hook from Events to Events; what it returns is checked where it is not one of our own kernels."""

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from spadmnist import config
-from spadmnist.effects import Conditions
+from spadmnist import config, plugins
+from spadmnist.effects import Conditions, Effect
 from spadmnist.inference.candidates import Candidate, candidates, with_values
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.exact_likelihood import Likelihood, MaximumLikelihood, maximise, not_in_likelihood
@@ -132,6 +132,45 @@ def test_an_effect_that_is_missing_is_added(sensor: Sensor) -> None:
         low, high = exact.intervals[key]
         assert low < truth < high < 1.5 * low
     assert exact.gains[0] > 100
+
+
+DEEP_LEVEL = """import numpy as np
+
+from spadmnist import Effect, parameter
+from spadmnist.events import Children
+
+
+class DeepLevel(Effect, stage="correlated"):
+    "A carrier that is released later fires its pixel again."
+
+    share = parameter(0.0, "", "chance", bounds=(0, 1), off=0.0, search=(1e-4, 0.5))
+    age = parameter(60e-9, "s", "mean time", bounds=(0, None), search=(1e-9, 1e-6))
+
+    def spawn(self, events, rng):
+        parent = np.flatnonzero(rng.random(len(events)) < self.share)
+        return Children(parent, rng.exponential(self.age, len(parent)))
+
+    def hazard(self, pixels):
+        return np.full(pixels, -np.log1p(-self.share)), self.age
+"""
+
+
+def test_a_users_effect_that_says_its_hazard_has_a_likelihood(sensor: Sensor, tmp_path: Path) -> None:
+    (tmp_path / "deep_level.py").write_text(DEEP_LEVEL)
+    plugins.load_file(tmp_path / "deep_level.py")
+    rest = [e for e in sensor.effects if e.name not in CHANCE]
+    without = Sensor(sensor.layout, rest, sensor.rules, sensor.chip_seed, sensor.name)
+    share, age = ("deep_level", "share"), ("deep_level", "age")
+    data = stamps(with_values(without, {share: 0.05, age: 60e-9}), 5e-3, 1e6, 1)
+    exact = found(without, data, "add deep_level")
+    for key, truth in ((share, 0.05), (age, 60e-9)):
+        low, high = exact.intervals[key]
+        assert low < truth < high < 1.5 * low
+    # a subclass whose events come otherwise does not inherit the hazard
+    known = Effect.registry.find("deep_level")
+    other = type("ShallowLevel", (known,), {"spawn": lambda self, events, rng: None, "__doc__": "Another one."})
+    assert known(share=0.1).hazard(1) is not None and other(share=0.1).hazard(1) is None  # type: ignore[attr-defined]
+    assert not other(share=0.1).in_likelihood(True, data[0].capture.conditions, "device")  # type: ignore[attr-defined]
 
 
 def test_traps_that_outlive_the_next_detection(sensor: Sensor) -> None:

@@ -200,6 +200,8 @@ class Effect(Plugin, abstract=True):
         changes = {"modulate", "spawn", "blind_time", "sensitivity"} & have or (chosen == "readout" and "apply" in have)
         if "states_mean" not in vars(cls):
             cls.states_mean = cls.has_mean or not changes or cls.expected_rate is not Effect.expected_rate
+        if "spawn" in vars(cls) and "hazard" not in vars(cls):
+            cls.hazard = Effect.hazard  # type: ignore[method-assign]  # that of another spawn is not inherited
         super().__init_subclass__(**keywords)
         if not keywords.get("abstract") and not vars(cls).get("cause"):
             cls.cause = cls.name
@@ -224,6 +226,48 @@ class Effect(Plugin, abstract=True):
     def moves_dark(self) -> bool:
         """Whether events without light (dark counts, or its own) fluctuate with it."""
         return self.stage == "arrival" and self.acts_on != "light"
+
+    @classmethod
+    def light_pattern(cls, layout: Layout) -> np.ndarray:
+        """The shapes of a pattern over the array, (pixels, shapes): its effect is about a sum of them.
+
+        A search tests whether a map of the pixels has them. Default: slopes along x and y, and the squared distance
+        from the middle. A parameter for each row or column has a shape for each, which is not asked here.
+        """
+        place = layout.centred.T
+        return np.stack([*place, (place**2).sum(axis=0)], axis=1)
+
+    def hazard(self, pixels: int) -> tuple[np.ndarray, float] | None:
+        """What a detection leaves in its own pixel, for the likelihood of time stamps; None: nothing of this form.
+
+        Correlated stage: events come at the hazard h / lifetime exp(-t / lifetime), t s after the detection, and only
+        in the pixel that fired.
+
+        Returns:
+            (h (pixels,), the integral of the hazard; its lifetime in s).
+        """
+        return None
+
+    def in_likelihood(self, stamped: bool, conditions: Conditions, rules: str) -> bool:
+        """Whether the exact likelihood of a capture describes this effect at its values.
+
+        Default: by the stage and what is declared there. In the law of stamps each pixel has a rate, a blind time after
+        each detection, a `hazard` and a blur; in that of frames each has a mean number of candidates, and no memory.
+
+        Args:
+            stamped: the capture has time stamps (TR); otherwise single frames (QIS).
+            conditions: of the capture.
+            rules: of the sensor, "paper" or "device".
+        """
+        if self.stage == "gate":  # frames without a gap between them have a mean number, wherever the gate lies
+            return not stamped and conditions.frame_time == conditions.frame_period
+        if self.stage == "correlated":
+            return stamped and rules == "device" and self.hazard(1) is not None
+        if self.stage == "dead_time" and stamped:
+            return not (hasattr(self, "sensitivity") or getattr(self, "extends", False))
+        if self.stage == "dead_time":
+            return not (hasattr(self, "carried") and self.carried() > 0)
+        return self.stage != "arrival" and not (self.stage == "readout" and hasattr(self, "apply"))
 
     def influence(self) -> float:
         """Pitches up to which what happens in one pixel may change what others record; inf: the whole array.

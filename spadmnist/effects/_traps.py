@@ -33,6 +33,10 @@ class Traps(Effect, stage="correlated", abstract=True):
         parent, delay = kernels.children(events.offsets, self.hazards(events.pixels), rng.images, rng.key, rng.place)
         return Children(parent, self.lifetime * delay)
 
+    def hazard(self, pixels: int) -> tuple[np.ndarray, float]:
+        """(`hazards`, the lifetime)."""
+        return self.hazards(pixels), float(self.lifetime)
+
     def influence(self) -> float:
         """A trap fires its own pixel alone."""
         return 0.0

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from .. import plugins
+from ..statistics import Statistic
 from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, mean_misfit
@@ -18,8 +20,6 @@ from .replicates import TOTALS, Cell, Replicates
 from .results import Step, plain, title
 from .signature import Signature, residuals_at
 from .trial import Phases, Trial
-
-_CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def physical_errors(
     """The physical errors of a model, relative, by name; of what was not measured there is none.
 
     The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates.
-    linearity: the largest deviation of a lit one from the others. map: rms error of the pixels. intervals: share of
-    the intervals in wrong cells. neighbours: share of the detections whose neighbours fire too often or too seldom.
+    linearity: the largest deviation of a lit one from the others. The others are those of statistics
+    (`Statistic.physical_error`), in the mean over the captures.
 
     Args:
         residuals: (cells,) by block.
@@ -94,25 +94,16 @@ def physical_errors(
         errors["mean_rate"] = float(np.sqrt(np.mean((x * elasticities) ** 2)))
         if lit.sum() > 1:
             errors["linearity"] = float(np.max(np.abs((x[lit] - np.median(x[lit])) * elasticities[lit])))
-    shares: dict[str, list[float]] = {"map": [], "intervals": [], "neighbours": []}
+    shares: dict[str, list[float]] = {}
     for cell, z in residuals.items():
-        if cell == TOTALS:
+        if cell == TOTALS or not (statistic := Statistic.registry.find(cell[1])).error:
             continue
-        id, name = cell
-        seen, null = replicates.seen[id], evaluation.nulls[cell]
+        seen, null = replicates.seen[cell[0]], evaluation.nulls[cell]
         expected = null.expected(seen.total)[0] + (shift.shifts.get(cell, 0.0) if shift else 0.0)
-        values = seen.summaries[name].values
-        if name == "pixel_map":
-            beyond = max(0.0, float(np.mean(z**2)) - 1) / max(float(np.mean(values)), 1.0)
-            shares["map"].append(math.sqrt(beyond))
-        elif name == "intervals":
-            raw = np.abs(values - expected).sum() - 0.8 * np.sqrt(np.maximum(expected, 0)).sum()
-            shares["intervals"].append(max(0.0, float(raw)) / 2 / max(float(values.sum()), 1.0))
-        elif name == "neighbours":
-            k = int(np.argmax(np.abs(z)))
-            far = abs(float(values[k] - expected[k])) if abs(z[k]) > _CLEAR else 0.0
-            shares["neighbours"].append(far / max(seen.total, 1.0))
-    whole = errors | {k: float(np.mean(v)) for k, v in shares.items() if v}
+        with plugins.blaming(statistic):
+            error = float(statistic.physical_error(seen.summaries[cell[1]].values, expected, z, seen.total))
+        shares.setdefault(statistic.error, []).append(error)
+    whole = errors | {k: float(np.mean(v)) for k, v in shares.items()}
     return {k: plain(v) for k, v in whole.items()}
 
 
@@ -133,7 +124,7 @@ def placebo_of(
     if not alike:
         return None
     one = alike[len(alike) // 2]
-    times = one.times if one.gain > 0 else 0.0
+    times = one.times if one.fall > 0 else 0.0
     residuals = residuals_at(replicates, evaluation, one.signature, times)
     errors = physical_errors(replicates, evaluation, residuals, one.signature.at(times))
     values = one.scaled() if times else {}

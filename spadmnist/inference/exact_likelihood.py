@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from .. import twin
+from .. import plugins, twin
 from ..effects import Effect
-from ..effects._traps import Traps
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from .candidates import Candidate, templates, with_values
 from .coordinates import Coordinate, Key
 from .light_levels import closed_form, level_for
-from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of
+from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 
 FALL = 3.84  # of twice the log-likelihood, at the ends of a 95 % interval
@@ -61,21 +60,9 @@ def not_in_likelihood(sensor: Sensor, capture: Capture) -> str:
     if capture.mean is not None or capture.modality not in ("tr", "qis"):
         return f"{capture.modality} of {capture.id}" if capture.mean is None else f"the mean of {capture.id}"
     stamped = capture.modality == "tr"
-    conditions = capture.conditions
     for effect in sensor.effects:
-        known = {
-            "light": True,
-            "detection": True,
-            "dark": True,
-            "arrival": False,
-            "gate": not stamped and conditions.frame_time == conditions.frame_period,
-            "correlated": stamped and sensor.rules == "device" and getattr(type(effect), "spawn", None) is Traps.spawn,
-            "dead_time": not (hasattr(effect, "sensitivity") or getattr(effect, "extends", False))
-            if stamped
-            else not (hasattr(effect, "carried") and effect.carried() > 0),
-            "timing": True,
-            "readout": not hasattr(effect, "apply"),
-        }[effect.stage]
+        with plugins.blaming(type(effect)):
+            known = effect.in_likelihood(stamped, capture.conditions, sensor.rules)
         if not (known or _idle(effect)):
             return effect.name
     if not stamped:
@@ -84,8 +71,8 @@ def not_in_likelihood(sensor: Sensor, capture: Capture) -> str:
     if blur is None:
         return "the stamps"
     width = math.hypot(sensor.tick / math.sqrt(6), blur)
-    traps = [e for e in sensor.at("correlated") if isinstance(e, Traps)]
-    return next((e.name for e in traps if width > _SHARP * float(e.lifetime)), "")
+    lifetimes = {name: lifetime for name, (_, lifetime) in hazards_of(sensor, 1).items()}
+    return next((name for name, lifetime in lifetimes.items() if width > _SHARP * lifetime), "")
 
 
 def _idle(effect: Effect) -> bool:

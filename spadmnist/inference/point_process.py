@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import kernels
-from ..effects._traps import Traps
+from .. import kernels, plugins
 from ..events import Events
 from ..recording import Recording
 from ..sensor import Sensor
@@ -65,6 +64,17 @@ def blur_of(sensor: Sensor) -> float | None:
                 return None
             square += 2 * sigma**2
     return math.sqrt(square)
+
+
+def hazards_of(sensor: Sensor, pixels: int) -> dict[str, tuple[np.ndarray, float]]:
+    """What a detection leaves in its own pixel, by the effect's name; see `Effect.hazard`."""
+    found = {}
+    for effect in sensor.effects:
+        with plugins.blaming(type(effect)):
+            left = effect.hazard(pixels)
+        if left is not None:
+            found[effect.name] = left
+    return found
 
 
 @kernels.inline
@@ -310,8 +320,8 @@ class Stamps:
         """
         dead = np.ascontiguousarray(np.broadcast_to(sensor.dead_times, len(self.counts)), np.float64)
         end = self.capture.conditions.exposure
-        chances = [(e, -np.expm1(-e.hazards(len(dead)))) for e in sensor.at("correlated") if isinstance(e, Traps)]
-        filled = [(float(e.lifetime), p) for e, p in chances if p.any()]
+        chances = [(-np.expm1(-h), lifetime) for h, lifetime in hazards_of(sensor, len(dead)).values()]
+        filled = [(lifetime, p) for p, lifetime in chances if p.any()]
         chance = np.array([p for _, p in filled]).reshape(len(filled), len(dead))
         lifetime = np.array([x for x, _ in filled])
         given = [dead, chance, lifetime, np.array([blur])]

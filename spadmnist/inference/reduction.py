@@ -83,9 +83,5 @@ def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
     Raises:
         SpadError: where a user's own statistic fails; it names the file and line.
     """
-    try:
+    with plugins.blaming(type(statistic)):
         return statistic.reduce(recording)
-    except Exception as error:
-        if plugins.is_built_in(type(statistic)):
-            raise
-        raise plugins.blame(statistic, error) from error

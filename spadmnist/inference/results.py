@@ -257,7 +257,8 @@ def table(found: Diagnosis) -> str:
     if found.in_sample is not None:
         text = f"In sample, misfit {found.in_sample.misfit:.3f}; worst check: {headline(found.in_sample)}."
         lines += [*textwrap.wrap(text, 100), ""]
-    names = ("mean_rate", "map", "linearity", "intervals", "neighbours")
+    names = dict.fromkeys(("mean_rate", "map", "linearity", "intervals", "neighbours"))
+    names |= dict.fromkeys(name for row in found.ladder for name in row["errors"])  # of the user's own statistics
     rows: list[tuple[str, ...]] = [("model", "held-out misfit", *(n.replace("_", " ") + " %" for n in names))]
     for row in found.ladder:
         rows.append((row["model"], f"{row['misfit']:.3f}", *(error_of(row, n) for n in names)))

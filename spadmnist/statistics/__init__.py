@@ -79,6 +79,20 @@ class Statistic(Plugin, abstract=True):
     # the statistics of whose cells this one's are sums: a deviation there shows here, too (`inference.deviations`)
     pools: ClassVar[tuple[str, ...]] = ()
     named_from: ClassVar[int] = 0  # a deviation in a cell before this one is no more specific than 0
+    error: ClassVar[str] = ""  # the name of its `physical_error` in the error budget of a diagnosis; "": it has none
+
+    @classmethod
+    def physical_error(
+        cls, measured: np.ndarray, expected: np.ndarray, residuals: np.ndarray, detections: float
+    ) -> float:
+        """The relative error of a model in what this statistic measures, beyond the noise.
+
+        Args:
+            measured, expected: (cells,) in the unit of the statistic.
+            residuals: (cells,) standard deviations.
+            detections: of the capture.
+        """
+        raise NotImplementedError
 
     def reduce(self, recording: Recording) -> Summary | None:
         """The summary of a recording, or None where it has nothing to say of it. The number of cells depends on the

@@ -105,6 +105,17 @@ class Intervals(Statistic):
     among = "pixel"
     unit = "detections"
 
+    error = "intervals"
+
+    @classmethod
+    def physical_error(
+        cls, measured: np.ndarray, expected: np.ndarray, residuals: np.ndarray, detections: float
+    ) -> float:
+        """The share of the intervals that lie in wrong cells."""
+        # 0.8: the mean magnitude of a normal variable, in standard deviations
+        beyond = np.abs(measured - expected).sum() - 0.8 * np.sqrt(np.maximum(expected, 0)).sum()
+        return max(0.0, float(beyond)) / 2 / max(float(measured.sum()), 1.0)
+
     def reduce(self, recording: Recording) -> Summary | None:
         """Counts; the last cell is all that is longer."""
         tick = tick_of(recording)

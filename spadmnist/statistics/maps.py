@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -134,6 +135,16 @@ class PixelMap(Statistic):
     modalities = _ALL
     specific = 2
     unit = "1"
+
+    error = "map"
+
+    @classmethod
+    def physical_error(
+        cls, measured: np.ndarray, expected: np.ndarray, residuals: np.ndarray, detections: float
+    ) -> float:
+        """The rms error of the pixels' rates."""
+        beyond = max(0.0, float(np.mean(residuals**2)) - 1) / max(float(np.mean(measured)), 1.0)
+        return math.sqrt(beyond)
 
     def reduce(self, recording: Recording) -> Summary | None:
         if not has_data(recording):

@@ -16,6 +16,7 @@ from ._counting import Surplus, exposure_in, of_pairs, per_cent, span, tick_of
 from ._frames import at_ends, bits, count_ones, first_stamps, frame_sums, moments, ones_of, some_frames
 from ._walk import REACH, Near, around, lag_edges, latest, near, walk
 
+_CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model; of 100, one in 20 by chance
 _CROWDED = 24  # places for each stamp, up to which all places of a frame are gone through
 _SPOTS = 512  # places that are looked at together
 _BLOCK = 4096  # words that are looked at together: they stay in the cache
@@ -42,6 +43,17 @@ class Neighbours(Statistic):
     pools = ("far_pairs",)
     among = "neighbours"
     unit = "standard deviations"
+
+    error = "neighbours"
+
+    @classmethod
+    def physical_error(
+        cls, measured: np.ndarray, expected: np.ndarray, residuals: np.ndarray, detections: float
+    ) -> float:
+        """The share of the detections whose neighbours fire too often or too seldom, where that is clearest."""
+        k = int(np.argmax(np.abs(residuals)))
+        far = abs(float(measured[k] - expected[k])) if abs(residuals[k]) > _CLEAR else 0.0
+        return far / max(detections, 1.0)
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Scores of pairs beyond chance."""
