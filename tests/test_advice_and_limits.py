@@ -18,6 +18,7 @@ from spadmnist.inference.conclusion import Notes, verdict_of
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.elimination import drop_mimics, drop_needless, in_vain
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
+from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.experiment_design import _apart, between
 from spadmnist.inference.map_trials import unseen_maps
 from spadmnist.inference.model_path import begin
@@ -265,17 +266,19 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
     evaluation = evaluate(replicates, {})
     clean, foul = with_residuals(evaluation, {}).residuals, with_residuals(evaluation, {"intervals": 10.0}).residuals
     kinds = [change_of(replicates, f"add {name}") for name in ("afterpulsing", "slow_afterpulsing", "crosstalk")]
-    best, near, third = (Trial(c, {}, Signature({}, {}, {}), 100.0, 1.0, residuals=clean) for c in kinds)
+    best, near, third = (
+        Trial(c, {}, Signature({}, {}, {}), 100.0, 1.0, residuals=clean, evidence=100.0) for c in kinds
+    )
 
     def told(**other: Any) -> list[tuple[str, bool]]:
-        found = alternatives(quiet(replicates), evaluation, best, [], [best, replace(near, **other)])
+        found = alternatives(quiet(replicates), evaluation, best, [best, replace(near, **other)])
         return [(a["effect"], a["confused"]) for a in found]
 
-    assert told(gain=93.0) == [("slow_afterpulsing", True)]
-    assert told(gain=88.0) == [("slow_afterpulsing", False)]
+    assert told(evidence=93.0) == [("slow_afterpulsing", True)]
+    assert told(evidence=88.0) == [("slow_afterpulsing", False)]
     assert told(residuals=foul) == [("slow_afterpulsing", False)]
-    assert told(residuals=None) == [("slow_afterpulsing", False)]  # never fitted
-    many = alternatives(quiet(replicates), evaluation, best, [], [best, near, near, third])
+    assert told(evidence=-math.inf) == [("slow_afterpulsing", False)]  # never fitted
+    many = alternatives(quiet(replicates), evaluation, best, [best, near, near, third])
     assert [a["effect"] for a in many] == ["slow_afterpulsing", "crosstalk"]  # each once
     # where chance makes pixels odd, by that model's own scatter
     own = with_residuals(evaluation, {})
@@ -284,22 +287,18 @@ def test_alternatives_are_confused_where_they_leave_nothing_and_are_as_near(lab)
         ("slow_afterpulsing", False)
     ]
     # whose squares fall as much, though the law of its scatter gains little
-    odd = with_residuals(evaluation, {"intervals": 0.0}).residuals
-    fell = square(evaluation.residuals) - square(odd)
-    for most, alike in ((fell, True), (fell + 100.0, False)):
-        best.gain = most
-        assert told(residuals=odd, gain=-50.0, chips=True, evaluation=own) == [("slow_afterpulsing", alike)], fell
-    best.gain = 100.0
+    for fall, alike in ((100.0, True), (10.0, False)):
+        assert told(fall=fall, evidence=-50.0, chips=True, evaluation=own) == [("slow_afterpulsing", alike)]
     # at the end of where it is looked for no law is quite right: what nearly does as well may be
     for lifetime, alike in ((499e-9, False), (500e-9, True), (5e-9, True)):
         best.values = {("afterpulsing", "lifetime"): lifetime}
-        assert told(gain=82.0) == [("slow_afterpulsing", alike)]
-        assert told(gain=78.0) == told(gain=99.0, residuals=foul) == [("slow_afterpulsing", False)]
+        assert told(evidence=82.0) == [("slow_afterpulsing", alike)]
+        assert told(evidence=78.0) == told(evidence=99.0, residuals=foul) == [("slow_afterpulsing", False)]
     # another value and a map of it are two things
     two = [
         replace(near, candidate=change_of(replicates, f"{kind} dead_time.duration")) for kind in ("set", "per_pixel")
     ]
-    assert [a["change"] for a in alternatives(quiet(replicates), evaluation, best, [], [best, *two])] == [
+    assert [a["change"] for a in alternatives(quiet(replicates), evaluation, best, [best, *two])] == [
         "set",
         "per_pixel",
     ]
@@ -332,9 +331,10 @@ def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, t
     assert (len(seen) < len(path.evaluation.residuals)) == bool(unseen)
     path.evaluation = replace(path.evaluation, residuals=seen)
     one = given(path, name, values, fitted=True)
+    one.evidence = evidence_of(path.replicates, path.evaluation, one)
     found = unseen_maps(path.scan, path.evaluation, {}, one)
     assert [t.candidate.effect for t in found if t.candidate.name == "per_pixel dead_time.duration"] == alike
-    assert one.gain > 100 and all(t.gain > one.gain - tie(one.gain) and t.residuals for t in found)
+    assert one.evidence > 100 and all(t.evidence > one.evidence - tie(one.evidence) for t in found)
 
 
 def test_verdicts(lab):
@@ -372,7 +372,7 @@ def test_no_chance_is_none_at_all(lab):
     assert min(p) < 1e-100 and all(0 < x <= 1 for x in p)
     path = begin(bench_of((sensor, data)))
     one = given(path, "add afterpulsing", {PROBABILITY: 0.4, LIFETIME: 50e-9}, False)
-    significance, p = p_of_best(path.replicates, path.evaluation, [one], replace(one, gain=1e18))
+    significance, p = p_of_best(path.replicates, path.evaluation, [one], replace(one, evidence=1e18))
     assert 0 < p < 1e-100 and math.isfinite(significance)
 
 
@@ -380,7 +380,7 @@ def test_of_what_is_faint_the_trace_decides_and_not_the_squares(lab):
     """Chance moves the squares of all cells by more than a faint effect does."""
     path = begin(bench_of(lab()))
     one = given(path, "add afterpulsing", {PROBABILITY: 0.02, LIFETIME: 50e-9}, False)
-    much, none = (replace(one, gain=gain) for gain in (400.0, 0.0))
+    much, none = (replace(one, evidence=evidence) for evidence in (400.0, 0.0))
     assert p_of_best(path.replicates, path.evaluation, [one], much)[1] < 1e-8  # as where something is plainly wrong
     of_trace = p_of_best(path.replicates, path.evaluation, [one], none, False)
     assert p_of_best(path.replicates, path.evaluation, [one], much, False) == of_trace and of_trace[1] > 1e-6

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, bench_of, change_of, names, quiet, taken
+from tinylab import CROSSTALK, bench_of, change_of, names, taken
 
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
+from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.gauss_newton import gauss_newton_step
 from spadmnist.inference.laws import Law
 from spadmnist.inference.model_path import _bounded, _gauss_newton, begin
-from spadmnist.inference.ranking import compare_by_squares
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.signature import Signature, _mean_shift, signatures
 from spadmnist.inference.trial import Trial
@@ -85,8 +84,8 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
 
     def evaluation(width: float, other: float) -> Any:
         null = {
-            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law()),
-            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law()),
+            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), recordings=32),
+            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), recordings=32),
         }
         left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))
@@ -94,22 +93,16 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     trace = {TREND: np.zeros(6), MANY: np.zeros(1000), TOTALS: np.zeros(3)}
     now, there = evaluation(1.0, 1.2), evaluation(3.0, 1.0)
     exact = float(z @ z + totals @ totals) * (1 - 1 / 9) - 2 * 9 * math.log(3)
-    assert log_likelihood_ratio(now, there, trace, fluctuates=True) == pytest.approx(exact)
-    assert log_likelihood_ratio(now, there, trace) == 0.0
+    assert log_likelihood_ratio(now, there, trace) == pytest.approx(exact)
     # data that are no wider than the model's own do not speak for it
     quiet_now, quiet_there = evaluation(1.0, 1.0), evaluation(3.0, 1.0)
     for one, width in ((quiet_now, 1.0), (quiet_there, 3.0)):
         one.residuals = {TREND: np.ones(6) / width, MANY: np.ones(1000), TOTALS: np.ones(3) / width}
-    assert log_likelihood_ratio(quiet_now, quiet_there, trace, fluctuates=True) == pytest.approx(
-        9 * (8 / 9 - 2 * math.log(3))
-    )
+    assert log_likelihood_ratio(quiet_now, quiet_there, trace) == pytest.approx(9 * (8 / 9 - 2 * math.log(3)))
 
 
 def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> None:
-    """Its coherence time is the exposure: most that one recording has of it is another total, which no trace has.
-
-    Nor is it weighed against others by squares, for they fall whatever makes the totals wider.
-    """
+    """Its coherence time is the exposure: most that one recording has of it is another total, which no trace has."""
     noise = "    source_noise: {contrast: 0.2, coherence_time: 40 ms}\n"
     replicates = bench_of(lab(noise, light=1000, seed=3))
     evaluation = evaluate(replicates, {})
@@ -122,27 +115,16 @@ def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> N
     )
     squares = sum(float(z @ z) for z in evaluation.residuals.values())
     fall = squares - sum(float(z @ z) for z in (one.residuals or {}).values())
-    assert one.gain > fall + 8.0
+    assert evidence_of(replicates, evaluation, one) > fall + 8.0
     assert one.fluctuates
-    assert one.scatters
-    rivals = [Trial(change_of(replicates, "add crosstalk"), {}, signature, one.gain - 1.0, 1.0) for _ in range(2)]
-    for rival in rivals:
-        rival.signature, rival.residuals, rival.evaluation = (
-            replace(signature, fluctuates=False),
-            evaluation.residuals,
-            evaluation,
-        )
-    before = one.gain
-    compare_by_squares(quiet(replicates), evaluation, [one, *rivals])
-    assert [t.gain for t in (one, *rivals)] == [before, before - 1.0, before - 1.0]
 
 
-@pytest.mark.parametrize("contrast", [0.05, 0.0])
+@pytest.mark.parametrize("contrast", [0.2, 0.0])
 def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -> None:
     """Beside later steps: judged by how wide it makes them itself, nothing would ever be missed without it."""
     noise = f"    source_noise: {{contrast: {contrast}, coherence_time: 2 s}}\n" if contrast else ""
-    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=3)))
-    taken(path, "add source_noise", {CONTRAST: 0.05, COHERENCE: 2.0}, fitted=False)
+    path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n" + noise, light=1000, seed=2)))
+    taken(path, "add source_noise", {CONTRAST: 0.2, COHERENCE: 2.0}, fitted=False)
     taken(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=False)
     drop_needless(path)
     assert names(path) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]

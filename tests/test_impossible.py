@@ -155,7 +155,7 @@ FAILING: dict[str, tuple[Any, str, bool]] = {
     "alternative": (alternatives, "_alternative", True),
     "placebo": (model_selection, "placebo_of", True),
     "chance": (model_selection, "p_of_best", False),
-    "weighing": (model_selection, "compare_by_squares", False),
+    "evidence": (model_selection, "evidence_of", False),
     "advice": (experiment_design, "between", True),
 }
 

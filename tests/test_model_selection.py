@@ -14,17 +14,17 @@ from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import point_of
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
+from spadmnist.inference.evidence import _share_of_counts, best_of, evidence_of, judge_maps_by_odd_pixels
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
 from spadmnist.inference.findings import mimicked
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.model_path import ModelPath, _bounded, begin, sharpen
 from spadmnist.inference.model_selection import _added, _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
-from spadmnist.inference.ranking import _share_of_counts, gain_against, least_probable
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, mimic
-from spadmnist.inference.score_test import ScoreTest, explains_its_signature
-from spadmnist.inference.signature import Signature, gain_of, residuals_at, signatures
+from spadmnist.inference.score_test import ScoreTest, explains_its_signature, sigmas_of
+from spadmnist.inference.signature import Signature, fall_of, residuals_at, signatures
 from spadmnist.inference.spectral_lines import Line
 from spadmnist.inference.trial import Trial, weaker
 
@@ -118,10 +118,10 @@ def test_an_edge_of_which_the_data_want_more_is_tried_further_off(lab, monkeypat
     # what it is thought to gain at several times its strength is no bound for what it gains there
     found = [(90.0, 1.7), (200.0, 0.8)]
     further = look._further(evaluation, [one], [])
-    assert asked == pytest.approx([high / 4, high / 2]) and [t.gain for t in further] == [90.0, 200.0]
+    assert asked == pytest.approx([high / 4, high / 2]) and [t.fall for t in further] == [90.0, 200.0]
     asked.clear()
     assert not look._further(evaluation, [replace(one, times=0.7)], [])  # less of it would do
-    assert not look._further(evaluation, [replace(one, gain=20.0)], [])  # nor is it worth it
+    assert not look._further(evaluation, [replace(one, fall=20.0)], [])  # nor is it worth it
     assert not look._further(evaluation, [replace(one, values={jitter: high})], [])
     assert not asked
 
@@ -146,11 +146,12 @@ def test_beside_chance_a_map_pays_for_its_numbers(lab):
     replicates = bench_of(lab())
     candidate = change_of(replicates, "per_pixel dark_counts.rate")
     maps = {("dark_counts", "rate"): map_}
+    evaluation = evaluate(replicates, {})
     told = Trial(candidate, {}, Signature({}, {}, {}), squares, 1.0, maps=maps, chance=1e-9)
-    chips = Trial(change_of(replicates, "add blinking_dark_counts"), {}, Signature({}, {}, {}), 90.0, 1.0, chips=True)
-    assert gain_against(told, told) == squares and gain_against(chips, told) == 90.0
-    assert gain_against(told, chips) == pytest.approx(max(squares - map_.price, 6.1**2), rel=0.01)
-    assert gain_against(replace(told, gain=20.0), chips) == 20.0  # never more than it gains
+    found = evidence_of(replicates, evaluation, told)
+    assert found == pytest.approx(max(squares - map_.price, 6.1**2), rel=0.01) and found < squares
+    # the squares hardly show small differences of many pixels
+    assert evidence_of(replicates, evaluation, replace(told, fall=20.0)) == pytest.approx(6.1**2, rel=0.01)
 
 
 def test_expectations_of_many_captures_are_those_of_each(lab):
@@ -167,13 +168,13 @@ def test_expectations_of_many_captures_are_those_of_each(lab):
             np.testing.assert_allclose(null.expected(float(total))[0], expected[k], rtol=1e-9)
 
 
-def test_a_gain_is_what_the_squares_fall_by(lab):
+def test_a_fall_is_what_the_squares_fall_by(lab):
     replicates = bench_of(lab())
     evaluation = evaluate(replicates, {})
     (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed({CROSSTALK: 0.05})])
     for times in (0.1, 1.0):
         fall = square(evaluation.residuals) - square(residuals_at(replicates, evaluation, signature, times))
-        assert gain_of(replicates, evaluation, signature, times) == pytest.approx(fall, rel=1e-9, abs=1e-6)
+        assert fall_of(replicates, evaluation, signature, times) == pytest.approx(fall, rel=1e-9, abs=1e-6)
 
 
 # --- what becomes of a closer look -------------------------------------------------------------------------------
@@ -281,6 +282,7 @@ def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, mon
     one = Trial(change_of(path.replicates, "add crosstalk"), {CROSSTALK: 0.01}, Signature({}, {}, {}), 50.0, 1.0)
     monkeypatch.setattr(path.scan, "again", lambda *_: [one])
     monkeypatch.setattr("spadmnist.inference.model_selection.worth_fitting", lambda *_: [one])
+    monkeypatch.setattr("spadmnist.inference.model_selection.evidence_of", lambda *_: 50.0)
     monkeypatch.setattr("spadmnist.inference.model_selection.patterns_first", lambda scan, evaluation, tried: tried)
     monkeypatch.setattr("spadmnist.inference.model_selection.fit_trial", lambda replicates, evaluation, one: one)
     monkeypatch.setattr("spadmnist.inference.model_selection.p_of_best", lambda *_: (3.0, 0.2))
@@ -298,6 +300,7 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         Trial(change_of(path.replicates, name), {}, Signature({}, {}, {}), gain, 1.0)
         for name, gain in (("per_pixel dark_counts.rate", -3.0), ("add slow_afterpulsing", 37.0))
     )
+    monkeypatch.setattr("spadmnist.inference.model_selection.evidence_of", lambda replicates, evaluation, one: one.fall)
     monkeypatch.setattr(path.scan, "again", lambda *_: [map_, other])
     monkeypatch.setattr("spadmnist.inference.model_selection.worth_fitting", lambda *_: [map_, other])
     monkeypatch.setattr("spadmnist.inference.model_selection.patterns_first", lambda scan, evaluation, tried: tried)
@@ -316,7 +319,8 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
     for failed in ([object()], []):
         with pytest.raises(StopIteration):
             _added(path, Notes([], False), failed)  # type: ignore[arg-type]
-    assert taken == [other, map_] and map_.gain == 16.0  # the square of its trace's, whatever all cells have gained
+    assert taken == [other, map_]
+    assert map_.evidence == pytest.approx(19.5, abs=0.1)  # what a p-value of 1e-5 is, however the squares fall
 
 
 @pytest.mark.parametrize(
@@ -328,18 +332,18 @@ def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(
 ) -> None:
     """But only where it is their numbers that tell, and not as unlikely as what has nothing to do with pixels."""
     replicates = bench_of(lab())
-    look = quiet(replicates)
     map_, codes, other = (
         Trial(change_of(replicates, name), {}, Signature({}, {}, {}), 50.0, 1.0)
         for name in ("per_pixel dark_counts.rate", "add tdc_nonlinearity", "add blinking_dark_counts")
     )
     map_.maps, codes.maps, other.chips = {(): None}, {(): None}, odd  # type: ignore[dict-item]
-    monkeypatch.setattr("spadmnist.inference.ranking._share_of_counts", lambda *_: numbers)
+    monkeypatch.setattr("spadmnist.inference.evidence._share_of_counts", lambda *_: numbers)
     judged = {id(map_): (2.0, 0.02), id(codes): (2.1, 0.015), id(other): (4.0, 1e-4)}
-    best, significance, p = least_probable(
-        look, evaluate(replicates, {}), [codes, map_, other], lambda t: judged[id(t)]
-    )
-    assert best.candidate.name.startswith(first) and (significance, p) == (4.0, 1e-4)
+    judge_maps_by_odd_pixels(replicates, evaluate(replicates, {}), [codes, map_, other], judged)
+    for one in (codes, map_, other):
+        one.evidence = sigmas_of(judged[id(one)][1]) ** 2
+    best = best_of([codes, map_, other])
+    assert best.candidate.name.startswith(first) and judged[id(best)] == (4.0, 1e-4)
 
 
 def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) -> None:
@@ -348,13 +352,11 @@ def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) 
     evaluation = evaluate(replicates, {})
     names = ("crosstalk", "slow_afterpulsing", "source_noise", "flicker", "background_light", "blinking_dark_counts")
     best, *others = (
-        Trial(
-            change_of(replicates, f"add {name}"), {}, Signature({}, {}, {}), gain, 1.0, residuals=evaluation.residuals
-        )
-        for name, gain in zip(names, (100.0, 50.0, 40.0, 30.0, 20.0, 99.0), strict=True)
+        Trial(change_of(replicates, f"add {name}"), {}, Signature({}, {}, {}), 0.0, 1.0, evidence=evidence)
+        for name, evidence in zip(names, (100.0, 50.0, 40.0, 30.0, 20.0, 99.0), strict=True)
     )
     monkeypatch.setattr("spadmnist.inference.alternatives.failing", lambda *_: [])
-    found = alternatives(quiet(replicates), evaluation, best, [best], others)
+    found = alternatives(quiet(replicates), evaluation, best, others)
     assert [(a["effect"], a["confused"]) for a in found] == [
         ("blinking_dark_counts", True),
         *((name, False) for name in names[1:4]),
@@ -363,7 +365,7 @@ def test_what_would_do_as_well_is_named_before_what_would_not(lab, monkeypatch) 
 
 def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
     replicates = bench_of(lab())
-    evaluation, look = evaluate(replicates, {}), quiet(replicates)
+    evaluation = evaluate(replicates, {})
     for name, low, high in (("per_pixel dark_counts.rate", 0.7, 1.0), ("add crosstalk", 0.0, 0.3)):
         candidate = change_of(replicates, name)
         if name.startswith("per_pixel"):
@@ -376,7 +378,7 @@ def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
             values = {CROSSTALK: 0.05}
         (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)])
         assert not isinstance(signature, str) and candidate.effect
-        assert low <= _share_of_counts(look, evaluation, signature) <= high, name
+        assert low <= _share_of_counts(replicates, evaluation, signature) <= high, name
 
 
 def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:

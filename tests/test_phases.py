@@ -10,6 +10,7 @@ from tinylab import bench_of, change_of
 
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.evaluation import evaluate, square
+from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.phases import Swing, choose_side, simulate_phases
 from spadmnist.inference.signature import Signature, residuals_at
@@ -63,13 +64,15 @@ def test_strength_and_phase_are_fitted(lab, amplitude: float, seed: int) -> None
     one = Trial(candidate, values, swing.at(phases), gain, times, phases={(id, PHASE): p for id, p in phases.items()})
     found = fit_trial(replicates, evaluation, one)
     error = math.sqrt(2 / replicates.seen["flat"].total)
-    assert found.gain > 0.3 * (amplitude / error) ** 2
+    assert found.fall > 0.3 * (amplitude / error) ** 2
     assert found.values[AMPLITUDE] == pytest.approx(amplitude, abs=6 * error)
     off = (found.phases["flat", PHASE] - 0.7 + math.pi) % (2 * math.pi) - math.pi
     assert abs(off) < 6 * error / amplitude + math.radians(2)
     assert found.times == 1 and found.scaled() == found.values  # what it does is what it does at these values
     again = residuals_at(replicates, evaluation, found.signature)
-    assert square(evaluation.residuals) - square(again) == pytest.approx(found.gain + 2 * len(found.phases) + 2)
+    assert found.fall == pytest.approx(square(evaluation.residuals) - square(again))
+    evidence = evidence_of(replicates, evaluation, found)  # two in chi square for the amplitude and each phase
+    assert evidence == pytest.approx(found.fall - 2 * len(found.phases) - 2)
     assert found.fit is not None
     _, low, high = found.fit.interval(0)
     assert low < found.values[AMPLITUDE] < high and high - low < 12 * error

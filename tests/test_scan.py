@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,14 +15,14 @@ from spadmnist import plugins
 from spadmnist.effects import Effect
 from spadmnist.inference.candidates import first_strengths
 from spadmnist.inference.coordinates import Coordinate
-from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
+from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio, square
+from spadmnist.inference.evidence import best_of, evidence_of, worth_fitting
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.laws import Law
 from spadmnist.inference.light_levels import levels_about
 from spadmnist.inference.map_trials import candidate_maps
 from spadmnist.inference.model_path import begin, edge_errors, open_ends, sharpen
 from spadmnist.inference.null_distribution import learn
-from spadmnist.inference.ranking import best_of, compare_by_squares, worth_fitting
 from spadmnist.inference.replicates import Replicates, no_size
 from spadmnist.inference.results import Value
 from spadmnist.inference.scan import Scan
@@ -97,7 +97,7 @@ def test_a_gate_that_takes_most_of_the_light_is_tried_where_it_does(lab) -> None
     evaluation, look = evaluate(replicates, {}), quiet(replicates)
     candidate = change_of(replicates, "add short_gate")
     tried = look._by_totals(evaluation, [(candidate, values) for values in look.begun(evaluation, candidate)])
-    best = max(tried, key=lambda one: one.gain)
+    best = max(tried, key=lambda one: one.fall)
     # the next strengths that are tried are a sixth away
     assert best.times == 1 and best.values["short_gate", "fraction"] == pytest.approx(0.4, abs=0.1)
     linear = signature_of_totals(replicates, evaluation, evaluation.sensors.changed({("short_gate", "fraction"): 0.82}))
@@ -112,7 +112,7 @@ def test_a_drift_is_looked_at_with_both_signs(lab) -> None:
     evaluation, look = evaluate(replicates, {}), quiet(replicates)
     candidate = change_of(replicates, "add source_drift")
     (one,) = look.looked_at(evaluation, candidate, look.begun(evaluation, candidate))
-    assert one.signature.even is not None and one.gain > 100
+    assert one.signature.even is not None and one.fall > 100
     # so many detections in a ramp tell the slope to root(12 / n)
     assert one.values["source_drift", "slope"] * one.times == pytest.approx(-0.3, abs=0.1)
 
@@ -157,11 +157,11 @@ def test_what_belongs_to_either_sign_speaks_for_the_one_that_is_there(lab, sign:
     there = score_test(replicates, evaluation, one.signature.at(times))
     assert found.data == there.data > score_test(replicates, evaluation, one.signature.at(-times)).data + 1
     marked = quiet(replicates)._marked(evaluation, one)
-    assert marked.gain == found.data**2 and marked.times * sign > 0
+    assert marked.fall == found.data**2 and marked.times * sign > 0
     # less than nothing of what both signs do is neither
     told = dict(evaluation.residuals)
     evaluation.residuals[ramp], evaluation.residuals[power] = 0.0 * told[ramp], -told[power]
-    assert quiet(replicates)._marked(evaluation, one).gain == 0
+    assert quiet(replicates)._marked(evaluation, one).fall == 0
     evaluation.residuals.update(told)
     # fitted as strong as it is seen, it helps, and the opposite does not
     strong = min(
@@ -321,35 +321,36 @@ def test_p_values_of_values_that_differ(joined: bool) -> None:
     assert np.mean(np.array(shifted) < 1e-2) > 0.6
 
 
-@dataclass
-class _Model:
-    """An evaluation as far as `best_of` looks at it."""
-
-    left: int
-    residuals: dict[Any, Any] = field(default_factory=dict)
-
-
-def test_a_map_and_chance_are_told_by_what_they_leave(lab, monkeypatch) -> None:
+def test_the_best_candidate_has_the_most_evidence(lab) -> None:
+    """A pattern that is first comes before what explains more; of equals a map of pixels is the best."""
     replicates = bench_of(lab())
-    look = quiet(replicates)
-    monkeypatch.setattr(
-        "spadmnist.inference.ranking.block_checks", lambda replicates, evaluation, residuals: [None] * evaluation.left
-    )
-    monkeypatch.setattr("spadmnist.inference.ranking.failing", lambda checks: checks)
-    nothing = Signature({}, {}, {})
-    map_ = Trial(change_of(replicates, "per_pixel dark_counts.rate"), {}, nothing, 90.0, 1.0, maps={})
-    map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
-    chance = Trial(change_of(replicates, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True)
-    third = Trial(change_of(replicates, "add crosstalk"), {}, nothing, 120.0, 1.0)
+    maps: Any = {("dark_counts", "rate"): None}
 
-    def better(left_by_map: int, left_by_chance: int, *more: Trial) -> str:
-        pair = [replace(map_, evaluation=_Model(left_by_map)), replace(chance, evaluation=_Model(left_by_chance))]  # type: ignore[arg-type]
-        return best_of(look, [*pair, *more], lambda t: t.gain).candidate.effect
+    def trial(name: str, evidence: float, **more: Any) -> Trial:
+        return Trial(change_of(replicates, name), {}, Signature({}, {}, {}), 0.0, 1.0, evidence=evidence, **more)
 
-    assert better(0, 0) == "dark_counts"
-    assert better(1, 0) == "blinking_dark_counts"
-    assert better(0, 1) == "dark_counts"
-    assert better(0, 0, third) == "crosstalk"
+    map_, odd = trial("per_pixel dark_counts.rate", 90.0, maps=maps), trial("add blinking_dark_counts", 90.0)
+    third, rows = trial("add crosstalk", 120.0), trial("add row_pattern", 20.0)
+    assert best_of([odd, map_]) is map_ and best_of([odd, map_, third]) is third
+    assert best_of([rows, map_]) is rows and best_of([map_, rows]) is map_
+    assert best_of([replace(rows, evidence=10.0), map_]) is map_
+
+
+def test_a_light_that_fluctuates_makes_squares_fall_and_has_no_evidence(lab) -> None:
+    """The data are those of a steady light, which each of the fluctuating ones surrounds at some distance."""
+    replicates = bench_of(lab(light=900, side=4), 32)
+    evaluation = evaluate(replicates, {})
+    values = {("source_noise", "contrast"): 0.2, ("source_noise", "coherence_time"): 2.0}
+    sensors = evaluation.sensors.changed(values)
+    (signature,) = signatures(replicates, evaluation, [sensors], 8, kept="sure")
+    assert isinstance(signature, Signature)
+    one = Trial(change_of(replicates, "add source_noise"), values, signature, 0.0, 1.0, sensors)
+    found = evidence_of(replicates, evaluation, one)
+    assert one.evaluation is not None
+    assert square(one.evaluation.residuals) < square(evaluation.residuals) and found < -100.0
+    # what is faint changes no scatter, and is not simulated: the squares fall as its signature says
+    faint = Trial(change_of(replicates, "add crosstalk"), {}, Signature({}, {}, {}), 17.0, 1.0, sensors, faint=True)
+    assert evidence_of(replicates, evaluation, faint) == 17.0 and faint.evaluation is None
 
 
 @pytest.mark.parametrize("law", ["normal", "scaled", "poisson", "exponential"])
@@ -373,7 +374,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
         kind = "normal" if law == "scaled" else law
         made = [Summary(x, kind, str, no_size, scale) for x in drawn(times, 64)]
         null = learn(made, np.full(64, mean))
-        return SimpleNamespace(nulls={CELL: null}, residuals={CELL: null.judge(data, mean).residuals})
+        return SimpleNamespace(nulls={CELL: null}, residuals={CELL: null.judge(data, mean).residuals}, space=None)
 
     for truth in (1.0, 2.0):
         data = drawn(truth)
@@ -381,21 +382,25 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
         exact = float(z @ z) * (1 - 1 / 4) - 2 * cells * math.log(2)
         if law == "exponential":
             exact = float(np.sum(data / mean)) - 2 * cells * math.log(2)
-        found = log_likelihood_ratio(state_of(1.0, data), state_of(2.0, data))
+        trace = {CELL: np.ones(cells)}
+        found = log_likelihood_ratio(state_of(1.0, data), state_of(2.0, data), trace)
         assert found == pytest.approx(exact, rel=0.25, abs=30), (law, truth)
         assert (found > 0) == (truth == 2.0)
 
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law())
+    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), recordings=32)
     now, there = (
-        SimpleNamespace(nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)})
+        SimpleNamespace(
+            nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)}, space=None
+        )
         for x, y in ((1.0, 1.1), (3.0, 1.0))
     )
     trace = {CELL: np.array([2.0]), OTHER: np.full(1000, 0.01)}
     assert log_likelihood_ratio(now, there, trace) == pytest.approx(-8.0)  # type: ignore[arg-type]
-    assert log_likelihood_ratio(now, there) == pytest.approx(210.0 - 8.0)  # type: ignore[arg-type]
+    everywhere = {CELL: np.array([2.0]), OTHER: np.ones(1000)}
+    assert log_likelihood_ratio(now, there, everywhere) == pytest.approx(210.0 - 8.0)  # type: ignore[arg-type]
 
 
 BOOM = """from spadmnist import Effect, parameter
@@ -440,21 +445,19 @@ def test_a_users_effect_that_cannot_be_tried_is_told(lab, tmp_path, monkeypatch)
 
 def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_fitted(lab) -> None:
     replicates = bench_of(lab())
-    look, nothing = quiet(replicates), Signature({}, {}, {})
-    chance = Trial(change_of(replicates, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True, fell=100.0)
+    nothing = Signature({}, {}, {})
+    chance = Trial(change_of(replicates, "add blinking_dark_counts"), {}, nothing, 100.0, 1.0, chips=True)
     other = Trial(change_of(replicates, "add crosstalk"), {}, nothing, 90.0, 1.0)
     map_ = Trial(change_of(replicates, "per_pixel dark_counts.rate"), {}, nothing, 10.0, 1.0)
     map_ = replace(map_, maps={("dark_counts", "rate"): None})  # type: ignore[dict-item]
-    assert [t.candidate.name for t in worth_fitting(look, [chance, other, map_])] == [
-        t.candidate.name for t in (chance, other, map_)
-    ]
-    assert worth_fitting(look, [other, map_]) == [other]
+    assert worth_fitting([chance, other, map_]) == [other, chance, map_]
+    assert worth_fitting([other, map_]) == [other]
     # and beside a map what chance makes, where there is something in it
-    clear = replace(map_, gain=1000.0)
-    assert worth_fitting(look, [clear, other, chance]) == [clear, chance]
-    assert worth_fitting(look, [clear, replace(chance, gain=20.0, fell=20.0)]) == [clear]
-    # as the squares say: until its number is fitted, how it scatters may tell against it
-    assert [t.chips for t in worth_fitting(look, [clear, replace(chance, gain=-50.0)])] == [False, True]
+    clear = replace(map_, fall=1000.0)
+    assert worth_fitting([clear, other, chance]) == [clear, chance]
+    assert worth_fitting([clear, replace(chance, fall=20.0)]) == [clear]
+    # what its squares promise crowds nobody out: it may scatter more
+    assert worth_fitting([replace(chance, fall=1e6), other, map_]) == [other, replace(chance, fall=1e6), map_]
 
 
 def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:
@@ -477,7 +480,7 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
         evaluation, {}, [far, replace(near, candidate=change_of(replicates, "add blinking_dark_counts"), chips=True)]
     )
     # of what is faint the trace decides which are looked at again, and how strong they are
-    clear = replace(near, signature=Signature({}, {}, {"flat": 2.0}), gain=0.0)
+    clear = replace(near, signature=Signature({}, {}, {"flat": 2.0}), fall=0.0)
     weak = replace(far, candidate=change_of(replicates, "add afterpulsing"), signature=Signature({}, {}, {"flat": 3.0}))
     traces = {id(clear.signature): 4.5, id(weak.signature): 1.0}
     monkeypatch.setattr(
@@ -488,7 +491,7 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
     look.again(evaluation, {}, [weak, clear], faint=True)
     assert [one.candidate.name for one in seen] == ["add crosstalk"]
     # what hardly shows is simulated up to three times as strong, where nothing is plainly wrong
-    dim = replace(near, signature=Signature({}, {}, {"flat": 0.1}), gain=45.0, times=0.8)
+    dim = replace(near, signature=Signature({}, {}, {"flat": 0.1}), fall=45.0, times=0.8)
     traces[id(dim.signature)] = 4.5
     for faint, times in ((False, 1.0), (True, 3.0)):
         seen.clear()
@@ -621,37 +624,9 @@ def test_a_template_of_another_strength_does_not_hide_one_that_promises(lab) -> 
     evaluation.residuals[cell] = np.full(cells, 4.0)
     usual = np.maximum(evaluation.nulls[cell].expected(replicates.seen["flat"].total)[0], 1.0)
     weak.signature = Signature({cell: 4.0 * np.sqrt(usual)}, {}, {})
-    weak.gain, _ = look.line_search(evaluation, weak.signature, weak.signed)
-    assert weak.gain > 25
+    weak.fall, _ = look.line_search(evaluation, weak.signature, weak.signed)
+    assert weak.fall > 25
     assert look._still(evaluation, tries, [weak, strong]) == []
-
-
-def test_near_rivals_are_compared_by_what_each_leaves_of_the_cells_that_they_move(lab) -> None:
-    replicates = bench_of(lab())
-    evaluation, look = evaluate(replicates, {}), quiet(replicates)
-    cell, other = ("flat", "fine_intervals"), ("flat", "spectrum")
-    cells = len(evaluation.residuals[cell])
-    evaluation.residuals[cell] = np.full(cells, 3.0)
-    nothing, moves = Signature({}, {}, {}), cells // 2
-
-    def tried(name: str, gain: float, left: float, beside: float, **more: Any) -> Trial:
-        there = _Model(
-            0, {**evaluation.residuals, cell: np.full(cells, left), other: evaluation.residuals[other] + beside}
-        )
-        fit = {**evaluation.residuals, cell: evaluation.residuals[cell] - 1.0 * (np.arange(cells) < moves)}
-        one = Trial(change_of(replicates, name), {}, nothing, gain, 1.0, evaluation.sensors, residuals=fit, **more)
-        one.evaluation = there  # type: ignore[assignment]
-        return one
-
-    # the first leaves less of what it moves, the second of what neither does
-    first, second = tried("add crosstalk", 300.0, 0.5, 0.0), tried("add jitter", 305.0, 1.0, -9.0)
-    far, map_ = tried("add source_drift", 100.0, 0.0, 0.0), tried("add source_noise", 301.0, 0.0, 0.0, maps={})
-    compare_by_squares(look, evaluation, [first, second, far, map_])
-    assert first.gain == 300.0 and second.gain == pytest.approx(300.0 - moves * (1.0 - 0.25))
-    assert (far.gain, map_.gain) == (100.0, 301.0)
-    alone = tried("add crosstalk", 300.0, 0.5, 0.0)
-    compare_by_squares(look, evaluation, [alone, far])
-    assert alone.gain == 300.0
 
 
 def test_a_time_is_tried_short_and_long(lab) -> None:
@@ -670,9 +645,9 @@ def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(la
     path = begin(bench_of((sensor, data)))
     key = ("slow_recovery", "time_constant")
     seen = given(path, "add slow_recovery", {key: 5e-9}, fitted=False)
-    far = replace(seen, gain=1000.0, times=30.0)
+    far = replace(seen, fall=1000.0, times=30.0)
     (found,) = path.scan.again(path.evaluation, {}, [far])
-    assert found.values[key] == pytest.approx(5e-9) and found.gain > 25
+    assert found.values[key] == pytest.approx(5e-9) and found.fall > 25
     # near by it goes where it is led
-    (found,) = path.scan.again(path.evaluation, {}, [replace(seen, gain=1000.0, times=1.2)])
+    (found,) = path.scan.again(path.evaluation, {}, [replace(seen, fall=1000.0, times=1.2)])
     assert found.values[key] == pytest.approx(6e-9)

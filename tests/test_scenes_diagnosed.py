@@ -89,7 +89,7 @@ def looked_at(made: Lab, effects: Sequence[str]) -> list[Trial]:
     for candidate in replicates.candidates(replicates.start):
         if candidate.effect in effects and candidate.kind == "add":
             tried += scan.looked_at(evaluation, candidate, scan.begun(evaluation, candidate))
-    return patterns_first(scan, evaluation, scan.again(evaluation, {}, sorted(tried, key=lambda t: -t.gain)))
+    return patterns_first(scan, evaluation, scan.again(evaluation, {}, sorted(tried, key=lambda t: -t.fall)))
 
 
 # --- a print beside maps of pixels --------------------------------------------------------------------------------

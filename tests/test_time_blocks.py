@@ -237,7 +237,7 @@ def test_a_placebo_is_as_strong_in_halves_as_in_the_whole(lab) -> None:
     rung = placebo_of(replicates, evaluation, [tried], best, {"crosstalk"})
     assert rung is not None and rung.placebo is not None and rung.row["placebo"]
     assert rung.placebo[x] == pytest.approx(0.05) and rung.placebo[other] == 0
-    tried.gain = -1.0  # what only makes it worse is added with no strength at all
+    tried.fall = -1.0  # what only makes it worse is added with no strength at all
     idle = placebo_of(replicates, evaluation, [tried], best, {"crosstalk"})
     assert idle is not None and idle.placebo == {} and idle.row["placebo"]
 

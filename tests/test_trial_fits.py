@@ -14,6 +14,7 @@ from tinylab import CROSSTALK, DURATION, bench_of, change_of, given, quiet
 from spadmnist.inference.candidates import candidates, templates, with_values
 from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, square
+from spadmnist.inference.evidence import evaluation_of, optimism
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.map_trials import patterns_first
 from spadmnist.inference.model_path import ModelPath, _of_pixels, accept, begin
@@ -22,7 +23,7 @@ from spadmnist.inference.results import Step
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import Signature, captures_showing, residuals_at
 from spadmnist.inference.trial import Trial
-from spadmnist.inference.trial_fits import IGNORED, _fails_own_checks, _probe, evaluation_of
+from spadmnist.inference.trial_fits import IGNORED, _fails_own_checks, _probe
 
 NOTHING = Signature({}, {}, {})
 SERVICE = ("readout_loss", "service_time")
@@ -267,7 +268,8 @@ def test_what_is_fitted_is_looked_at_everywhere(lab, monkeypatch) -> None:
     for cell, z in again.items():
         np.testing.assert_array_equal(one.residuals[cell], z)
     assert one.fit.square == pytest.approx(square(again))
-    assert one.gain == pytest.approx(square(evaluation.residuals) - square(again) - 2.0)  # of one number
+    assert one.fall == pytest.approx(square(evaluation.residuals) - square(again))
+    assert optimism(one) == pytest.approx(2.0)  # of one number
 
 
 @pytest.mark.parametrize(("stated", "tried"), [(4, [2.0, 6.0]), (2, [1.0, 3.0]), (1, [2.0])])
@@ -289,6 +291,6 @@ def test_a_stated_queue_that_is_another_one_is_found(lab) -> None:
     path = begin(bench_of((stated, data)))
     one = given(path, "set readout_loss.queue", {("readout_loss", "queue"): 3.0}, fitted=True)
     assert one.values == {("readout_loss", "queue"): 2.0}
-    assert one.gain > 100
+    assert one.fall > 100
     accept(path, one, 10.0)
     assert path.steps[0].values["queue"].value == 2

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
-from .evaluation import Evaluation, block_checks, failing, mean_misfit, square
-from .ranking import gain_against
+from .evaluation import Evaluation, block_checks, failing, mean_misfit
 from .replicates import Replicates
 from .results import plain
 from .scan import Scan
@@ -14,14 +14,12 @@ from .signature import residuals_at
 from .trial import Trial, at_end, tie
 
 _NAMED = 4  # alternatives of a step
-# of the gain of a shape at the end of its range: a candidate with as much is confused with it, because another law
-# may be the right one
+# of the evidence for a shape at the end of its range: a candidate with as much is confused with it, because another
+# law may be the right one
 _ALMOST = 0.8
 
 
-def alternatives(
-    scan: Scan, evaluation: Evaluation, best: Trial, refined: Sequence[Trial], second: Sequence[Trial]
-) -> list[dict[str, Any]]:
+def alternatives(scan: Scan, evaluation: Evaluation, best: Trial, second: Sequence[Trial]) -> list[dict[str, Any]]:
     """The other candidates with the misfit that each leaves, ties first, for the JSON data."""
     out: list[dict[str, Any]] = []
     for one in second:
@@ -39,18 +37,17 @@ def alternatives(
 def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, one: Trial) -> dict[str, Any]:
     residuals = one.residuals or residuals_at(replicates, evaluation, one.signature, one.times, noisy=True)
     judged, left = evaluation, residuals
-    if one.scatters and one.evaluation is not None:
+    if one.evaluation is not None:  # by its own scatter
         judged, left = one.evaluation, one.evaluation.residuals
     failed = failing(block_checks(replicates, judged, left))
-    most, gain = gain_against(best, one), gain_against(one, best)
-    if one.chips and judged is not evaluation:  # by the likelihood ratio a few odd pixels may gain little
-        gain = max(gain, square(evaluation.residuals) - square(residuals))
-    near = most - gain < tie(most) or (at_end(best) and gain > _ALMOST * most)
+    # by the likelihood ratio of their wide cells a few odd pixels may gain little
+    most, own = best.evidence, max(one.evidence, one.fall) if one.chips else one.evidence
+    near = most - own < tie(most) or (at_end(best) and own > _ALMOST * most)
     return {
         "change": one.candidate.kind,
         "effect": one.candidate.effect,
         "parameter": one.candidate.parameter,
         "misfit": plain(mean_misfit(evaluation.replicate_residuals, residuals)),
-        "confused": one.residuals is not None and near and not failed,
+        "confused": one.evidence > -math.inf and near and not failed,
         "tried": one,
     }

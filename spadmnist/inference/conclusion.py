@@ -169,7 +169,7 @@ def rival_step(path: ModelPath, rival: Trial) -> Step:
     value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
     left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
     return Step(
-        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.gain, 0.0)), "all rates alike"
+        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.fall, 0.0)), "all rates alike"
     )
 
 

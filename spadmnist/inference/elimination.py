@@ -78,7 +78,7 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
     missed = len(path.failed) > failed
     if step.fluctuates and not missed:
         template = {cell: step.template.get(cell, np.zeros_like(z)) for cell, z in before[0].residuals.items()}
-        missed = log_likelihood_ratio(path.evaluation, before[0], template, fluctuates=True) > _NEEDLESS
+        missed = log_likelihood_ratio(path.evaluation, before[0], template) > _NEEDLESS
     if missed:
         path.back_to(before)
     else:
@@ -100,7 +100,7 @@ def _fit_from_templates(path: ModelPath) -> None:
         path.values = {k: x for k, x in path.values.items() if k not in keys_of(step.candidate, path)}
         evaluation = without_fit(path)
         found = path.scan.looked_at(evaluation, step.candidate, path.scan.begun(evaluation, step.candidate))
-        best = max(found, key=lambda one: one.gain, default=None)
+        best = max(found, key=lambda one: one.fall, default=None)
         rest, accepted = path.values, path.scan.accepted
         try:
             if best is not None:

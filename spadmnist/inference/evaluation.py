@@ -27,8 +27,8 @@ from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joi
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
 _PIECES = 4  # tasks of one capture: the number of workers that share it
 _SEEN = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
-# of the log of the ratio of two scatters: the most that counts, and the least that is significant
-_WIDEST, _WIDER = 2.3, 0.5
+_WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts
+_OTHER_SCATTER = 3.0  # standard errors of that log: a cell beyond has another scatter; 3 of 1000 do so by chance
 _NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
 _FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
 
@@ -235,51 +235,41 @@ def square(residuals: Mapping[Cell, np.ndarray]) -> float:
     return sum(float(z @ z) for z in residuals.values())
 
 
-def log_likelihood_ratio(
-    evaluation: Evaluation,
-    other: Evaluation,
-    template: Mapping[Cell, np.ndarray] | None = None,
-    fluctuates: bool = False,
-) -> float:
+def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Mapping[Cell, np.ndarray]) -> float:
     """Twice the log quasi-likelihood ratio of another model to this one, each cell by its own model's scatter.
 
             sum z^2 - z'^2 - 2 log(s' / s)
 
     z, s: residual and scatter of a cell under this model; z', s': under the other. A model with more scatter has
-    smaller squares even if it is wrong; the log of the scatter is the price.
+    smaller squares even if it is wrong; the log of the scatter is the price. The totals count, and the cells that the
+    other model moves, or whose scatter is another one: the noise of thousands of other cells would decide.
 
     Args:
         evaluation, other: of the two models.
-        template: of the other model (`template_of`); statistics without a signature are left out, because their noise
-            over thousands of cells would decide.
-        fluctuates: the other model fluctuates from replicate to replicate; then the cells that scatter more, and the
-            totals, count.
+        template: of the other model (`template_of`); a statistic without a signature is not moved.
     """
     out = 0.0
     for cell in other.residuals.keys() & evaluation.residuals.keys():
         z, there = evaluation.residuals[cell], other.residuals[cell]
-        if cell == TOTALS and fluctuates:
-            out += float(z @ z - there @ there) + 2 * (_log_precision(other) - _log_precision(evaluation))
-            continue
-        seen = template is None or float(template[cell] @ template[cell]) > _SEEN
-        if not (seen or fluctuates):
-            continue
-        if cell not in other.nulls or cell not in evaluation.nulls:
+        if cell not in other.nulls or cell not in evaluation.nulls:  # the totals
             out += float(z @ z - there @ there)
             continue
         null, new = evaluation.nulls[cell], other.nulls[cell]
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
+        error = null.law.error_of_scatter(z.size, min(null.recordings, new.recordings))
+        moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _SEEN)
         # a cell that never varies has no scatter: the log of its ratio is bounded
         gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
-        if fluctuates and template is not None:
-            gain = gain[(seen & (template[cell] != 0)) | np.broadcast_to(wider > _WIDER, z.shape)]
-        out += float(np.sum(gain))
-    return out
+        out += float(np.sum(gain[moved | (np.broadcast_to(np.abs(wider), z.shape) > _OTHER_SCATTER * error)]))
+    return out + 2 * (_log_precision(other) - _log_precision(evaluation))
 
 
 def _log_precision(evaluation: Evaluation) -> float:
-    """The log determinant of the inverse root of the totals' covariance."""
-    return float(np.linalg.slogdet(evaluation.space[2])[1]) if evaluation.space is not None else 0.0
+    """The log determinant of the inverse root of the covariance of the log totals."""
+    if evaluation.space is None:
+        return 0.0
+    _, elasticity, root, _ = evaluation.space
+    return float(np.linalg.slogdet(root)[1] - np.sum(np.log(elasticity)))
 
 
 def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:

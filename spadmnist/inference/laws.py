@@ -96,6 +96,10 @@ class Law:
         """The scatter of the cells, in units that another model shares: one number for all, or (cells,)."""
         return np.asarray(spread)
 
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """The standard error of the log of the ratio of two scatters, each of n replicates of as many cells."""
+        return 1 / math.sqrt(max(n - 1, 1))
+
     def template(self, shift: np.ndarray, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
         """A shift in standard deviations, (cells,)."""
         return np.asarray(shift / np.maximum(self.spread_at(expected, spread, factor), _LEAST_FREE))
@@ -153,6 +157,10 @@ class Scaled(Law):
     def breadth(self, spread: np.ndarray, factor: float) -> np.ndarray | float:
         """One factor for all cells."""
         return factor
+
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """All cells inform the factor."""
+        return 1 / math.sqrt(max(n * cells - 1, 1))
 
 
 class Poisson(Scaled):
@@ -228,6 +236,10 @@ class Exponential(Scaled):
     def factor(self, z: np.ndarray) -> float:
         """None is needed."""
         return 1.0
+
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """The mean of n exponential powers in each cell."""
+        return math.sqrt(2 / n)
 
     def standardized(
         self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import plugins
+from ..effects import Effect
 from ..errors import UNABLE
 from ..sensor import Sensor
 from . import count_model, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
+from .evidence import evidence_of
 from .models import Model
 from .replicates import Replicates
 from .score_test import PIXELS, p_of_map
@@ -109,17 +112,15 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
     }
     chance = 1.0 if maps[0].chance is None else maps[0].chance
     doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
-    layout = evaluation.sensors.one.layout
-    place = layout.centred.T
-    radius = (place**2).sum(axis=0)
+    one_sensor = evaluation.sensors.one
     designs = {}
-    for one in patterns:
-        if one.candidate.per == "row":
-            designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "row"))
-        elif one.candidate.per == "column":
-            designs[one.candidate.name] = _indicators(pixel_maps.groups_of(evaluation.sensors.one, "column"))
-        elif not of_scene(one):
-            designs[one.candidate.name] = np.stack([*place, radius], axis=1)
+    for candidate in (t.candidate for t in patterns if not of_scene(t)):
+        if candidate.per:
+            designs[candidate.name] = _indicators(pixel_maps.groups_of(one_sensor, candidate.per))
+        else:
+            pattern = Effect.registry.find(candidate.effect)
+            with plugins.blaming(pattern):
+                designs[candidate.name] = pattern.light_pattern(one_sensor.layout)
     found = pixel_maps.pattern_tests(free, designs)
     chances = {name: p for name, (p, _) in found.items()} | scenes
     real = [t for t in patterns if chances[t.candidate.name] < doubtful]
@@ -129,7 +130,7 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
     if real and (rest[0] in maps or rest[0] in real or (scenes and of_pixels)):
         fixed = [t for t in real if not of_scene(t)]
         firsts = [min(fixed, key=lambda t: found[t.candidate.name][1])] if fixed else []
-        first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.gain)
+        first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.fall)
         rest.remove(first)
         rest.insert(0, first)
     return rest
@@ -160,11 +161,11 @@ def unseen_maps(
 ) -> list[Trial]:
     """Trials of random maps: maps that no pixel's counts inform, but whose signature is that of a candidate.
 
-    The pixels of every replicate are drawn anew. A trial is returned where its gain is that of `like`, within a tie.
+    The pixels of every replicate are drawn anew. A trial is returned if it is a tie with `like`.
 
     Args:
         values: the values of the model, SI.
-        like: the trial of the candidate.
+        like: the fitted trial of the candidate.
         faint: see `Scan.again`.
     """
     levels = count_model.light_levels_of(scan.replicates, evaluation)
@@ -195,15 +196,18 @@ def unseen_maps(
                 if isinstance(signature, str):
                     continue
                 residuals = residuals_at(scan.replicates, evaluation, signature)
-                gain = square(evaluation.residuals) - square(residuals)
-                one = Trial(candidate, {}, signature, gain, 1.0, sensors, residuals=residuals)
+                fall = square(evaluation.residuals) - square(residuals)
+                one = Trial(candidate, {}, signature, fall, 1.0, sensors, residuals=residuals)
                 one = scan._marked(evaluation, one) if faint else one
-                if best is None or one.gain > best.gain:
+                if best is None or one.fall > best.fall:
                     best, about = one, float(sigma)
-            if best is None or best.gain < like.gain / 2:
+            if best is None or best.fall < like.evidence / 2:
                 break
             sigmas = about * np.exp(math.log(sigmas[1] / sigmas[0]) * np.array([-0.6, -0.3, 0.3, 0.6]))
-        if best is not None and best.gain > like.gain - tie(like.gain):
+        if best is None or best.fall < like.evidence / 2:
+            continue
+        best.evidence = best.fall if faint else evidence_of(scan.replicates, evaluation, best)
+        if best.evidence > like.evidence - tie(like.evidence):
             out.append(best)
     return out
 

@@ -26,15 +26,15 @@ from .conclusion import Limits, Notes, answer, left_over, not_done, outside, riv
 from .elimination import drop_mimics, drop_needless, in_vain, left_in_own_cells
 from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
+from .evidence import best_of, evidence_of, judge_maps_by_odd_pixels, worth_fitting
 from .findings import mimicked
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_GAIN
 from .map_trials import patterns_first, unseen_maps
 from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
-from .ranking import best_of, compare_by_squares, least_probable, worth_fitting
 from .replicates import REPLICATES, TOTALS, Replicates
 from .results import Diagnosis, title
-from .score_test import explains_its_signature, p_of_any, p_of_best
+from .score_test import explains_its_signature, p_of_any, p_of_best, sigmas_of
 from .trial import Trial
 from .trial_fits import fit_trial
 
@@ -260,8 +260,8 @@ def _added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: f
             return _best_added(path, notes, failed, least)
         except _NoCandidate as none:
             names = none.args[0]
-        except UNABLE as error:  # not attributable to one candidate: the one with the largest gain is excluded
-            most = max(notes.tried, key=lambda t: t.gain, default=None)
+        except UNABLE as error:  # not attributable to one candidate: the one with the largest fall is excluded
+            most = max(notes.tried, key=lambda t: t.fall, default=None)
             if most is None:
                 raise
             path.scan.exclude(most.candidate, "choosing the best", why(error))
@@ -294,30 +294,29 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
     if not second:
         return False
-    worth = worth_fitting(scan, second)
+    worth = worth_fitting(second)
     replicates.say(f"step {number}: fitting " + ", ".join(title(t.candidate) for t in worth))
-    refined = []
+    fitted = []
     for one in worth:
         with scan.if_possible(one.candidate, "fitting its numbers"):
-            refined.append(fit_trial(replicates, path.evaluation, one))
-    if not refined:
+            one = fit_trial(replicates, path.evaluation, one)
+            if not faint:
+                one.evidence = evidence_of(replicates, path.evaluation, one)
+            fitted.append(one)
+    if not fitted:
         raise _NoCandidate({one.candidate.name for one in worth})
-    if not faint:
-        compare_by_squares(scan, path.evaluation, refined)
-    judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in refined}
+    judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in fitted}
     if faint:
-        for one in refined:
-            one.gain = judged[id(one)][0] ** 2
-        refined = [one for one in refined if explains_its_signature(replicates, path.evaluation, one)]
-        if not refined:
+        judge_maps_by_odd_pixels(replicates, path.evaluation, fitted, judged)
+        for one in fitted:
+            one.evidence = sigmas_of(judged[id(one)][1]) ** 2
+        fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
+        if not fitted:
             return False
-        best, significance, p = least_probable(scan, path.evaluation, refined, lambda t: judged[id(t)])
-    else:
-        with _needed(path, [one.candidate for one in refined if one.scatters], "comparing the best"):
-            best = best_of(scan, refined, lambda t: t.gain)
-        significance, p = judged[id(best)]
+    best = best_of(fitted)
+    significance, p = judged[id(best)]
     # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
-    if p > least or (best.gain < LEAST_GAIN and not faint):
+    if p > least or (best.evidence < LEAST_GAIN and not faint):
         if faint or not _few(path):
             return False
         path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
@@ -328,8 +327,8 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     if best.maps is None and not best.phases:
         with _or_as_before(path, "looking for what looks alike"):
             unseen = unseen_maps(scan, before, path.values, best, faint)
-            refined, second = refined + unseen, second + unseen
-    new[0].alternatives = alternatives(scan, before, best, refined, second)
+            second = second + unseen
+    new[0].alternatives = alternatives(scan, before, best, second)
     named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
     if notes.placebo is None:
         with contextlib.suppress(*UNABLE):  # no result depends on it

@@ -19,7 +19,7 @@ from . import count_model, counts_in_the_dark, time_blocks
 from .candidates import Candidate, candidates
 from .comparison import comparison_with
 from .coordinates import Key, point_of
-from .evaluation import log_likelihood_ratio
+from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
@@ -29,7 +29,7 @@ from .results import Diagnosis, Step, Value, title
 from .score_test import LEAST_P, p_of_map
 from .signature import Signature, signature_of_totals, template_of
 from .trial import Trial
-from .trial_fits import evaluation_of, fit_trial
+from .trial_fits import fit_trial
 
 
 def fit_named(
@@ -184,16 +184,11 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             accept(path, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
             continue
         best = fit_trial(replicates, path.evaluation, _started(path, candidate), 5)
-        if not candidate.coordinates:  # a switch, which may be right as it is
-            best.gain = log_likelihood_ratio(
-                path.evaluation,
-                evaluation_of(replicates, best),
-                template_of(replicates, path.evaluation, best.signature),
-            )
-            if best.gain <= 0:
-                _kept(path, candidate)
-                continue
-        accept(path, best, math.sqrt(max(best.gain, 0.0)))
+        best.evidence = evidence_of(replicates, path.evaluation, best)
+        if not candidate.coordinates and best.evidence <= 0:  # a switch, which is right as it is
+            _kept(path, candidate)
+            continue
+        accept(path, best, math.sqrt(max(best.evidence, 0.0)))
     ends: dict[Key, tuple[float, float]] = {}
     coordinates = tuple(d for step in path.steps for d in step.coordinates)
     if coordinates:
@@ -224,11 +219,11 @@ def _kept(path: ModelPath, candidate: Candidate) -> None:
 
 
 def _started(path: ModelPath, candidate: Candidate) -> Trial:
-    """The trial of the template with the largest gain, at its best strength."""
+    """The trial of the template with the largest fall, at its best strength."""
     found = path.scan.looked_at(path.evaluation, candidate, path.scan.begun(path.evaluation, candidate))
     if not found:
         raise InputError(f"{title(candidate)} cannot be simulated in these captures")
-    return max(found, key=lambda t: t.gain)
+    return max(found, key=lambda t: t.fall)
 
 
 def _halves(name: str) -> tuple[str, str]:

@@ -19,10 +19,9 @@ from .levels import COST_OF_A_NUMBER, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
 from .phases import NEAR, TIMES, simulate_phases
-from .ranking import gain_by_own_scatter
 from .replicates import FEW, Replicates
 from .score_test import LEAST_P, best_direction, sigmas_of
-from .signature import Signature, gain_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
+from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
 from .spectral_lines import Line, spectral_lines
 from .trial import Trial, frequencies_of, further, is_same, shape_of, stronger, weaker
 from .trial_fits import STRONG
@@ -30,7 +29,7 @@ from .trial_fits import STRONG
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
 _SCAN = 2  # replicates of each capture for the first look
 _SECOND = 6  # candidates in the second look
-_NEARLY = 0.8  # of the largest gain
+_NEARLY = 0.8  # of the largest fall
 _BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
 _FAR_OFF = 0.4  # of the logarithm of a strength
 _SILENT = 6.0  # standard deviations: a signature below it is none
@@ -97,7 +96,7 @@ class Scan:
     # --- looking -------------------------------------------------------------------------------------------------
 
     def line_search(self, evaluation: Evaluation, signature: Signature, signed: bool) -> tuple[float, float]:
-        """(gain in chi square, factor on the strength at which it is largest).
+        """(fall of the squares in chi square, factor on the strength at which it is largest).
 
         Args:
             signed: the strength may have either sign.
@@ -106,9 +105,9 @@ class Scan:
         tries = [*TIMES, *([-t for t in TIMES] if signed else [])]
         for _ in range(2):
             for times in tries:
-                gain = gain_of(self.replicates, evaluation, signature, times)
-                if gain > best[0]:
-                    best = gain, times
+                fall = fall_of(self.replicates, evaluation, signature, times)
+                if fall > best[0]:
+                    best = fall, times
             if best[0] < PROMISING:
                 break
             tries = [best[1] * x for x in NEAR if x != 1]
@@ -169,7 +168,7 @@ class Scan:
                 still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
         for one in self._simulated(evaluation, still, _SCAN, only):
             one.seen = set(only or evaluation.made)
-            one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+            one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(one)
         for candidate, tried in tries:
             if not candidate.phases:
@@ -181,10 +180,10 @@ class Scan:
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
                 continue
-            gain, times, found = swing.suited(self.replicates, evaluation)
+            fall, times, found = swing.suited(self.replicates, evaluation)
             phases = {(id, key): p for id, p in found.items() for key in candidate.phases}
-            gain -= 2 * len(phases)
-            one = Trial(candidate, tried, swing.at(found), gain, times, phases=phases, seen=set(evaluation.made))
+            fall -= 2 * len(phases)
+            one = Trial(candidate, tried, swing.at(found), fall, times, phases=phases, seen=set(evaluation.made))
             for coordinate in frequencies_of(candidate):
                 f = float(tried[coordinate.key])
                 line = next((line for line in self.lines(evaluation) if line.frequency == f), None)
@@ -224,7 +223,7 @@ class Scan:
         return out
 
     def scan(self, evaluation: Evaluation, everywhere: bool = False, known: Sequence[Trial] = ()) -> list[Trial]:
-        """The trials of every candidate at its templates, by gain.
+        """The trials of every candidate at its templates, by the fall of the squares.
 
         Args:
             everywhere: in all captures, not only in the most informative ones.
@@ -248,7 +247,7 @@ class Scan:
             out = old + self._raised(evaluation, self._looked_at(evaluation, tries, some), some)
             out += self._lowered(evaluation, out, some)
             out += self._further(evaluation, out, some)
-        return sorted(out, key=lambda t: -t.gain)
+        return sorted(out, key=lambda t: -t.fall)
 
     def _by_totals(self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]]) -> list[Trial]:
         """The trials by the closed forms of the totals, where nothing but totals fails; nothing is simulated."""
@@ -262,8 +261,8 @@ class Scan:
                     0.0,
                     1.0,
                 )
-                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
-                out.append(self._by_exact_totals(evaluation, one) if one.gain > PROMISING else one)
+                one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
+                out.append(self._by_exact_totals(evaluation, one) if one.fall > PROMISING else one)
         return out
 
     def _by_exact_totals(self, evaluation: Evaluation, one: Trial) -> Trial:
@@ -272,16 +271,16 @@ class Scan:
         The totals are not proportional to a large strength. A gate of half the frame halves them, one of nothing
         leaves nothing.
         """
-        best = replace(one, gain=0.0, times=1.0)
+        best = replace(one, fall=0.0, times=1.0)
         for factors in ([*TIMES, *([-t for t in TIMES] if one.signed else [])], NEAR):
             start = best
             for factor in factors:
                 values = replace(start, times=factor).scaled()
                 with contextlib.suppress(SpadError):
                     signature = signature_of_totals(self.replicates, evaluation, evaluation.sensors.changed(values))
-                    gain = gain_of(self.replicates, evaluation, signature)
-                    if gain > best.gain:
-                        best = replace(start, values=values, signature=signature, gain=gain)
+                    fall = fall_of(self.replicates, evaluation, signature)
+                    if fall > best.fall:
+                        best = replace(start, values=values, signature=signature, fall=fall)
         return best
 
     def _raised(self, evaluation: Evaluation, tried: list[Trial], some: Sequence[str]) -> list[Trial]:
@@ -293,7 +292,7 @@ class Scan:
         found = self._looked_at(evaluation, silent, some) if silent else []
         raised = {(one.candidate.name, shape_of(one)) for one in found}
         # a faint one that the data resemble stays
-        again = [t for t in faint if t.gain < COST_OF_A_NUMBER and (t.candidate.name, shape_of(t)) in raised]
+        again = [t for t in faint if t.fall < COST_OF_A_NUMBER and (t.candidate.name, shape_of(t)) in raised]
         return [t for t in tried if not any(t is one for one in again)] + found
 
     def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
@@ -304,8 +303,8 @@ class Scan:
         return [t for t in loud if size_of(self.replicates, evaluation, t.signature) > _SILENT]
 
     def _further(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
-        """Stronger trials for edges with a gain at a larger strength; a blur is not proportional to it."""
-        return self._onward(evaluation, tried, some, further, lambda t: t.gain > PROMISING and t.times > 1)
+        """Stronger trials for edges whose squares fall further at a larger strength: a blur is not proportional."""
+        return self._onward(evaluation, tried, some, further, lambda t: t.fall > PROMISING and t.times > 1)
 
     def _onward(
         self,
@@ -334,9 +333,9 @@ class Scan:
             if one.candidate.phases or not any(is_same(one, *t) for t in tries):
                 continue
             now = replace(one)
-            now.gain, now.times = self.line_search(evaluation, one.signature, one.signed)
+            now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
-            if now.gain >= PROMISING / 4:
+            if now.fall >= PROMISING / 4:
                 promising.add((now.candidate.name, shape_of(now)))
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
 
@@ -355,7 +354,7 @@ class Scan:
             for one in self._simulated(evaluation, some, _SCAN, sorted(missing)):
                 one.signature = earlier[id(one)].beside(one.signature, missing)
                 one.seen = one.seen | missing
-                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
+                one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
                 out.append(one)
         return out
 
@@ -383,24 +382,25 @@ class Scan:
         Args:
             values: the values of the model, SI.
             tried: the trials of the scan.
-            faint: no check fails. Then the squares of all cells are more noise than effect, and the gain is the
-                square of the score.
+            faint: no check fails. Then the squares of all cells are more noise than effect, and their fall is taken
+                as the square of the score.
         """
         best: list[Trial] = []
         further: list[Trial] = []
         if faint:
-            tried = sorted((self._marked(evaluation, t) for t in tried), key=lambda t: -t.gain)
+            tried = sorted((self._marked(evaluation, t) for t in tried), key=lambda t: -t.fall)
         for one in tried:
-            if one.gain > 9 and all(b.candidate.name != one.candidate.name for b in best):
-                # of those with nearly the largest gain, the one simulated nearest to its best strength
+            if one.fall > 9 and all(b.candidate.name != one.candidate.name for b in best):
+                # of those with nearly the largest fall, the one simulated nearest to its best strength
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
-                alike = [t for t in same if t.gain > _NEARLY * one.gain]
+                alike = [t for t in same if t.fall > _NEARLY * one.fall]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
                 further += _faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
                 break
         best += further
         out: list[Trial] = []
+        sizes: dict[int, float] = {}  # of the signature as it was simulated first, by the trial's id
         kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
         for one in best:
             if one.phases:
@@ -417,12 +417,13 @@ class Scan:
                 with self.if_possible(one.candidate, _AGAIN):
                     given = start.scaled()
                     sensors = evaluation.sensors.changed(given, one.phases, one.chips)
-                    out.append(replace(start, values=given, gain=size, sensors=sensors))
+                    out.append(replace(start, values=given, sensors=sensors))
+                    sizes[id(out[-1])] = size
         # random odd pixels are a map as well, even where the map by itself would not be significant
         least = LEAST_P_WITH_ODD_PIXELS if any(one.chips for one in best) else LEAST_P_OF_MAP
         for one in self._simulated(evaluation, [*out, *map_trials_of(self, evaluation, values, least)], FEW):
             if one.maps is None:
-                before, x, size = one.gain, abs(one.times), size_of(self.replicates, evaluation, one.signature)
+                before, x, size = sizes[id(one)], abs(one.times), size_of(self.replicates, evaluation, one.signature)
                 if (
                     min(size, before) > 5
                     and not 0.7 < x < 1.4
@@ -431,46 +432,39 @@ class Scan:
                 ):
                     # linear or quadratic: noise hides any other power of a faint signature
                     one.power = 2.0 if math.log(size / before) / math.log(x) > 1.5 else 1.0
-                one.gain, one.times = self.line_search(evaluation, one.signature, one.signed)
-                if one.chips and one.gain > PROMISING:
-                    gain: float | None = None
-                    with self.if_possible(one.candidate, _AGAIN):
-                        gain = gain_by_own_scatter(self, evaluation, one)
-                    if gain is None:
-                        continue
-                    one.fell, one.gain = one.gain, gain
+                one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
             else:
-                one.gain = square(evaluation.residuals) - square(
+                one.fall = square(evaluation.residuals) - square(
                     residuals_at(self.replicates, evaluation, one.signature)
                 )
                 # the squares hardly show small differences of many pixels; those of edges they do
                 if one.chance is not None and not one.candidate.blinds:
-                    one.gain = max(one.gain, sigmas_of(one.chance) ** 2)
+                    one.fall = max(one.fall, sigmas_of(one.chance) ** 2)
             kept.append(self._marked(evaluation, one) if faint else one)
         found: dict[int | str, Trial] = {}
-        for one in sorted(kept, key=lambda t: -t.gain):
+        for one in sorted(kept, key=lambda t: -t.fall):
             found.setdefault(id(one) if one.maps else one.candidate.name, one)
         return list(found.values())
 
     def _marked(self, evaluation: Evaluation, one: Trial) -> Trial:
-        """The trial with the square of its score as gain."""
+        """The trial with the square of its score as the fall."""
         if one.chance is not None:
-            return replace(one, gain=sigmas_of(one.chance) ** 2)
+            return replace(one, fall=sigmas_of(one.chance) ** 2)
         significance, found, times = best_direction(self.replicates, evaluation, one)
         suits = times * found.data / found.size if significance > 0 else one.times
-        return replace(one, gain=significance**2, times=one.times if one.gain > 0 and one.times * suits > 0 else suits)
+        return replace(one, fall=significance**2, times=one.times if one.fall > 0 and one.times * suits > 0 else suits)
 
 
 def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """The best trial of another shape that was simulated far below its best strength; none where there is no such.
 
-    Noise hides a part of a faint signature, so that its gain is too small beside that of a strong one.
+    Noise hides a part of a faint signature, so that its squares fall too little beside those of a strong one.
 
     Args:
         best: the best trial of a candidate.
-        tried: all trials of that candidate, by gain.
+        tried: all trials of that candidate, by the fall.
     """
-    others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > _BOLDER and t.gain > PROMISING)
+    others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > _BOLDER and t.fall > PROMISING)
     return list(others)[:1]
 
 

@@ -93,7 +93,7 @@ def p_of_best(
     Args:
         tried: all trials of the scan.
         best: one of them.
-        large: the misfit is large, so that the gain may exceed what the linear signature gives.
+        large: the misfit is large, so that the evidence may exceed what the linear signature gives.
     """
     if best.chance is not None:
         others = sum(c.carrier is not None for c in replicates.candidates(evaluation.sensors.one)) if best.maps else 1
@@ -107,8 +107,8 @@ def p_of_best(
     # no direction by itself may be significant, but all together
     together = min((p for p, _ in _p_values_of_group(replicates, evaluation, directions)), default=1.0)
     significance = max(significance, float(stats.t.isf(max(together, LEAST_P) / 2, found.freedom)))
-    if large:  # far from the model the signature is not linear: the gain itself, in the same units
-        significance = max(significance, math.sqrt(max(best.gain, 0.0) / max(found.spread**2, 0.5)))
+    if large:  # far from the model the signature is not linear: the evidence itself, in the same units
+        significance = max(significance, math.sqrt(max(best.evidence, 0.0) / max(found.spread**2, 0.5)))
     one = float(_p_of_square(significance**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
     return significance, max(_trials_corrected(own, min(one, together)), LEAST_P)
 

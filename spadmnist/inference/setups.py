@@ -197,8 +197,8 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
             with scan.if_possible(candidate, "explaining the totals", wholly=False):
                 sensors = evaluation.sensors.changed(tried)
                 one = Trial(candidate, tried, signature_of_totals(replicates, evaluation, sensors), 0.0, 1.0, sensors)
-                one.gain, one.times = scan.line_search(evaluation, one.signature, one.signed)
-                if one.gain < COST_OF_A_NUMBER:
+                one.fall, one.times = scan.line_search(evaluation, one.signature, one.signed)
+                if one.fall < COST_OF_A_NUMBER:
                     continue
                 one = _fitted(scan, evaluation, one)
                 left = one.residuals[TOTALS] if one.residuals else evaluation.residuals[TOTALS]
@@ -208,7 +208,7 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
             continue
         remains, fit = best
         if remains + COST_OF_A_NUMBER < cost + ALIKE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
-            fit.gain = square(evaluation.residuals) - remains
+            fit.fall = square(evaluation.residuals) - remains
             out.append(fit)
     out = sorted(out, key=lambda t: t.cost(evaluation))[:_VERIFIED]
     models = [t.sensors for t in out if t.sensors is not None]
@@ -264,7 +264,7 @@ def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
         one.candidate,
         given,
         signature,
-        one.gain,
+        one.fall,
         1.0,
         evaluation.sensors.changed(given),
         residuals=residuals,

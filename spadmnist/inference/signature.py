@@ -308,7 +308,7 @@ def residuals_at(
     return out
 
 
-def gain_of(replicates: Replicates, evaluation: Evaluation, signature: Signature, times: float = 1.0) -> float:
+def fall_of(replicates: Replicates, evaluation: Evaluation, signature: Signature, times: float = 1.0) -> float:
     """The fall of the squared residuals of the data if the expectation were shifted by `times` the signature."""
     found = residuals_at(replicates, evaluation, signature, times)
     return sum(

@@ -1,4 +1,4 @@
-"""A trial: a candidate at some values, its signature, and its gain."""
+"""A trial: a candidate at some values, its signature, the fall of the squares that it predicts, and its evidence."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from .signature import Signature
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
 _RAISED = 12.0  # the factor on a strength without a signature for another trial
-# in chi square, constant and per root of the gain: two candidates nearer than that are a tie, because a few
+# in chi square, constant and per root of the evidence: two candidates nearer than that are a tie, because a few
 # replicates blur the difference
 _ALIKE, _BLURRED = 8.0, 0.3
 
 
 @dataclass
 class Trial:
-    """A candidate at some values, with its signature and its gain.
+    """A candidate at some values, with its signature.
 
     Attributes:
         values: by (effect, parameter), SI.
-        gain: in chi square.
-        times: the factor on the strength of `values` at which the gain is largest.
-        fell: the fall of the squares, where the gain is another measure.
+        fall: of the squared residuals at the best strength, as the signature predicts, in chi square. It chooses what
+            is fitted. Where no check fails it is the square of the score.
+        times: the factor on the strength of `values` at which the fall is largest.
+        evidence: of the fitted trial, in chi square, see `evidence`; the one measure by which models are compared.
         phases: fitted to each capture.
         intervals: 95 % intervals of coordinates that `fit` does not hold.
     """
@@ -43,10 +44,10 @@ class Trial:
     candidate: Candidate
     values: dict[Key, Any]
     signature: Signature
-    gain: float
+    fall: float
     times: float
     sensors: Model | None = None
-    fell: float = 0.0
+    evidence: float = -math.inf
     power: float = 1.0  # the signature grows with this power of the strength
     chance: float | None = None  # p-value, where a test of its own gives it
     fit: Fit | None = None
@@ -69,11 +70,6 @@ class Trial:
     def fluctuates(self) -> bool:
         """Whether its effect differs from replicate to replicate."""
         return self.maps is None and not self.chips and (self.there or self.signature).fluctuates
-
-    @property
-    def scatters(self) -> bool:
-        """Whether its replicates scatter unlike the model's own, so that squares of residuals do not judge it."""
-        return self.chips or self.fluctuates
 
     def cost(self, evaluation: Evaluation) -> float:
         """The squares that it leaves in the totals, plus the cost of a free parameter."""
@@ -176,6 +172,6 @@ def is_pattern(one: Trial) -> bool:
     return candidate.per in ("row", "column") or Effect.registry.find(candidate.effect).is_pattern
 
 
-def tie(gain: float) -> float:
-    """The difference of gains, in chi square, within which two candidates are a tie."""
-    return _ALIKE + _BLURRED * math.sqrt(max(gain, 0.0))
+def tie(evidence: float) -> float:
+    """The difference of evidence, in chi square, within which two candidates are a tie."""
+    return _ALIKE + _BLURRED * math.sqrt(max(evidence, 0.0))

@@ -1,8 +1,7 @@
-"""Fits of the coordinates of one trial, with its gain on captures that it is not fitted to."""
+"""Fits of the coordinates of one trial."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import SpadError
-from . import held_out
 from .coordinates import Coordinate, Key, is_edge, point_of, room_of
-from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square, stacked
+from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_side, simulate_phases
 from .replicates import FEW, TOTALS, Replicates
@@ -32,13 +30,12 @@ _LINE = 0.25  # of the square of a signature, in one cell of a spectrum: then it
 _LEAST_BOOST = 1.5  # the least factor for which a stronger simulation is worth it
 _SWINGING = 6  # replicates for phases: a periodic model draws other random numbers
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first step to its neighbours, and the shortest
-_EACH = 2.0  # in chi square, of a fitted parameter
 # in chi square: the least fall for another whole number; the rise beyond which one is excluded
 _BETTER, EXCLUDED = 2.0, 6.0
 
 
 def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds: int = 3) -> Trial:
-    """The trial with its coordinates fitted; its gain is that on captures that it is not fitted to.
+    """The trial with its coordinates fitted, and the fall of the squares there.
 
     Args:
         rounds: see `gauss_newton`.
@@ -86,27 +83,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         one.there, residuals = there, residuals_at(replicates, evaluation, there)
         found = replace(found, residuals=residuals, square=square(residuals))
     one.fit, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
-    one.gain = square(evaluation.residuals) - found.square
-    if one.scatters:  # pixels, or replicates, may then scatter more: squares of residuals do not judge it
-        with contextlib.suppress(SpadError):  # what cannot be simulated in every capture keeps the fall of its squares
-            one.gain = log_likelihood_ratio(evaluation, evaluation_of(replicates, one), template, one.fluctuates)
-    one.gain -= _EACH * len(coordinates) if one.fluctuates else optimism(one)
+    one.fall = square(evaluation.residuals) - found.square
     return one
-
-
-def optimism(one: Trial) -> float:
-    """The optimism of a fitted trial, in chi square; 0 without a fit."""
-    if one.fit is None or one.residuals is None:
-        return 0.0
-    return held_out.optimism(one.residuals, one.fit) + 2.0 * len(one.phases)
-
-
-def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
-    """The evaluation of a trial's model, made once."""
-    if one.evaluation is None:
-        assert one.sensors is not None
-        one.evaluation = evaluate(replicates, {}, one.sensors)
-    return one.evaluation
 
 
 def _fails_own_checks(replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit) -> bool:
@@ -211,7 +189,7 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _SWINGING)
     if isinstance(swing, str):
         raise SpadError(swing)
-    gain, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
+    one.fall, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in coordinates}}
     mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}
     found = choose_side(replicates, evaluation, one.candidate.phases, one.values, found, mirrored)
@@ -232,7 +210,6 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     own = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
     covariance = covariance_of(np.concatenate(list(jacobian.values())), own)
     one.fit = Fit(coordinates, now, covariance, residuals, jacobian, square(residuals), one.values)
-    one.gain = gain - optimism(one)
     return one
 
 

@@ -1,0 +1,133 @@
+"""The evidence for a candidate: the one measure by which fitted models are compared, in chi square.
+
+        E = 2 log(L' / L) - 2 p
+
+L, L': quasi-likelihood of the data under the model, and under the model with the candidate, each by its own scatter;
+p: the effective number of parameters that were fitted. Squares of residuals alone do not compare models of different
+scatter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..statistics import Statistic
+from . import held_out
+from .evaluation import Evaluation, evaluate, log_likelihood_ratio
+from .levels import LEAST_GAIN, PROMISING
+from .replicates import TOTALS, Replicates
+from .score_test import sigmas_of
+from .signature import Signature, template_of
+from .trial import Trial, is_pattern
+
+_FITTED = 3  # the largest number of trials that are fitted, random odd pixels and their map not counted
+_NEAR = 0.4  # of the largest fall of the squares: a trial below it is not fitted
+_MOSTLY = 0.5  # of the squares of a signature
+_EACH = 2.0  # in chi square: the optimism of one fitted parameter (Akaike, IEEE Trans. Autom. Control 19 (1974) 716)
+
+
+def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> float:
+    """The evidence for a fitted trial, in chi square.
+
+    Three ways lead to the likelihood ratio, each where its noise is least. A map has a likelihood of its own, in which
+    its values are a random effect. A faint effect changes no scatter, and its own replicates would hide it: the
+    squares fall as its signature, simulated stronger, says. All others are simulated as they are.
+
+    Raises:
+        SpadError: where the model with it cannot be simulated.
+    """
+    if one.maps is not None:
+        return _evidence_of_map(one)
+    if one.faint and not (one.chips or one.fluctuates):
+        return one.fall - optimism(one)
+    template = template_of(replicates, evaluation, (one.there or one.signature).at(one.times))
+    return log_likelihood_ratio(evaluation, evaluation_of(replicates, one), template) - optimism(one)
+
+
+def _evidence_of_map(one: Trial) -> float:
+    """The fall of the squares less the price of the values, or the square of what its own test says in sigma."""
+    assert one.maps is not None
+    # maps of earlier steps are left out
+    price = sum(one.maps[c.carrier].price for c in one.candidates if c.carrier in one.maps)
+    # the squares hardly show small differences of many pixels; those of edges they do
+    own = 0.0 if one.chance is None or one.candidate.blinds else sigmas_of(one.chance) ** 2
+    return max(one.fall - price, own)
+
+
+def optimism(one: Trial) -> float:
+    """The optimism of a fitted trial, in chi square: what the fit gains on the data that it was fitted to."""
+    phases = _EACH * len(one.phases)
+    if one.fit is None or one.residuals is None:
+        return phases
+    if one.fluctuates:  # each capture has drawn another light, so that leaving it out tells nothing of the fit
+        return phases + _EACH * len(one.fit.coordinates)
+    return phases + held_out.optimism(one.residuals, one.fit)
+
+
+def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
+    """The evaluation of a trial's model, made once."""
+    if one.evaluation is None:
+        assert one.sensors is not None
+        one.evaluation = evaluate(replicates, {}, one.sensors)
+    return one.evaluation
+
+
+def worth_fitting(second: Sequence[Trial]) -> list[Trial]:
+    """The trials that may be best when they are fitted.
+
+    The squares that random odd pixels predict are those of a model that scatters more, so that they crowd nobody out.
+    With them a map of the pixels is fitted as well, though its small differences are hardly visible here; with a map
+    random odd pixels are, though no strength suits each pixel.
+
+    Args:
+        second: the trials of the second look, by the fall of the squares; a pattern may be first.
+    """
+    rivals = [t for t in second if not t.chips]
+    most = max((t.fall for t in rivals), default=0.0)
+    out = [t for k, t in enumerate(rivals) if k == 0 or t.fall > _NEAR * most][:_FITTED]
+    maps = any(map(is_map_of_pixels, out))
+    chips = [t for t in second if t.chips and t.fall > PROMISING and (maps or t.fall > _NEAR * most)]
+    more = [t for t in rivals if chips and is_map_of_pixels(t) and all(t is not one for one in out)]
+    return out + chips + more
+
+
+def best_of(fitted: Sequence[Trial]) -> Trial:
+    """The fitted trial with the most evidence, a map of pixels before another; a pattern that is first, if it has any.
+
+    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name.
+    """
+    first = fitted[0]
+    if is_pattern(first) and first.evidence >= LEAST_GAIN:
+        return first
+    return max(fitted, key=lambda t: (t.evidence, is_map_of_pixels(t)))
+
+
+def judge_maps_by_odd_pixels(
+    replicates: Replicates, evaluation: Evaluation, fitted: Sequence[Trial], judged: dict[int, tuple[float, float]]
+) -> None:
+    """Give a faint map of pixels the p-value of random odd pixels, where that is smaller.
+
+    Where the signature of the odd pixels lies in counts that compare no detections with each other, their score is a
+    sharper test of the same map.
+
+    Args:
+        judged: (significance, p-value) by the trial's id.
+    """
+    for odd in (t for t in fitted if t.chips):
+        if _share_of_counts(replicates, evaluation, odd.signature) > _MOSTLY:
+            for one in filter(is_map_of_pixels, fitted):
+                judged[id(one)] = min(judged[id(one)], judged[id(odd)], key=lambda x: x[1])
+
+
+def _share_of_counts(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> float:
+    """The share of a signature's square in statistics of counts that compare no detections with each other."""
+    squares = {
+        cell: float(t @ t) for cell, t in template_of(replicates, evaluation, signature).items() if cell != TOTALS
+    }
+    counts = sum(x for (_, name), x in squares.items() if Statistic.registry.find(name).among == "")
+    return counts / max(sum(squares.values()), 1e-300)
+
+
+def is_map_of_pixels(one: Trial) -> bool:
+    """Whether it is a map of pixels."""
+    return one.maps is not None and one.candidate.per == "pixel"
