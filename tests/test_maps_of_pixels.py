@@ -11,13 +11,18 @@ import pytest
 import spadmnist
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
+from spadmnist.effects import Conditions, DarkCounts, Detection
+from spadmnist.events import Layout
 from spadmnist.inference.candidates import candidates, maps_beside, with_values
+from spadmnist.inference.comparison import compare
 from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps
+from spadmnist.inference.named_fit import fit_named
 from spadmnist.inference.pixel_maps import _DOUBT, PixelMap, pattern_tests
 from spadmnist.inference.replicates import Replicates
+from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Serial
 
@@ -227,3 +232,55 @@ def test_a_camera_has_another_chip_than_the_model(tmp_path: Path) -> None:
     fitted = np.asarray(found.model.effect("dark_counts").rate)
     assert hot.sum() > 3 and np.all(np.abs(fitted[hot] / rates[hot] - 1) < 0.5)
     assert spadmnist.diagnose(truth, data, quick=True, within="none").verdict == "adequate"
+
+
+# --- one sensor with the map ----------------------------------------------------------------------------------------
+
+
+def map_of(raw: np.ndarray, raw_error: float, sigma: float) -> PixelMap:
+    """The map of normal logarithms that are known with this error, under the prior that they have."""
+    share = sigma**2 / (sigma**2 + raw_error**2)
+    error = np.full(raw.size, raw_error * math.sqrt(share))
+    known = np.full(raw.size, raw_error)
+    return PixelMap(("dark_counts", "rate"), 5.0, np.arange(raw.size), share * raw, error, raw, known, sigma)
+
+
+@pytest.mark.parametrize("raw_error", [0.02, 0.5, 1.0])
+def test_the_values_of_one_sensor_spread_as_the_pixels_do(raw_error: float) -> None:
+    """10,000 logarithms: their spread is told to 0.7 %, of which 5 standard deviations are allowed (6e-7)."""
+    rng, sigma = np.random.Generator(np.random.PCG64(8)), 0.5
+    true = sigma * rng.standard_normal(10_000)
+    map_ = map_of(true + raw_error * rng.standard_normal(true.size), raw_error, sigma)
+    means, spread = np.log(map_.values() / 5.0), np.log(map_.spread_values() / 5.0)
+    assert np.std(spread) == pytest.approx(sigma, rel=0.036)
+    # the means of the posterior spread by the root of the reliability
+    assert np.std(means) == pytest.approx(sigma * math.sqrt(sigma**2 / (sigma**2 + raw_error**2)), rel=0.036)
+    assert map_.spread_values().sum() == pytest.approx(map_.values().sum())
+    apart = [float(np.sqrt(np.mean((x - x.mean() - true) ** 2))) for x in (means, spread)]
+    assert apart[0] <= apart[1] < 1.25 * apart[0]
+    if raw_error < 0.1:  # what is known well stays as it is
+        np.testing.assert_allclose(spread - means, 0.0, atol=0.01)
+
+
+def test_a_map_of_few_counts_passes_the_comparison_with_its_own_data() -> None:
+    """8 dark counts a pixel: with the means of the posterior the model fails, for its pixels are too much alike."""
+    side, frames, frame = 32, 4000, 1e-5
+    rng = np.random.Generator(np.random.PCG64(5))
+    rate = 8.0 / (frames * frame) * np.exp(0.5 * rng.standard_normal(side * side))
+    rate[rng.random(side * side) < 0.02] *= 30
+    layout = Layout(side, side, 25e-12, 1.0)
+    effects = [Detection(pdp=0.4), DarkCounts(rate=float(np.median(rate)))]
+    stated = Sensor(layout, effects, "device", name="lab").resolved()
+    clock = Conditions(frames * frame, frames, frame, frame, None)
+    plan = measurements.in_memory("lab", layout, [Capture("dark", "qis", Light(), clock)])
+    truth = with_values(stated, {("dark_counts", "rate"): rate})
+    data = measurements.in_memory("lab", layout, list(twin.twin(truth, plan, 1)))
+    found = fit_named(stated, data, per_pixel=["dark_counts.rate"], jobs=1)
+    (step,) = found.steps
+    assert step.map is not None
+    np.testing.assert_array_equal(found.values["dark_counts", "rate"], step.map.spread_values())
+    verdicts = []
+    for values in (step.map.spread_values(), step.map.values()):
+        model = with_values(stated, {("dark_counts", "rate"): values})
+        verdicts.append(compare(model, data, jobs=1, replicates=32).verdict)
+    assert verdicts == ["adequate", "fails"]

@@ -121,7 +121,7 @@ def answer(
         invisible=invisible,
         unlimited=unlimited,
         traces=traces(replicates, start, path.evaluation, path.steps),
-        values=path.values,
+        values=path.sensor_values,
         simulations=replicates.simulations,
         dark=replicates.dark,
         crop=str(replicates.start.window) if replicates.start.window else None,

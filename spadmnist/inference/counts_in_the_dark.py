@@ -153,7 +153,7 @@ def _answer(
         [],
         [],
         [],
-        values={candidate.carrier: map_.values()},
+        values={candidate.carrier: map_.spread_values()},
         shape=replicates.start.layout.shape,
         asked="fit",
         dark=replicates.dark,

@@ -105,6 +105,12 @@ class ModelPath:
         maps = HeldMaps(dict(self.values), held, dict(self.scan.phases), chips) if held else None
         self.ladder.append(Rung(name, self.evaluation, misfit, errors, left, self.fit, list(steps), maps))
 
+    @property
+    def sensor_values(self) -> dict[Key, Any]:
+        """The values of one sensor that stands for the model, SI; a map has the spread of the chip."""
+        maps = {step.candidate.carrier: step.map for step in self.steps if step.candidate.carrier and step.map}
+        return {**self.values, **{key: map_.spread_values() for key, map_ in maps.items() if key in self.values}}
+
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""
         last = self.ladder.pop()

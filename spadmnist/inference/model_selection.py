@@ -153,7 +153,7 @@ def _diagnosed(
         replicates.say("the comparison of the model with its steps")
         own = None if path.steps else path.evaluation
         in_sample = (
-            comparison_of(replicates, own) if own else comparison_with(replicates, path.values, path.scan.phases)
+            comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values, path.scan.phases)
         )
     return answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
 

@@ -32,6 +32,7 @@ CODES = "codes"  # the statistic of the codes
 _PERIODS = (256, 140, 100)  # the periods that `statistics.codes` folds codes with
 # the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law
 GRID, ROUNDS = (-4.0, 8.0, 97), 100
+LEAST_RELIABLE = 0.04  # of the variance of values: estimates that have less of it spread as if they had so much
 NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
 _FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off
 HALF_95 = 1.96  # standard deviations: half of a 95 % interval
@@ -100,6 +101,25 @@ class PixelMap:
         if self.likely is not None:  # a pixel that is informed by itself has its own estimate
             relative = np.where(self.raw_error < self.certain, relative, self._one_of(draw))
         return np.clip(self.base * relative, self.low, self.high)
+
+    def spread_values(self) -> np.ndarray:
+        """Values that differ from each other as the values of the chip do, (groups,), SI; for one sensor with the map.
+
+        The means of the posterior, `values`, are the nearest to each true value, and differ less than these do: what is
+        known poorly lies near the middle. Here each deviation from the middle is larger by the root of the reliability
+        of its estimate, and the sum of the values stays. What is known well stays as it is.
+        Source: Louis, J. Am. Stat. Assoc. 79 (1984) 393, "Estimating a population of parameter values".
+        """
+        logs, reliability, most = self.estimate, 1 / (1 + self._pulled), np.full(self.estimate.size, MOST)
+        if self.likely is not None:  # a law of any shape, so that a hot one is moved within its own error at most
+            own, error = mean_of(self.likely[1], self.likely[0])
+            alone = self.raw_error >= self.certain
+            apart = float(np.var(own[alone])) if alone.any() else 0.0
+            logs, most = np.where(alone, own, logs), np.where(alone, error, most)
+            reliability = np.where(alone, apart / np.maximum(apart + error**2, 1e-30), reliability)
+        beyond = (logs - median_of(logs)) * (1 / np.sqrt(np.maximum(reliability, LEAST_RELIABLE)) - 1)
+        means, factor = self.values() / self.base, np.exp(np.clip(beyond, -most, most))
+        return np.clip(self.base * means * factor * (means.sum() / (means @ factor)), self.low, self.high)
 
     def _as_wide(self, draw: float) -> np.ndarray:
         """(groups,) factor on the deviation and the variance of each estimate, if the prior had another width.
