@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_a_statistic_that_fails_there_is_blamed_with_its_line(lab, tmp_path) -> 
     replicates = bench_of(lab())
     evaluation = evaluate(replicates, {})
     with pytest.raises(EffectError, match=r"halves\.py:14: the statistic halves failed: ZeroDivisionError"):
-        physical_errors(replicates, evaluation, evaluation.residuals)
+        physical_errors(replicates, evaluation, evaluation.residuals, strict=True)
 
 
 def test_a_map_is_tested_for_the_shapes_that_a_users_pattern_declares(lab, tmp_path, monkeypatch) -> None:
@@ -100,3 +101,48 @@ def test_a_map_is_tested_for_the_shapes_that_a_users_pattern_declares(lab, tmp_p
     assert patterns_first(look, evaluate(replicates, {}), [stripes, rows, map_]) == [stripes, rows, map_]
     np.testing.assert_array_equal(asked["add stripes"], np.tile([[0.0], [1.0]], (8, 1)))
     assert asked["add row_pattern"].shape == (16, 3)  # the first of four rows is what the others differ from
+
+
+@pytest.mark.parametrize(
+    ("returned", "says"),
+    [
+        ("np.arange(layout.pixels) % 2.0", r"finite and \(16, shapes\), not \(16,\)"),
+        ("np.full((layout.pixels, 1), np.nan)", "finite"),
+        ("1 / 0", "ZeroDivisionError"),
+    ],
+)
+def test_a_pattern_with_wrong_shapes_is_left_out_alone(lab, tmp_path, monkeypatch, returned: str, says: str) -> None:
+    load(tmp_path, STRIPES.replace("(np.arange(layout.pixels) % 2.0)[:, None]", returned), "stripes.py")
+    replicates = bench_of(lab(side=4))
+    look, nothing = quiet(replicates), Signature({}, {}, {})
+    stripes, rows, map_ = (
+        Trial(change_of(replicates, name), {}, nothing, fall, 1.0)
+        for name, fall in (("add stripes", 90.0), ("add row_pattern", 80.0), ("per_pixel detection.pdp", 70.0))
+    )
+    map_.maps = {map_.candidate.carrier: None}  # type: ignore[dict-item]
+    monkeypatch.setattr(pixel_maps, "acts_on_light", lambda sensor, candidate: True)
+    monkeypatch.setattr(pixel_maps, "pattern_tests", lambda free, designs: dict.fromkeys(designs, (1e-9, 1.0)))
+    assert patterns_first(look, evaluate(replicates, {}), [stripes, rows, map_]) == [rows, map_]
+    (entry,) = look.untried
+    assert entry["effect"] == "stripes" and re.search(says, entry["why"]) and "stripes.py" in entry["why"]
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [('error = "linearity"', "take another name"), ('error = "halves"\n    physical_error = None', "must define")],
+)
+def test_an_error_that_cannot_be_is_refused_when_the_class_is_made(tmp_path, line: str, says: str) -> None:
+    text = HALVES.replace('    error = "halves"\n', f"    {line.partition(chr(10))[0]}\n")
+    if "physical_error" in line:
+        text = text.replace("def physical_error(", "def another(")
+    with pytest.raises(EffectError, match=says):
+        load(tmp_path, text, "halves.py")
+
+
+def test_an_error_that_is_no_number_is_told_at_first_and_left_out_later(lab, tmp_path) -> None:
+    load(tmp_path, HALVES.replace("RETURNED", "float('nan')"), "halves.py")
+    replicates = bench_of(lab())
+    evaluation = evaluate(replicates, {})
+    with pytest.raises(EffectError, match="finite number"):
+        physical_errors(replicates, evaluation, evaluation.residuals, strict=True)
+    assert "halves" not in physical_errors(replicates, evaluation, evaluation.residuals)

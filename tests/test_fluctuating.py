@@ -23,6 +23,7 @@ from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
 
 CONTRAST, COHERENCE = ("source_noise", "contrast"), ("source_noise", "coherence_time")
+STEADY = 1 + 0.1 * np.random.Generator(np.random.PCG64(1)).standard_normal(32)  # mean squares of replicates
 TREND, MANY = ("flat", "trend"), ("flat", "fine_intervals")
 
 
@@ -84,8 +85,8 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
 
     def evaluation(width: float, other: float) -> Any:
         null = {
-            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), recordings=32),
-            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), recordings=32),
+            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), own=STEADY),
+            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=STEADY),
         }
         left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))

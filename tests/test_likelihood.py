@@ -16,7 +16,7 @@ from spadmnist.effects import Conditions, Effect
 from spadmnist.inference.candidates import Candidate, candidates, with_values
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.exact_likelihood import Likelihood, MaximumLikelihood, maximise, not_in_likelihood
-from spadmnist.inference.point_process import _FOLLOWS, _LAST, _followed, _of_rates
+from spadmnist.inference.point_process import _FOLLOWS, _LAST, _followed, _of_rates, hazards_of
 from spadmnist.inference.profile_likelihood import crossing, maximum
 from spadmnist.light import photons_from_irradiance
 from spadmnist.recording import Capture, Light, Recording
@@ -166,6 +166,13 @@ def test_a_users_effect_that_says_its_hazard_has_a_likelihood(sensor: Sensor, tm
     for key, truth in ((share, 0.05), (age, 60e-9)):
         low, high = exact.intervals[key]
         assert low < truth < high < 1.5 * low
+    # one number stands for every pixel; a map of them is no matter
+    (tmp_path / "level.py").write_text(DEEP_LEVEL.replace("DeepLevel", "Level").replace("np.full(pixels, ", "("))
+    plugins.load_file(tmp_path / "level.py")
+    mapped = with_values(sensor, {CHANCE: np.linspace(0.0, 0.1, 16)})
+    for model, name in ((with_values(without, {("level", "share"): 0.05}), "level"), (mapped, CHANCE[0])):
+        left = hazards_of(model, 16)[name][0]
+        assert left.shape == (16,) and not not_in_likelihood(model, data[0].capture)
     # a subclass whose events come otherwise does not inherit the hazard
     known = Effect.registry.find("deep_level")
     other = type("ShallowLevel", (known,), {"spawn": lambda self, events, rng: None, "__doc__": "Another one."})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -259,7 +260,18 @@ def test_the_values_of_one_sensor_spread_as_the_pixels_do(raw_error: float) -> N
     apart = [float(np.sqrt(np.mean((x - x.mean() - true) ** 2))) for x in (means, spread)]
     assert apart[0] <= apart[1] < 1.25 * apart[0]
     if raw_error < 0.1:  # what is known well stays as it is
-        np.testing.assert_allclose(spread - means, 0.0, atol=0.01)
+        np.testing.assert_array_equal(map_.spread_values(), map_.values())
+
+
+def test_a_pixel_that_is_known_well_is_not_moved_by_those_that_are_not() -> None:
+    rng, sigma = np.random.Generator(np.random.PCG64(8)), 0.5
+    well, poor = map_of(sigma * rng.standard_normal(500), 0.01, sigma), map_of(rng.standard_normal(500), 1.0, sigma)
+    fields = ("estimate", "error", "raw", "raw_error")
+    both = {name: np.concatenate([getattr(well, name), getattr(poor, name)]) for name in fields}
+    map_ = replace(well, group=np.arange(1000), **both)
+    np.testing.assert_array_equal(map_.spread_values()[:500], map_.values()[:500])
+    assert map_.spread_values().sum() == pytest.approx(map_.values().sum())
+    assert np.std(np.log(map_.spread_values()[500:])) > 1.5 * np.std(np.log(map_.values()[500:]))
 
 
 def test_a_map_of_few_counts_passes_the_comparison_with_its_own_data() -> None:

@@ -23,7 +23,7 @@ from spadmnist.inference.model_selection import _added, _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, mimic
-from spadmnist.inference.score_test import ScoreTest, explains_its_signature, sigmas_of
+from spadmnist.inference.score_test import ScoreTest, explains_its_signature
 from spadmnist.inference.signature import Signature, fall_of, residuals_at, signatures
 from spadmnist.inference.spectral_lines import Line
 from spadmnist.inference.trial import Trial, weaker
@@ -320,7 +320,7 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         with pytest.raises(StopIteration):
             _added(path, Notes([], False), failed)  # type: ignore[arg-type]
     assert taken == [other, map_]
-    assert map_.evidence == pytest.approx(19.5, abs=0.1)  # what a p-value of 1e-5 is, however the squares fall
+    assert map_.evidence == 16.0  # the square of its score, however the squares fall
 
 
 @pytest.mark.parametrize(
@@ -340,9 +340,7 @@ def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(
     monkeypatch.setattr("spadmnist.inference.evidence._share_of_counts", lambda *_: numbers)
     judged = {id(map_): (2.0, 0.02), id(codes): (2.1, 0.015), id(other): (4.0, 1e-4)}
     judge_maps_by_odd_pixels(replicates, evaluate(replicates, {}), [codes, map_, other], judged)
-    for one in (codes, map_, other):
-        one.evidence = sigmas_of(judged[id(one)][1]) ** 2
-    best = best_of([codes, map_, other])
+    best = best_of([codes, map_, other], lambda one: -judged[id(one)][1])
     assert best.candidate.name.startswith(first) and judged[id(best)] == (4.0, 1e-4)
 
 

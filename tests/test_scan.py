@@ -322,7 +322,7 @@ def test_p_values_of_values_that_differ(joined: bool) -> None:
 
 
 def test_the_best_candidate_has_the_most_evidence(lab) -> None:
-    """A pattern that is first comes before what explains more; of equals a map of pixels is the best."""
+    """A pattern in a map comes before what explains more; of equals a map of pixels is the best."""
     replicates = bench_of(lab())
     maps: Any = {("dark_counts", "rate"): None}
 
@@ -331,9 +331,13 @@ def test_the_best_candidate_has_the_most_evidence(lab) -> None:
 
     map_, odd = trial("per_pixel dark_counts.rate", 90.0, maps=maps), trial("add blinking_dark_counts", 90.0)
     third, rows = trial("add crosstalk", 120.0), trial("add row_pattern", 20.0)
-    assert best_of([odd, map_]) is map_ and best_of([odd, map_, third]) is third
-    assert best_of([rows, map_]) is rows and best_of([map_, rows]) is map_
-    assert best_of([replace(rows, evidence=10.0), map_]) is map_
+
+    def best(*fitted: Trial, pattern: Trial | None = None) -> Trial:
+        return best_of(fitted, lambda one: one.evidence, pattern)
+
+    assert best(odd, map_) is map_ and best(odd, map_, third) is third
+    assert best(map_, rows, pattern=rows) is rows and best(rows, map_) is map_
+    assert best(map_, pattern=rows) is map_  # it could not be fitted
 
 
 def test_a_light_that_fluctuates_makes_squares_fall_and_has_no_evidence(lab) -> None:
@@ -390,7 +394,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), recordings=32)
+    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=np.ones(32))
     now, there = (
         SimpleNamespace(
             nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)}, space=None
@@ -458,6 +462,12 @@ def test_beside_what_chance_makes_of_pixels_a_map_of_them_is_fitted(lab) -> None
     assert worth_fitting([clear, replace(chance, fall=20.0)]) == [clear]
     # what its squares promise crowds nobody out: it may scatter more
     assert worth_fitting([replace(chance, fall=1e6), other, map_]) == [other, replace(chance, fall=1e6), map_]
+    # there is always one to fit, or the search would look for the same for ever
+    assert worth_fitting([replace(chance, fall=20.0)]) == [replace(chance, fall=20.0)] and worth_fitting([]) == []
+    # where no check fails, squares of scores are compared, which no scatter makes larger
+    dim = replace(chance, fall=14.0)
+    assert worth_fitting([dim, replace(other, fall=4.0)], faint=True) == [dim]
+    assert worth_fitting([dim, replace(map_, fall=4.0)], faint=True) == [dim, replace(map_, fall=4.0)]
 
 
 def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypatch) -> None:

@@ -240,11 +240,13 @@ class Effect(Plugin, abstract=True):
     def hazard(self, pixels: int) -> tuple[np.ndarray, float] | None:
         """What a detection leaves in its own pixel, for the likelihood of time stamps; None: nothing of this form.
 
-        Correlated stage: events come at the hazard h / lifetime exp(-t / lifetime), t s after the detection, and only
-        in the pixel that fired.
+        Correlated stage: with a probability p a detection fires its own pixel again, once, after a time with an
+        exponential law; and no other pixel.
 
+        Args:
+            pixels: of the array.
         Returns:
-            (h (pixels,), the integral of the hazard; its lifetime in s).
+            (-ln(1 - p), (pixels,) or one number; the mean time in s).
         """
         return None
 
@@ -262,7 +264,7 @@ class Effect(Plugin, abstract=True):
         if self.stage == "gate":  # frames without a gap between them have a mean number, wherever the gate lies
             return not stamped and conditions.frame_time == conditions.frame_period
         if self.stage == "correlated":
-            return stamped and rules == "device" and self.hazard(1) is not None
+            return stamped and rules == "device" and type(self).hazard is not Effect.hazard
         if self.stage == "dead_time" and stamped:
             return not (hasattr(self, "sensitivity") or getattr(self, "extends", False))
         if self.stage == "dead_time":

@@ -41,7 +41,7 @@ def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, on
         judged, left = one.evaluation, one.evaluation.residuals
     failed = failing(block_checks(replicates, judged, left))
     # by the likelihood ratio of their wide cells a few odd pixels may gain little
-    most, own = best.evidence, max(one.evidence, one.fall) if one.chips else one.evidence
+    most, own = best.evidence, max(one.evidence, one.fall) if one.chips and judged is not evaluation else one.evidence
     near = most - own < tie(most) or (at_end(best) and own > _ALMOST * most)
     return {
         "change": one.candidate.kind,

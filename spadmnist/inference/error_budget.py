@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import plugins
+from ..errors import EffectError
 from ..statistics import Statistic
 from .candidates import Candidate
 from .coordinates import Key
@@ -63,7 +64,11 @@ class Rung:
 
 
 def physical_errors(
-    replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray], shift: Signature | None = None
+    replicates: Replicates,
+    evaluation: Evaluation,
+    residuals: Mapping[Cell, np.ndarray],
+    shift: Signature | None = None,
+    strict: bool = False,
 ) -> dict[str, float]:
     """The physical errors of a model, relative, by name; of what was not measured there is none.
 
@@ -74,6 +79,10 @@ def physical_errors(
     Args:
         residuals: (cells,) by block.
         shift: the signature of a model that was not simulated itself.
+        strict: a user's statistic that fails is an error; otherwise its number is left out, because no result of a
+            search depends on it.
+    Raises:
+        EffectError: where a user's statistic fails, if `strict`.
     """
     ids, elasticities, _, common = totals_space(replicates, evaluation)
     errors = {}
@@ -100,8 +109,15 @@ def physical_errors(
             continue
         seen, null = replicates.seen[cell[0]], evaluation.nulls[cell]
         expected = null.expected(seen.total)[0] + (shift.shifts.get(cell, 0.0) if shift else 0.0)
-        with plugins.blaming(statistic):
-            error = float(statistic.physical_error(seen.summaries[cell[1]].values, expected, z, seen.total))
+        try:
+            with plugins.blaming(statistic):
+                error = float(statistic.physical_error(seen.summaries[cell[1]].values, expected, z, seen.total))
+                if not math.isfinite(error):
+                    raise ValueError(f"physical_error must be a finite number, not {error}")
+        except EffectError:
+            if strict:
+                raise
+            continue
         shares.setdefault(statistic.error, []).append(error)
     whole = errors | {k: float(np.mean(v)) for k, v in shares.items()}
     return {k: plain(v) for k, v in whole.items()}

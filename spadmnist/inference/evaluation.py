@@ -256,19 +256,21 @@ def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Ma
             continue
         null, new = evaluation.nulls[cell], other.nulls[cell]
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
-        error = null.law.error_of_scatter(z.size, min(null.recordings, new.recordings))
+        wider = np.broadcast_to(wider, z.shape)
+        error = null.law.error_of_scatter(null.own if np.var(null.own) > np.var(new.own) else new.own)
         moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _SEEN)
+        other_scatter = np.abs(wider) > _OTHER_SCATTER * error
+        other_scatter &= 2 * float(np.sum(wider[other_scatter] ** 2)) > _SEEN
         # a cell that never varies has no scatter: the log of its ratio is bounded
-        gain = fall - 2 * np.broadcast_to(np.clip(wider, -_WIDEST, _WIDEST), z.shape)
-        out += float(np.sum(gain[moved | (np.broadcast_to(np.abs(wider), z.shape) > _OTHER_SCATTER * error)]))
-    return out + 2 * (_log_precision(other) - _log_precision(evaluation))
+        gain = fall - 2 * np.clip(wider, -_WIDEST, _WIDEST)
+        out += float(np.sum(gain[moved | other_scatter]))
+    if evaluation.space is None or other.space is None or evaluation.space[0] != other.space[0]:
+        return out  # of other totals the scatters are not compared
+    return out + 2 * (_log_precision(*other.space[1:3]) - _log_precision(*evaluation.space[1:3]))
 
 
-def _log_precision(evaluation: Evaluation) -> float:
-    """The log determinant of the inverse root of the covariance of the log totals."""
-    if evaluation.space is None:
-        return 0.0
-    _, elasticity, root, _ = evaluation.space
+def _log_precision(elasticity: np.ndarray, root: np.ndarray) -> float:
+    """The log determinant of the inverse root of the covariance of the log totals; see `totals_space`."""
     return float(np.linalg.slogdet(root)[1] - np.sum(np.log(elasticity)))
 
 

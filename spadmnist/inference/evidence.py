@@ -9,20 +9,21 @@ scatter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from ..statistics import Statistic
 from . import held_out
 from .evaluation import Evaluation, evaluate, log_likelihood_ratio
-from .levels import LEAST_GAIN, PROMISING
+from .levels import PROMISING
 from .replicates import TOTALS, Replicates
 from .score_test import sigmas_of
 from .signature import Signature, template_of
-from .trial import Trial, is_pattern
+from .trial import Trial
 
-_FITTED = 3  # the largest number of trials that are fitted, random odd pixels and their map not counted
-_NEAR = 0.4  # of the largest fall of the squares: a trial below it is not fitted
-_MOSTLY = 0.5  # of the squares of a signature
+# the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
+# fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
+_FITTED, _NEAR = 3, 0.4
+_MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
 _EACH = 2.0  # in chi square: the optimism of one fitted parameter (Akaike, IEEE Trans. Autom. Control 19 (1974) 716)
 
 
@@ -72,8 +73,8 @@ def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
     return one.evaluation
 
 
-def worth_fitting(second: Sequence[Trial]) -> list[Trial]:
-    """The trials that may be best when they are fitted.
+def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
+    """The trials that may be best when they are fitted; at least one, if there is any.
 
     The squares that random odd pixels predict are those of a model that scatters more, so that they crowd nobody out.
     With them a map of the pixels is fitted as well, though its small differences are hardly visible here; with a map
@@ -81,25 +82,31 @@ def worth_fitting(second: Sequence[Trial]) -> list[Trial]:
 
     Args:
         second: the trials of the second look, by the fall of the squares; a pattern may be first.
+        faint: no check fails, so that the falls are squares of scores, which no scatter makes larger.
     """
-    rivals = [t for t in second if not t.chips]
+    odd = [] if faint else [t for t in second if t.chips]
+    rivals = [t for t in second if all(t is not one for one in odd)]
     most = max((t.fall for t in rivals), default=0.0)
     out = [t for k, t in enumerate(rivals) if k == 0 or t.fall > _NEAR * most][:_FITTED]
     maps = any(map(is_map_of_pixels, out))
-    chips = [t for t in second if t.chips and t.fall > PROMISING and (maps or t.fall > _NEAR * most)]
-    more = [t for t in rivals if chips and is_map_of_pixels(t) and all(t is not one for one in out)]
-    return out + chips + more
+    out += [t for t in odd if t.fall > PROMISING and (maps or t.fall > _NEAR * most)]
+    chips = any(t.chips for t in out)
+    more = [t for t in second if (chips and is_map_of_pixels(t)) or (faint and maps and t.chips and t.fall > PROMISING)]
+    return (out + [t for t in more if all(t is not one for one in out)]) or list(second[:1])
 
 
-def best_of(fitted: Sequence[Trial]) -> Trial:
-    """The fitted trial with the most evidence, a map of pixels before another; a pattern that is first, if it has any.
+def best_of(fitted: Sequence[Trial], merit: Callable[[Trial], float], pattern: Trial | None = None) -> Trial:
+    """The fitted trial with the most merit, of equals a map of pixels; a pattern that is significant in a map.
 
     Pixels that differ in addition to a pattern make a map of them the better model, and not the better name.
+
+    Args:
+        merit: the evidence; or what falls with the p-value, where no check fails.
+        pattern: the one that `patterns_first` found, if any.
     """
-    first = fitted[0]
-    if is_pattern(first) and first.evidence >= LEAST_GAIN:
-        return first
-    return max(fitted, key=lambda t: (t.evidence, is_map_of_pixels(t)))
+    if pattern is not None and any(t is pattern for t in fitted):
+        return pattern
+    return max(fitted, key=lambda t: (merit(t), is_map_of_pixels(t)))
 
 
 def judge_maps_by_odd_pixels(

@@ -71,7 +71,7 @@ def not_in_likelihood(sensor: Sensor, capture: Capture) -> str:
     if blur is None:
         return "the stamps"
     width = math.hypot(sensor.tick / math.sqrt(6), blur)
-    lifetimes = {name: lifetime for name, (_, lifetime) in hazards_of(sensor, 1).items()}
+    lifetimes = {name: lifetime for name, (_, lifetime) in hazards_of(sensor, sensor.layout.pixels).items()}
     return next((name for name, lifetime in lifetimes.items() if width > _SHARP * lifetime), "")
 
 

@@ -112,28 +112,42 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
     }
     chance = 1.0 if maps[0].chance is None else maps[0].chance
     doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
-    one_sensor = evaluation.sensors.one
-    designs = {}
+    designs: dict[str, np.ndarray] = {}
     for candidate in (t.candidate for t in patterns if not of_scene(t)):
-        if candidate.per:
-            designs[candidate.name] = _indicators(pixel_maps.groups_of(one_sensor, candidate.per))
-        else:
-            pattern = Effect.registry.find(candidate.effect)
-            with plugins.blaming(pattern):
-                designs[candidate.name] = pattern.light_pattern(one_sensor.layout)
+        with scan.if_possible(candidate, "its pattern"):
+            designs[candidate.name] = _shapes(evaluation.sensors.one, candidate)
+    patterns = [t for t in patterns if of_scene(t) or t.candidate.name in designs]
+    tried = [t for t in tried if not is_pattern(t) or any(t is one for one in patterns)]
     found = pixel_maps.pattern_tests(free, designs)
     chances = {name: p for name, (p, _) in found.items()} | scenes
     real = [t for t in patterns if chances[t.candidate.name] < doubtful]
     dropped = [t for t in patterns if t not in real]
     rest = [t for t in tried if t not in dropped]
-    of_pixels = rest[0].maps is not None and rest[0].candidate.per == "pixel"
-    if real and (rest[0] in maps or rest[0] in real or (scenes and of_pixels)):
+    most = next((t for t in rest if not t.chips), rest[0])  # the squares of random odd pixels are those of more scatter
+    of_pixels = most.maps is not None and most.candidate.per == "pixel"
+    if real and (most in maps or most in real or (scenes and of_pixels)):
         fixed = [t for t in real if not of_scene(t)]
         firsts = [min(fixed, key=lambda t: found[t.candidate.name][1])] if fixed else []
         first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.fall)
         rest.remove(first)
         rest.insert(0, first)
     return rest
+
+
+def _shapes(sensor: Sensor, candidate: Candidate) -> np.ndarray:
+    """The shapes of a pattern over the array, (pixels, shapes): a line for each value, or what its effect declares.
+
+    Raises:
+        EffectError: where a user's effect declares something else.
+    """
+    if candidate.per:
+        return _indicators(pixel_maps.groups_of(sensor, candidate.per))
+    pattern = Effect.registry.find(candidate.effect)
+    with plugins.blaming(pattern):
+        shapes = np.asarray(pattern.light_pattern(sensor.layout), np.float64)
+        if shapes.ndim != 2 or len(shapes) != sensor.layout.pixels or not np.isfinite(shapes).all():
+            raise ValueError(f"light_pattern must be finite and ({sensor.layout.pixels}, shapes), not {shapes.shape}")
+    return shapes
 
 
 def _p_of_scene(
@@ -206,7 +220,8 @@ def unseen_maps(
             sigmas = about * np.exp(math.log(sigmas[1] / sigmas[0]) * np.array([-0.6, -0.3, 0.3, 0.6]))
         if best is None or best.fall < like.evidence / 2:
             continue
-        best.evidence = best.fall if faint else evidence_of(scan.replicates, evaluation, best)
+        with scan.if_possible(candidate, MAKING_A_MAP):
+            best.evidence = best.fall if faint else evidence_of(scan.replicates, evaluation, best)
         if best.evidence > like.evidence - tie(like.evidence):
             out.append(best)
     return out

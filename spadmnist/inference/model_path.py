@@ -98,7 +98,7 @@ class ModelPath:
             steps: those that the model adds.
         """
         left = self.held_out
-        errors = physical_errors(self.replicates, self.evaluation, left)
+        errors = physical_errors(self.replicates, self.evaluation, left, strict=not self.ladder)
         misfit = mean_misfit(self.evaluation.replicate_residuals, left)
         held = [c for c in self.scan.accepted if c.carrier]
         chips = any(step.chips for step in self.steps)

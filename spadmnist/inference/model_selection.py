@@ -34,8 +34,8 @@ from .map_trials import patterns_first, unseen_maps
 from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
 from .replicates import REPLICATES, TOTALS, Replicates
 from .results import Diagnosis, title
-from .score_test import explains_its_signature, p_of_any, p_of_best, sigmas_of
-from .trial import Trial
+from .score_test import explains_its_signature, p_of_any, p_of_best
+from .trial import Trial, is_pattern
 from .trial_fits import fit_trial
 
 MAX_STEPS = 12  # of one diagnosis, by default
@@ -294,7 +294,7 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
     if not second:
         return False
-    worth = worth_fitting(second)
+    worth = worth_fitting(second, faint)
     replicates.say(f"step {number}: fitting " + ", ".join(title(t.candidate) for t in worth))
     fitted = []
     for one in worth:
@@ -309,11 +309,12 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     if faint:
         judge_maps_by_odd_pixels(replicates, path.evaluation, fitted, judged)
         for one in fitted:
-            one.evidence = sigmas_of(judged[id(one)][1]) ** 2
+            one.evidence = judged[id(one)][0] ** 2
         fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
         if not fitted:
             return False
-    best = best_of(fitted)
+    pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_GAIN) else None
+    best = best_of(fitted, lambda t: -judged[id(t)][1] if faint else t.evidence, pattern)
     significance, p = judged[id(best)]
     # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
     if p > least or (best.evidence < LEAST_GAIN and not faint):

@@ -85,7 +85,7 @@ class Swing:
     def suited(
         self, replicates: Replicates, evaluation: Evaluation, times: Sequence[float] = TIMES
     ) -> tuple[float, float, dict[str, float]]:
-        """(gain in chi square, strength, phase of each capture) of the best fit to the data.
+        """(fall of the squares in chi square, strength, phase of each capture) of the best fit to the data.
 
         Args:
             times: strengths to try, relative to the simulated one.
@@ -167,7 +167,7 @@ def _best(
     times: Sequence[float],
     around: Mapping[str, np.ndarray],
 ) -> tuple[float, float, dict[str, float]]:
-    """(gain in chi square, strength, phase of each capture) of the best of some strengths and phases.
+    """(fall of the squares in chi square, strength, phase of each capture) of the best of some strengths and phases.
 
     Args:
         times: strengths.

@@ -32,7 +32,9 @@ CODES = "codes"  # the statistic of the codes
 _PERIODS = (256, 140, 100)  # the periods that `statistics.codes` folds codes with
 # the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law
 GRID, ROUNDS = (-4.0, 8.0, 97), 100
-LEAST_RELIABLE = 0.04  # of the variance of values: estimates that have less of it spread as if they had so much
+# reliability, the share of the variance of values that their estimates have: above the first a value is known well, its
+# spread being too small by 1 %; below the second it spreads as if it had so much, lest noise be blown up five times
+RELIABLE, LEAST_RELIABLE = 0.98, 0.04
 NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
 _FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off
 HALF_95 = 1.96  # standard deviations: half of a 95 % interval
@@ -106,8 +108,8 @@ class PixelMap:
         """Values that differ from each other as the values of the chip do, (groups,), SI; for one sensor with the map.
 
         The means of the posterior, `values`, are the nearest to each true value, and differ less than these do: what is
-        known poorly lies near the middle. Here each deviation from the middle is larger by the root of the reliability
-        of its estimate, and the sum of the values stays. What is known well stays as it is.
+        known poorly lies near the middle. Here the deviations of these from the middle are larger by the inverse root
+        of the reliability of their estimates, and their sum stays. What is known well stays as it is.
         Source: Louis, J. Am. Stat. Assoc. 79 (1984) 393, "Estimating a population of parameter values".
         """
         logs, reliability, most = self.estimate, 1 / (1 + self._pulled), np.full(self.estimate.size, MOST)
@@ -118,8 +120,11 @@ class PixelMap:
             logs, most = np.where(alone, own, logs), np.where(alone, error, most)
             reliability = np.where(alone, apart / np.maximum(apart + error**2, 1e-30), reliability)
         beyond = (logs - median_of(logs)) * (1 / np.sqrt(np.maximum(reliability, LEAST_RELIABLE)) - 1)
-        means, factor = self.values() / self.base, np.exp(np.clip(beyond, -most, most))
-        return np.clip(self.base * means * factor * (means.sum() / (means @ factor)), self.low, self.high)
+        means, poor = self.values(), reliability < RELIABLE
+        factor = np.where(poor, np.exp(np.clip(beyond, -most, most)), 1.0)
+        if poor.any():
+            factor[poor] *= means[poor].sum() / (means[poor] @ factor[poor])
+        return np.clip(means * factor, self.low, self.high)
 
     def _as_wide(self, draw: float) -> np.ndarray:
         """(groups,) factor on the deviation and the variance of each estimate, if the prior had another width.

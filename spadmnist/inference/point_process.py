@@ -69,11 +69,11 @@ def blur_of(sensor: Sensor) -> float | None:
 def hazards_of(sensor: Sensor, pixels: int) -> dict[str, tuple[np.ndarray, float]]:
     """What a detection leaves in its own pixel, by the effect's name; see `Effect.hazard`."""
     found = {}
-    for effect in sensor.effects:
+    for effect in sensor.at("correlated"):
         with plugins.blaming(type(effect)):
-            left = effect.hazard(pixels)
-        if left is not None:
-            found[effect.name] = left
+            if (left := effect.hazard(pixels)) is not None:
+                hazard, time = left
+                found[effect.name] = np.broadcast_to(np.asarray(hazard, np.float64), pixels), float(time)
     return found
 
 

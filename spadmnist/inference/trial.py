@@ -33,8 +33,9 @@ class Trial:
 
     Attributes:
         values: by (effect, parameter), SI.
-        fall: of the squared residuals at the best strength, as the signature predicts, in chi square. It chooses what
-            is fitted. Where no check fails it is the square of the score.
+        fall: of the squared residuals at the best strength, as the signature predicts, in chi square, less 2 for a
+            phase; of a map at least the square of what its own test says. It chooses what is fitted. Where no check
+            fails, the square of the score stands for it until the trial is fitted.
         times: the factor on the strength of `values` at which the fall is largest.
         evidence: of the fitted trial, in chi square, see `evidence`; the one measure by which models are compared.
         phases: fitted to each capture.

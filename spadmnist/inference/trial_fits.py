@@ -189,7 +189,7 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _SWINGING)
     if isinstance(swing, str):
         raise SpadError(swing)
-    one.fall, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
+    _, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in coordinates}}
     mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}
     found = choose_side(replicates, evaluation, one.candidate.phases, one.values, found, mirrored)
@@ -198,6 +198,7 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     one.signature = signature.at(times)
     one.times, one.faint = 1.0, True
     one.residuals = residuals = residuals_at(replicates, evaluation, signature, times)
+    one.fall = square(evaluation.residuals) - square(residuals)
     one.sensors = evaluation.sensors.changed(one.values, one.phases, one.chips)
     aside = [residuals_at(replicates, evaluation, signature, times * math.exp(h)) for h in (_ASIDE, -_ASIDE)]
     # of one strength, or of several that grow together

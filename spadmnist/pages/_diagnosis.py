@@ -124,7 +124,7 @@ def _words(found: Diagnosis, maps: Mapping[int, OddPixels]) -> dict[str, Any]:
         "ladder": ladder,
         "broad": _ladder_picture(ladder, found.null_95, _BROAD) if ladder else None,
         "narrow": _ladder_picture(ladder, found.null_95, _NARROW) if ladder else None,
-        "columns": _COLUMNS,
+        "columns": _columns(ladder),
         "error": results.error_of,
         "fallen": _fallen(found),
         "steps": steps,
@@ -159,9 +159,16 @@ def _fallen(found: Diagnosis) -> tuple[str, float, float] | None:
     if not found.steps or found.before > found.null_95 or len(rows) < 2:
         return None
     first, last = rows[0], rows[-1]
-    most = max(_COLUMNS, key=lambda name: first.get(name, 0.0) - last.get(name, 0.0))
+    names = _columns(found.ladder)
+    most = max(names, key=lambda name: first.get(name, 0.0) - last.get(name, 0.0))
     fell = _HALF * first.get(most, 0.0) > last.get(most, 0.0)
-    return (_COLUMNS[most], first[most], last.get(most, 0.0)) if fell else None
+    return (names[most], first[most], last.get(most, 0.0)) if fell else None
+
+
+def _columns(ladder: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The errors of the ladder and what they are called, those of the user's own statistics last."""
+    every = dict.fromkeys(name for row in ladder for name in row["errors"])
+    return _COLUMNS | {name: name.replace("_", " ") for name in every if name not in _COLUMNS}
 
 
 def _described(effect: str) -> dict[str, Any]:
@@ -613,7 +620,8 @@ was fitted to other data. In sample: to the same.</dd>
 <dt>noise floor</dt><dd>95 of 100 measurements of a right model have a misfit below this.</dd>
 <dt>mean rate, map, linearity, intervals, neighbours</dt><dd>Errors in physical units: the rms error of the captures'
 rates; of the pixels' rates; the largest deviation of one light level from the others; the share of intervals between
-detections in wrong cells; the share of detections whose neighbours fire too often or too seldom.</dd>
+detections in wrong cells; the share of detections whose neighbours fire too often or too seldom. Others are those of
+your own statistics.</dd>
 <dt>95 % interval</dt><dd>It contains the true value in 95 of 100 measurements if the fitted model is right. Where
 checks still fail, or another law is at work, the true value may lie outside.</dd>
 <dt>placebo</dt><dd>An unrelated effect, fitted all the same: as much falls by itself.</dd>

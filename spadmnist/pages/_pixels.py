@@ -55,7 +55,7 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     fitted, carrier, shape = step.map, step.candidate.carrier, found.shape
     if step.candidate.kind != "per_pixel" or fitted is None or carrier is None or shape is None:
         return None
-    values = np.ravel(np.asarray(found.values.get(carrier, ()), np.float64))
+    values = np.ravel(fitted.values())  # the best estimate of each, which the sensor file lets differ more
     if values.size != shape[0] * shape[1] or not np.isfinite(values).all():
         return None
     low, high = odd_pixels(fitted)

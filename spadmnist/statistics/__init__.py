@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from ..recording import Recording
 __all__ = ["LAWS", "Recording", "Statistic", "Summary", "parameter"]
 
 LAWS = ("poisson", "normal", "exponential", "exact")
+OTHER_ERRORS = ("mean_rate", "linearity")  # columns of the error budget that come from the totals of captures
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,15 @@ class Statistic(Plugin, abstract=True):
     pools: ClassVar[tuple[str, ...]] = ()
     named_from: ClassVar[int] = 0  # a deviation in a cell before this one is no more specific than 0
     error: ClassVar[str] = ""  # the name of its `physical_error` in the error budget of a diagnosis; "": it has none
+
+    def __init_subclass__(cls, **keywords: Any):
+        if "error" not in vars(cls):
+            cls.error = ""  # a subclass has a column of its own, or none
+        elif cls.error in OTHER_ERRORS:
+            raise TypeError(f"{cls.__name__}: the error {cls.error!r} is one of no statistic; take another name")
+        elif cls.error and cls.physical_error.__func__ is Statistic.physical_error.__func__:  # type: ignore[attr-defined]
+            raise TypeError(f"{cls.__name__}: with error = {cls.error!r} it must define physical_error")
+        super().__init_subclass__(**keywords)
 
     @classmethod
     def physical_error(
