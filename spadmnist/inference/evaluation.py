@@ -257,10 +257,9 @@ def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Ma
         null, new = evaluation.nulls[cell], other.nulls[cell]
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
         wider = np.broadcast_to(wider, z.shape)
-        error = null.law.error_of_scatter(null.own if np.var(null.own) > np.var(new.own) else new.own)
+        error = null.law.error_of_scatter(z.size, min(len(null.own), len(new.own)))
         moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _SEEN)
         other_scatter = np.abs(wider) > _OTHER_SCATTER * error
-        other_scatter &= 2 * float(np.sum(wider[other_scatter] ** 2)) > _SEEN
         # a cell that never varies has no scatter: the log of its ratio is bounded
         gain = fall - 2 * np.clip(wider, -_WIDEST, _WIDEST)
         out += float(np.sum(gain[moved | other_scatter]))

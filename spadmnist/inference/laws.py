@@ -96,13 +96,9 @@ class Law:
         """The scatter of the cells, in units that another model shares: one number for all, or (cells,)."""
         return np.asarray(spread)
 
-    def error_of_scatter(self, own: np.ndarray) -> float:
-        """The standard error of the log of the ratio of two scatters.
-
-        Args:
-            own: (replicates,) mean squared residual of each replicate, over all cells.
-        """
-        return 1 / math.sqrt(max(len(own) - 1, 1))
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """The standard error of the log of the ratio of two scatters, each of n replicates of as many cells."""
+        return 1 / math.sqrt(max(n - 1, 1))
 
     def template(self, shift: np.ndarray, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
         """A shift in standard deviations, (cells,)."""
@@ -162,9 +158,9 @@ class Scaled(Law):
         """One factor for all cells."""
         return factor
 
-    def error_of_scatter(self, own: np.ndarray) -> float:
-        """All cells inform the factor, dependent ones less than others: their mean squares differ by more."""
-        return float(np.std(own, ddof=1)) / max(float(own.mean()), _LEAST_FREE) / math.sqrt(2 * len(own))
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """All cells inform the factor; that of dependent ones is known less well than this."""
+        return 1 / math.sqrt(max(n * cells - 1, 1))
 
 
 class Poisson(Scaled):
@@ -241,9 +237,9 @@ class Exponential(Scaled):
         """None is needed."""
         return 1.0
 
-    def error_of_scatter(self, own: np.ndarray) -> float:
-        """The mean of exponential powers in each cell."""
-        return math.sqrt(2 / len(own))
+    def error_of_scatter(self, cells: int, n: int) -> float:
+        """The mean of n exponential powers in each cell."""
+        return math.sqrt(2 / n)
 
     def standardized(
         self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int
