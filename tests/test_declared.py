@@ -15,6 +15,7 @@ from spadmnist.inference import pixel_maps
 from spadmnist.inference.error_budget import physical_errors
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_trials import patterns_first
+from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.signature import Signature
 from spadmnist.inference.trial import Trial
 
@@ -62,6 +63,14 @@ def load(folder: Path, text: str, name: str) -> None:
     plugins.load_file(folder / name)
 
 
+def patterns_and_a_map(replicates: Replicates) -> list[Trial]:
+    """Trials of the stripes, of rows, and of a map of the pixels."""
+    falls = {"add stripes": 90.0, "add row_pattern": 80.0, "per_pixel detection.pdp": 70.0}
+    made = [Trial(change_of(replicates, name), {}, Signature({}, {}, {}), fall, 1.0) for name, fall in falls.items()]
+    made[2].maps = {made[2].candidate.carrier: None}  # type: ignore[dict-item]
+    return made
+
+
 def test_the_error_budget_has_a_column_of_a_users_statistic(lab, tmp_path) -> None:
     load(tmp_path, HALVES.replace("RETURNED", "abs(measured[1] - expected[1]) / detections"), "halves.py")
     replicates = bench_of(lab())
@@ -84,12 +93,7 @@ def test_a_statistic_that_fails_there_is_blamed_with_its_line(lab, tmp_path) -> 
 def test_a_map_is_tested_for_the_shapes_that_a_users_pattern_declares(lab, tmp_path, monkeypatch) -> None:
     load(tmp_path, STRIPES, "stripes.py")
     replicates = bench_of(lab(side=4))
-    look, nothing = quiet(replicates), Signature({}, {}, {})
-    stripes, rows, map_ = (
-        Trial(change_of(replicates, name), {}, nothing, fall, 1.0)
-        for name, fall in (("add stripes", 90.0), ("add row_pattern", 80.0), ("per_pixel detection.pdp", 70.0))
-    )
-    map_.maps = {map_.candidate.carrier: None}  # type: ignore[dict-item]
+    look, (stripes, rows, map_) = quiet(replicates), patterns_and_a_map(replicates)
     monkeypatch.setattr(pixel_maps, "acts_on_light", lambda sensor, candidate: True)
     asked: dict[str, np.ndarray] = {}
 
@@ -114,12 +118,7 @@ def test_a_map_is_tested_for_the_shapes_that_a_users_pattern_declares(lab, tmp_p
 def test_a_pattern_with_wrong_shapes_is_left_out_alone(lab, tmp_path, monkeypatch, returned: str, says: str) -> None:
     load(tmp_path, STRIPES.replace("(np.arange(layout.pixels) % 2.0)[:, None]", returned), "stripes.py")
     replicates = bench_of(lab(side=4))
-    look, nothing = quiet(replicates), Signature({}, {}, {})
-    stripes, rows, map_ = (
-        Trial(change_of(replicates, name), {}, nothing, fall, 1.0)
-        for name, fall in (("add stripes", 90.0), ("add row_pattern", 80.0), ("per_pixel detection.pdp", 70.0))
-    )
-    map_.maps = {map_.candidate.carrier: None}  # type: ignore[dict-item]
+    look, (stripes, rows, map_) = quiet(replicates), patterns_and_a_map(replicates)
     monkeypatch.setattr(pixel_maps, "acts_on_light", lambda sensor, candidate: True)
     monkeypatch.setattr(pixel_maps, "pattern_tests", lambda free, designs: dict.fromkeys(designs, (1e-9, 1.0)))
     assert patterns_first(look, evaluate(replicates, {}), [stripes, rows, map_]) == [rows, map_]

@@ -248,7 +248,7 @@ def map_of(raw: np.ndarray, raw_error: float, sigma: float) -> PixelMap:
 
 @pytest.mark.parametrize("raw_error", [0.02, 0.5, 1.0])
 def test_the_values_of_one_sensor_spread_as_the_pixels_do(raw_error: float) -> None:
-    """10,000 logarithms: their spread is told to 0.7 %, of which 5 standard deviations are allowed (6e-7)."""
+    """The spread of 10,000 logarithms has a standard error of 0.7 %. Five of them are allowed (false alarms: 6e-7)."""
     rng, sigma = np.random.Generator(np.random.PCG64(8)), 0.5
     true = sigma * rng.standard_normal(10_000)
     map_ = map_of(true + raw_error * rng.standard_normal(true.size), raw_error, sigma)

@@ -63,7 +63,7 @@ DIMENSIONS = sorted({si for si, _ in SIZES.values()})
 
 def refused(value: object, unit: str = "s") -> str:
     """The sentence with which a value is refused: one line, at once."""
-    with within(5), pytest.raises(ValueError) as caught:
+    with within(1), pytest.raises(ValueError) as caught:
         units.parse(value, unit)
     sentence = str(caught.value)
     assert sentence and "\n" not in sentence

@@ -458,7 +458,7 @@ class Scan:
 def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """The best trial of another shape that was simulated far below its best strength; none where there is no such.
 
-    Noise hides a part of a faint signature, so that its squares fall too little beside those of a strong one.
+    Noise hides a part of a faint signature: the fall that it predicts is too small, that of a strong one is not.
 
     Args:
         best: the best trial of a candidate.
