@@ -23,6 +23,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -210,8 +211,9 @@ def tried(patterns: Sequence[str], seed: int, sample: int | None, jobs: int, num
             tries += [_Try(index, n) for n in ([number] if number is not None else numbers)]
         found: list[list[Lost]] = [[] for _ in _classes]
         random.Random(seed).shuffle(tries)  # so that no worker has all that take long
-        with multiprocessing.get_context("fork").Pool(jobs) as pool:
-            for n, (one, lost) in enumerate(zip(tries, pool.imap(_attempted, tries, chunksize=4), strict=True)):
+        # none of them is ended by SIGTERM: the program's own answer to it is there, and is lost in one just forked
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+            for n, (one, lost) in enumerate(zip(tries, pool.map(_attempted, tries, chunksize=4), strict=True)):
                 if lost:
                     found[one.index].append(lost)
                 if sys.stderr.isatty():
