@@ -338,6 +338,15 @@ def test_the_best_candidate_has_the_most_evidence(lab) -> None:
     assert best(odd, map_) is map_ and best(odd, map_, third) is third
     assert best(map_, rows, pattern=rows) is rows and best(rows, map_) is map_
     assert best(map_, pattern=rows) is map_  # it could not be fitted
+    # in a tie a map is the first before random odd pixels, and before nothing else
+    more = trial("add blinking_dark_counts", 95.0, chips=True)
+
+    def within(margin: float, *fitted: Trial) -> Trial:
+        return best_of(fitted, lambda one: one.evidence, margin=lambda most: margin)
+
+    assert within(10.0, more, map_) is map_ and within(4.0, more, map_) is more
+    assert within(10.0, replace(more, chips=False), map_) is not map_
+    assert within(10.0, more, replace(rows, evidence=94.0)) is more
 
 
 def test_a_light_that_fluctuates_makes_squares_fall_and_has_no_evidence(lab) -> None:

@@ -62,7 +62,7 @@ def optimism(one: Trial) -> float:
         return phases
     if one.fluctuates:  # each capture has drawn another light, so that leaving it out tells nothing of the fit
         return phases + _EACH * len(one.fit.coordinates)
-    return phases + held_out.optimism(one.residuals, one.fit)
+    return phases + held_out.optimism(one.fit.residuals, one.fit)
 
 
 def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
@@ -95,18 +95,27 @@ def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
     return (out + [t for t in more if all(t is not one for one in out)]) or list(second[:1])
 
 
-def best_of(fitted: Sequence[Trial], merit: Callable[[Trial], float], pattern: Trial | None = None) -> Trial:
+def best_of(
+    fitted: Sequence[Trial],
+    merit: Callable[[Trial], float],
+    pattern: Trial | None = None,
+    margin: Callable[[float], float] = lambda merit: 0.0,
+) -> Trial:
     """The fitted trial with the most merit, of equals a map of pixels; a pattern that is significant in a map.
 
-    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name.
+    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name. A map is
+    the first of a tie with random odd pixels: it says which pixels differ and not why.
 
     Args:
         merit: the evidence; or what falls with the p-value, where no check fails.
         pattern: the one that `patterns_first` found, if any.
+        margin: merit of the best -> the difference within which a map is as good as random odd pixels.
     """
     if pattern is not None and any(t is pattern for t in fitted):
         return pattern
-    return max(fitted, key=lambda t: (merit(t), is_map_of_pixels(t)))
+    best = max(fitted, key=lambda t: (merit(t), is_map_of_pixels(t)))
+    maps = [t for t in fitted if is_map_of_pixels(t) and merit(best) - merit(t) < margin(merit(best))]
+    return max(maps, key=merit) if best.chips and maps else best
 
 
 def judge_maps_by_odd_pixels(

@@ -35,7 +35,7 @@ from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharp
 from .replicates import REPLICATES, TOTALS, Replicates
 from .results import Diagnosis, title
 from .score_test import explains_its_signature, p_of_any, p_of_best
-from .trial import Trial, is_pattern
+from .trial import Trial, is_pattern, tie
 from .trial_fits import fit_trial
 
 MAX_STEPS = 12  # of one diagnosis, by default
@@ -314,7 +314,10 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
         if not fitted:
             return False
     pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_GAIN) else None
-    best = best_of(fitted, lambda t: -judged[id(t)][1] if faint else t.evidence, pattern)
+    if faint:
+        best = best_of(fitted, lambda t: -judged[id(t)][1], pattern)
+    else:
+        best = best_of(fitted, lambda t: t.evidence, pattern, tie)
     significance, p = judged[id(best)]
     # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
     if p > least or (best.evidence < LEAST_GAIN and not faint):

@@ -398,7 +398,7 @@ class Scan:
                 further += _faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
                 break
-        best += further
+        best = [replace(one, others=_of_other_shapes(one, tried)) if one.chips else one for one in best + further]
         out: list[Trial] = []
         sizes: dict[int, float] = {}  # of the signature as it was simulated first, by the trial's id
         kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
@@ -466,6 +466,19 @@ def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """
     others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > _BOLDER and t.fall > PROMISING)
     return list(others)[:1]
+
+
+def _of_other_shapes(best: Trial, tried: Sequence[Trial]) -> tuple[Trial, ...]:
+    """The best trial of the same candidate at each other shape.
+
+    Args:
+        tried: all trials, by the fall.
+    """
+    out = {shape_of(best): best}
+    for one in tried:
+        if one.candidate.name == best.candidate.name:
+            out.setdefault(shape_of(one), one)
+    return tuple(out.values())[1:]
 
 
 def _among(tried: Sequence[Trial], candidate: Candidate, values: Mapping[Key, Any]) -> bool:

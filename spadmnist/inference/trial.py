@@ -62,6 +62,7 @@ class Trial:
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     seen: set[str] = field(default_factory=set)  # captures in which it was simulated
     there: Signature | None = None  # the signature at the fitted values
+    others: tuple[Trial, ...] = ()  # of other shapes, where the squares do not tell which shape is best
 
     @property
     def candidates(self) -> list[Candidate]:

@@ -14,6 +14,7 @@ from .coordinates import Coordinate, Key, is_edge, point_of, room_of
 from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_side, simulate_phases
+from .random_pixels import fit_by_own_scatter
 from .replicates import FEW, TOTALS, Replicates
 from .signature import captures_showing, residuals_at, signatures, size_of, template_of
 from .trial import Trial
@@ -84,6 +85,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         found = replace(found, residuals=residuals, square=square(residuals))
     one.fit, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
     one.fall = square(evaluation.residuals) - found.square
+    if one.chips and not one.faint and found.coordinates:
+        return fit_by_own_scatter(replicates, evaluation, one)
     return one
 
 
