@@ -237,6 +237,17 @@ class Effect(Plugin, abstract=True):
         place = layout.centred.T
         return np.stack([*place, (place**2).sum(axis=0)], axis=1)
 
+    def of_pixels(self, hit: np.ndarray) -> dict[str, Any]:
+        """The parameters under which exactly these pixels have the effect, of one that hits pixels at random, by name.
+
+        A diagnosis knows from the counts which pixels were hit, and writes their sensor. Default: none, the pixels of
+        the sensor that it writes are drawn.
+
+        Args:
+            hit: (pixels,) bool.
+        """
+        return {}
+
     def hazard(self, pixels: int) -> tuple[np.ndarray, float] | None:
         """What a detection leaves in its own pixel, for the likelihood of time stamps; None: nothing of this form.
 

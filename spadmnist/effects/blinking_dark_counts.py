@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from .. import kernels
@@ -79,6 +81,10 @@ class BlinkingDarkCounts(Effect, stage="arrival"):
         hit = chip.generator().random(chip.layout.pixels) < self.fraction
         self._added = np.where(hit, self.amplitude, 0.0)
         self._hit = np.flatnonzero(self._added)
+
+    def of_pixels(self, hit: np.ndarray) -> dict[str, Any]:
+        """The amplitude in these pixels, none in the others."""
+        return {"amplitude": np.where(hit, self.amplitude, 0.0), "fraction": 1.0}
 
     @property
     def on(self) -> float:

@@ -101,6 +101,8 @@ def answer(
     replicates = path.replicates
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
     excluded, invisible, unlimited = limits
+    for step in path.steps:
+        step.hit = path.pixels_hit(step)
     unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
     if unexplained and verdict == "unexplained" and path.nearest:
         unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from ..sensor import Sensor
 from .candidates import with_values
@@ -51,6 +52,19 @@ class CountModel:
             return np.asarray(counts * np.log(expected) - expected)
         share = np.clip(expected / self.conditions.frames, 1e-12, 1 - 1e-9)
         return np.asarray(counts * np.log(share) + (self.conditions.frames - counts) * np.log1p(-share))
+
+    def p_of_more(self, expected: np.ndarray) -> np.ndarray:
+        """The p-value of as many counts or more, (pixels,).
+
+        Args:
+            expected: (pixels,) detections.
+        """
+        counts = self.seen.counts
+        assert counts is not None
+        if not self.frames:
+            return np.asarray(stats.poisson.sf(counts - 1, expected))
+        frames = self.conditions.frames
+        return np.asarray(stats.binom.sf(counts - 1, frames, np.minimum(expected / frames, 1.0)))
 
     def saturated(self, counts: np.ndarray) -> bool:
         """Whether half of the pixels have a detection in nearly every frame.

@@ -21,6 +21,7 @@ from .gauss_newton import Fit, error_scale, gauss_newton_step
 from .models import Model
 from .phases import evaluate_start
 from .pixel_maps import HALF_95, map_values
+from .random_pixels import of_pixels, pixels_hit
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value, title
 from .scan import Scan
@@ -107,9 +108,27 @@ class ModelPath:
 
     @property
     def sensor_values(self) -> dict[Key, Any]:
-        """The values of one sensor that stands for the model, SI; a map has the spread of the chip."""
+        """The values of one sensor that stands for the model, SI; its pixels are those of the chip.
+
+        A map has the spread of the chip, and what hits pixels at random is in those that it has hit.
+        """
         maps = {step.candidate.carrier: step.map for step in self.steps if step.candidate.carrier and step.map}
-        return {**self.values, **{key: map_.spread_values() for key, map_ in maps.items() if key in self.values}}
+        values = {**self.values, **{key: map_.spread_values() for key, map_ in maps.items() if key in self.values}}
+        sensor = with_values(self.replicates.start, self.values)
+        for step in self.steps:
+            hit = self.pixels_hit(step)
+            values |= {} if hit is None else of_pixels(sensor, step.candidate.effect, hit)
+        return values
+
+    def pixels_hit(self, step: Step) -> np.ndarray | None:
+        """The pixels of the chip that a step's effect has hit, (pixels,) bool; None where that is not known."""
+
+        def made() -> np.ndarray | None:
+            with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
+                return pixels_hit(self.replicates, self.evaluation, self.values, step.candidate.effect)
+            return None
+
+        return self.evaluation.once(("pixels hit", step.candidate.effect), made) if step.chips else None
 
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""

@@ -13,8 +13,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from .. import plugins
 from ..errors import SpadError
-from .coordinates import Key, point_of
+from ..sensor import Sensor
+from . import count_model
+from .candidates import with_values
+from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
 from .gauss_newton import Fit, gauss_newton_step
 from .models import Model
@@ -25,6 +31,7 @@ from .trial import Trial
 _OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: four share what the worst of a few decides
 _TURNS = 6  # steps at most; from the nearest of the shapes four were enough for dark counts that blink
 _VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise
+_CHANCE = 0.5  # pixels that are taken as hit by chance, in the mean over all: less than one
 _PROMISED = 5.0  # in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian
 
 
@@ -88,3 +95,40 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     one.there, one.residuals = signature, residuals_at(replicates, evaluation, signature)
     one.fall = square(evaluation.residuals) - square(one.residuals)
     return one
+
+
+def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, effect: str) -> np.ndarray | None:
+    """The pixels whose counts show an effect that hits pixels at random, (pixels,) bool; None where it does not say.
+
+    Args:
+        evaluation: of the model with the effect.
+        values: of that model, SI.
+    Raises:
+        SpadError: where a user's effect says something else.
+    """
+    pixels = replicates.start.layout.pixels
+    none = of_pixels(with_values(replicates.start, values), effect, np.zeros(pixels, bool))
+    if not none:
+        return None
+    without = with_values(replicates.start, {**values, **none})
+    levels = count_model.light_levels_of(replicates, evaluation)
+    counted = [id for id, seen in replicates.seen.items() if seen.counts is not None]
+    p = np.ones(pixels)
+    for id in counted:
+        line = count_model.CountModel(replicates, id, levels[id])
+        p = np.minimum(p, len(counted) * line.p_of_more(line.expected(without)))
+    return np.asarray(p < _CHANCE / pixels)
+
+
+def of_pixels(sensor: Sensor, effect: str, hit: np.ndarray) -> dict[Key, Any]:
+    """The values under which an effect of the sensor is in exactly these pixels, SI; none where it does not say them.
+
+    Args:
+        hit: (pixels,) bool.
+    Raises:
+        EffectError: where a user's effect fails.
+    """
+    own = sensor.effect(effect)
+    assert own is not None
+    with plugins.blaming(type(own)):
+        return {(effect, name): value for name, value in own.of_pixels(hit).items()}

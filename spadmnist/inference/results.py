@@ -96,6 +96,14 @@ class Step:
     # (cells, coordinates) by block, where the effect is faint
     jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
+    hit: np.ndarray | None = field(default=None, repr=False)  # (pixels,) bool: which ones an effect has hit at random
+
+    @property
+    def where(self) -> str:
+        """In words, in how many pixels an effect that hits them at random is seen; empty for all else."""
+        if self.hit is None:
+            return ""
+        return f"seen in {self.hit.sum():,} of {self.hit.size:,} pixels, which the sensor file has"
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name} {shown(v)}" for name, v in self.values.items())
@@ -241,6 +249,7 @@ def table(found: Diagnosis) -> str:
         parts = [f"{words.get(name, name)} {shown(v)}" for name, v in step.values.items()]
         text = f"{number}. {title(step.candidate)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
         text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
+        text += f"; {step.where}" if step.where else ""
         lines += textwrap.wrap(text, 100, subsequent_indent="   ")
         but = mimic(step.candidate)
         lines += textwrap.wrap(str(but or ""), 100, initial_indent="   But: ", subsequent_indent="   ")
