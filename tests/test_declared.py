@@ -15,6 +15,7 @@ from spadmnist.inference import pixel_maps
 from spadmnist.inference.error_budget import physical_errors
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_trials import patterns_first
+from spadmnist.inference.mixed_model import PatternEvidence
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.signature import Signature
 from spadmnist.inference.trial import Trial
@@ -97,14 +98,14 @@ def test_a_map_is_tested_for_the_shapes_that_a_users_pattern_declares(lab, tmp_p
     monkeypatch.setattr(pixel_maps, "acts_on_light", lambda sensor, candidate: True)
     asked: dict[str, np.ndarray] = {}
 
-    def tests(free: object, designs: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-        asked.update(designs)
-        return {name: (1e-9, float(design.shape[1])) for name, design in designs.items()}
+    def evidence(free: object, patterns: dict[str, np.ndarray]) -> dict[str, PatternEvidence]:
+        asked.update(patterns)
+        return {name: PatternEvidence(90.0 - pattern.max(), 0.0, 0.0) for name, pattern in patterns.items()}
 
-    monkeypatch.setattr(pixel_maps, "pattern_tests", tests)
+    monkeypatch.setattr(pixel_maps, "evidence_of_patterns", evidence)
     assert patterns_first(look, evaluate(replicates, {}), [stripes, rows, map_]) == [stripes, rows, map_]
     np.testing.assert_array_equal(asked["add stripes"], np.tile([[0.0], [1.0]], (8, 1)))
-    assert asked["add row_pattern"].shape == (16, 3)  # the first of four rows is what the others differ from
+    np.testing.assert_array_equal(asked["add row_pattern"], np.repeat(np.arange(4), 4))  # the row of each pixel
 
 
 @pytest.mark.parametrize(
@@ -120,7 +121,8 @@ def test_a_pattern_with_wrong_shapes_is_left_out_alone(lab, tmp_path, monkeypatc
     replicates = bench_of(lab(side=4))
     look, (stripes, rows, map_) = quiet(replicates), patterns_and_a_map(replicates)
     monkeypatch.setattr(pixel_maps, "acts_on_light", lambda sensor, candidate: True)
-    monkeypatch.setattr(pixel_maps, "pattern_tests", lambda free, designs: dict.fromkeys(designs, (1e-9, 1.0)))
+    clear = PatternEvidence(90.0, 90.0, 0.0)
+    monkeypatch.setattr(pixel_maps, "evidence_of_patterns", lambda free, patterns: dict.fromkeys(patterns, clear))
     assert patterns_first(look, evaluate(replicates, {}), [stripes, rows, map_]) == [rows, map_]
     (entry,) = look.untried
     assert entry["effect"] == "stripes" and re.search(says, entry["why"]) and "stripes.py" in entry["why"]

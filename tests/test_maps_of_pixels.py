@@ -21,7 +21,7 @@ from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.named_fit import fit_named
-from spadmnist.inference.pixel_maps import _DOUBT, PixelMap, pattern_tests
+from spadmnist.inference.pixel_maps import _DOUBT, PixelMap
 from spadmnist.inference.replicates import Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
@@ -166,31 +166,6 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     clear = PixelMap(("a", "b"), 1.0, np.arange(n), raw, np.full(n, 1e-4), raw, np.full(n, 1e-4), sigma)
     draw = rng.standard_normal(n)
     assert clear.values(draw, 2.0) == pytest.approx(clear.values(draw, 0.0), rel=1e-4)
-
-
-@pytest.mark.parametrize("slope", [0.02, 0.25])
-def test_a_gradient_is_a_gradient_and_no_pattern_of_rows(slope: float) -> None:
-    """However clear it is, where both have a p-value of 0; and 15 numbers that do no better than one are no rows."""
-    side, rng = 16, np.random.default_rng(8)
-    y = np.repeat(np.linspace(-0.5, 0.5, side), side)
-    x = np.tile(np.linspace(-0.5, 0.5, side), side)
-    gradient = np.stack([x, y, x**2 + y**2], axis=1)
-    rows = np.eye(side)[np.repeat(np.arange(side), side)][:, 1:]
-    noise, n = 0.004, side**2
-
-    def told(light: np.ndarray) -> dict[str, tuple[float, float]]:
-        raw = np.log(light) + rng.normal(0, noise, n)
-        raw[[5, 100]] = [-3.0, 2.0]  # odd pixels make no pattern
-        map_ = PixelMap(("a", "b"), 1.0, np.arange(n), raw, np.full(n, noise), raw, np.full(n, noise), 0.01)
-        return pattern_tests(map_, {"gradient": gradient, "rows": rows})
-
-    found = told(1 + slope * y)
-    assert found["gradient"][0] < 1e-6 and found["rows"][0] < 1e-6
-    assert found["gradient"][1] < found["rows"][1]
-    found = told(1 + slope * rng.standard_normal(side)[np.repeat(np.arange(side), side)] / 3)
-    assert found["rows"][1] < found["gradient"][1]
-    found = told(np.ones(n))
-    assert min(p for p, _ in found.values()) > 1e-4
 
 
 ANOTHER = """format: spadmnist-measurement/1

@@ -28,7 +28,6 @@ from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_trials import patterns_first
 from spadmnist.inference.model_selection import diagnose
-from spadmnist.inference.pixel_maps import p_of_explained
 from spadmnist.inference.score_test import p_of_map
 from spadmnist.inference.trial import Trial
 from spadmnist.measurement import Measurement
@@ -124,26 +123,6 @@ def test_what_happens_where_no_light_falls_is_no_pattern_of_the_light() -> None:
     maps = {c.name: p_of_map(replicates, evaluation, c, {}, levels) for c in some}
     assert maps["add column_pattern"] > 1e-3 and maps["per_pixel detection.pdp"] > 1e-3
     assert maps["per_pixel dark_counts.rate"] < 1e-6
-
-
-def test_what_numbers_take_from_residuals_is_beyond_what_they_leave() -> None:
-    """p-values of what is chance are even from 0 to 1, and two odd pixels do not hide what is there."""
-    rng = np.random.Generator(np.random.PCG64(3))
-    told = np.stack([rng.exponential(100.0, 200), rng.exponential(30.0, 200)])
-    slopes = np.sqrt(told)
-    shape = slopes + rng.standard_normal((2, 200))  # most where the pixels scatter most
-    chances = []
-    for _ in range(400):
-        z = rng.standard_normal((2, 200)) + slopes * 0.3 * rng.standard_normal(200)
-        wide = np.linalg.inv(np.eye(2) + 0.09 * slopes.T[:, :, None] * slopes.T[:, None, :])
-        times = np.einsum("cp,pcd,dp", shape, wide, z) / np.einsum("cp,pcd,dp", shape, wide, shape)
-        chances.append(p_of_explained(z, z - times * shape, told, 0.3, 1))
-    # by Kolmogorov's law, below 2.7 / sqrt(400) but for once in a million times
-    assert np.max(np.abs(np.sort(chances) - (np.arange(400) + 0.5) / 400)) < 2.7 / 20
-    odd = np.where(np.arange(200) < 2, 500.0, 0.0)
-    z = rng.standard_normal((2, 200)) + slopes * 0.3 * rng.standard_normal(200)
-    assert p_of_explained(z + 0.3 * shape + odd, z + odd, told, 0.3, 1) < 1e-4
-    assert p_of_explained(np.ones((1, 2)), np.ones((1, 2)), np.ones((1, 2)), 0.3, 2) == 1.0
 
 
 # --- whole diagnoses ----------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from spadmnist.inference.evaluation import evaluate, square
 from spadmnist.inference.evidence import evaluation_of, optimism
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.map_trials import patterns_first
+from spadmnist.inference.mixed_model import PatternEvidence
 from spadmnist.inference.model_path import ModelPath, _of_pixels, accept, begin
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step
@@ -125,19 +126,22 @@ def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numb
     )
     map_.maps = {map_.candidate.carrier: None}  # type: ignore[dict-item]
     monkeypatch.setattr("spadmnist.inference.pixel_maps.acts_on_light", lambda sensor, candidate: True)
-    told = {rows.candidate.name: (1e-9, 40.0), gradient.candidate.name: (1e-9, 10.0)}
-    monkeypatch.setattr("spadmnist.inference.pixel_maps.pattern_tests", lambda free, designs: told)
+    told = {
+        rows.candidate.name: PatternEvidence(40.0, 40.0, 0.0),
+        gradient.candidate.name: PatternEvidence(60.0, 60.0, 0.0),
+    }
+    monkeypatch.setattr("spadmnist.inference.pixel_maps.evidence_of_patterns", lambda free, designs: told)
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [gradient, rows, map_]
-    told[gradient.candidate.name] = (0.5, 10.0)  # it does not stand out of the map's scatter
+    told[gradient.candidate.name] = PatternEvidence(3.0, 3.0, 0.0)  # pixels that differ by chance have as much of it
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [rows, map_]
     other = Trial(change_of(replicates, "add crosstalk"), {}, NOTHING, 1000.0, 1.0)
     assert patterns_first(look, evaluation, [other, rows, map_]) == [other, rows, map_]
-    # what one map in a thousand has of rows is none where the map itself is far beyond chance: a few odd pixels
-    told[rows.candidate.name], map_.chance = (9e-4, 40.0), 6e-10
+    # a little of rows is none where the map itself is far beyond chance: a few odd pixels
+    told[rows.candidate.name], map_.chance = PatternEvidence(8.0, 8.0, 0.0), 6e-10
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [map_]
-    map_.chance = 1e-4  # a map that rows make is no more likely than they
+    map_.chance = 1e-4  # a map that rows make has no more evidence than they
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [rows, map_]
-    told[rows.candidate.name], map_.chance = (1e-5, 40.0), 1e-30  # pixels that differ, and rows
+    told[rows.candidate.name], map_.chance = PatternEvidence(18.0, 18.0, 0.0), 1e-30  # pixels that differ, and rows
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [rows, map_]
 
 

@@ -17,9 +17,11 @@ from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
 from .evidence import evidence_of
+from .levels import LEAST_GAIN
+from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
 from .replicates import Replicates
-from .score_test import PIXELS, p_of_map
+from .score_test import PIXELS, p_of_map, sigmas_of
 from .signature import Signature, residuals_at, signatures, template_of
 from .trial import Trial, is_pattern, of_scene, tie
 
@@ -33,9 +35,6 @@ LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS = 1e-3, 0.05
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)
 _TOLD = 50.0  # information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
 _LIKE = 0.4  # cosine of two signatures: below it they are not alike
-# p-values of a pattern in a map: of a significant one, and of one for which the p-value of the map is irrelevant
-_STANDS_OUT, _NO_DOUBT = 1e-3, 1e-4
-_MAYBE = 100.0  # times the p-value of the map: a pattern below it is significant, too
 # the least width of a map that is tried, and its least mean square relative to its noise
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05
 
@@ -91,9 +90,9 @@ def candidate_maps(scan: Scan, evaluation: Evaluation) -> list[Candidate]:
 
 
 def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> list[Trial]:
-    """The trials, a pattern first where it is significant in the map; patterns that are not are dropped.
+    """The trials, a pattern first where it has evidence beside pixels that differ; patterns without it are dropped.
 
-    A few random odd pixels may lie in a row, if seldom. A pattern whose p-value is far above that of the map is none.
+    A few random odd pixels may lie in a row, if seldom: no pattern. One that says as much as the map stays, too.
     """
     maps = [
         t
@@ -105,43 +104,45 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
         return tried
     assert maps[0].maps is not None
     free = maps[0].maps[maps[0].candidate.carrier]  # type: ignore[index]
-    scenes = {
-        t.candidate.name: _p_of_scene(scan.replicates, evaluation, t, maps[0].candidate, free)
-        for t in patterns
-        if of_scene(t)
-    }
-    chance = 1.0 if maps[0].chance is None else maps[0].chance
-    doubtful = min(_STANDS_OUT, max(_MAYBE * chance, _NO_DOUBT))
-    designs: dict[str, np.ndarray] = {}
-    for candidate in (t.candidate for t in patterns if not of_scene(t)):
-        with scan.if_possible(candidate, "its pattern"):
-            designs[candidate.name] = _shapes(evaluation.sensors.one, candidate)
-    patterns = [t for t in patterns if of_scene(t) or t.candidate.name in designs]
-    tried = [t for t in tried if not is_pattern(t) or any(t is one for one in patterns)]
-    found = pixel_maps.pattern_tests(free, designs)
-    chances = {name: p for name, (p, _) in found.items()} | scenes
-    real = [t for t in patterns if chances[t.candidate.name] < doubtful]
-    dropped = [t for t in patterns if t not in real]
-    rest = [t for t in tried if t not in dropped]
+    evidence: dict[str, PatternEvidence] = {}
+    shapes: dict[str, np.ndarray] = {}
+    for one in patterns:
+        with scan.if_possible(one.candidate, "its pattern"):
+            if of_scene(one):
+                evidence[one.candidate.name] = _evidence_of_scene(
+                    scan.replicates, evaluation, one, maps[0].candidate, free
+                )
+            else:
+                shapes[one.candidate.name] = _shapes(evaluation.sensors.one, one.candidate)
+    evidence |= pixel_maps.evidence_of_patterns(free, shapes)
+    chance = maps[0].chance  # odd pixels, which the mixed model cuts off, are in it
+
+    def is_real(e: PatternEvidence) -> bool:
+        own = math.inf if chance is None else max(sigmas_of(chance) ** 2, e.pixels)
+        return e.beside >= LEAST_GAIN or (own < math.inf and e.alone > own - tie(own))
+
+    real = [t for t in patterns if is_real(evidence.get(t.candidate.name, NO_PATTERN))]
+    rest = [t for t in tried if not is_pattern(t) or any(t is one for one in real)]
+    if not rest:
+        return rest
     most = next((t for t in rest if not t.chips), rest[0])  # the squares of random odd pixels are those of more scatter
     of_pixels = most.maps is not None and most.candidate.per == "pixel"
+    scenes = any(of_scene(t) for t in patterns)
     if real and (most in maps or most in real or (scenes and of_pixels)):
-        fixed = [t for t in real if not of_scene(t)]
-        firsts = [min(fixed, key=lambda t: found[t.candidate.name][1])] if fixed else []
-        first = max([*firsts, *(t for t in real if of_scene(t))], key=lambda t: t.fall)
+        first = max(real, key=lambda t: evidence[t.candidate.name].beside)
         rest.remove(first)
         rest.insert(0, first)
     return rest
 
 
 def _shapes(sensor: Sensor, candidate: Candidate) -> np.ndarray:
-    """The shapes of a pattern over the array, (pixels, shapes): a line for each value, or what its effect declares.
+    """The shapes of a pattern over the array, (pixels, shapes), as its effect declares them; or the line of each pixel.
 
     Raises:
         EffectError: where a user's effect declares something else.
     """
     if candidate.per:
-        return _indicators(pixel_maps.groups_of(sensor, candidate.per))
+        return pixel_maps.groups_of(sensor, candidate.per)
     pattern = Effect.registry.find(candidate.effect)
     with plugins.blaming(pattern):
         shapes = np.asarray(pattern.light_pattern(sensor.layout), np.float64)
@@ -150,13 +151,10 @@ def _shapes(sensor: Sensor, candidate: Candidate) -> np.ndarray:
     return shapes
 
 
-def _p_of_scene(
+def _evidence_of_scene(
     replicates: Replicates, evaluation: Evaluation, one: Trial, candidate: Candidate, free: pixel_maps.PixelMap
-) -> float:
-    """The p-value of a change of the scene, by what it takes from the residuals of the pixels.
-
-    Its effect on a pixel depends on the scene around it, so that no shape over the array stands for it; and a map of
-    the light is not informed where no light falls.
+) -> PatternEvidence:
+    """The evidence for a change of the scene; a map of the light is not informed where no light falls.
 
     Args:
         candidate, free: the map of pixels that it is compared with, and its fit.
@@ -167,7 +165,7 @@ def _p_of_scene(
     information = map_models.information(replicates, evaluation.values, candidate, levels)
     z, left = (np.stack([x[id, PIXELS] for id in ids]) for x in (evaluation.residuals, after))
     known = np.stack([information[id] for id in ids])
-    return pixel_maps.p_of_explained(z, left, known, free.sigma, len(one.candidate.coordinates))
+    return evidence_of_scene(z, left, known, free.sigma, len(one.candidate.coordinates))
 
 
 def unseen_maps(
@@ -247,8 +245,3 @@ def _with_random_map(sensors: Model, candidate: Candidate, sigma: float) -> Mode
         return with_values(sensor, {(effect, parameter): values * draws})
 
     return Model(of, sensors.one, alike=False, typical=sensors.usual)
-
-
-def _indicators(groups: np.ndarray) -> np.ndarray:
-    one = np.eye(int(groups.max()) + 1)[groups]
-    return np.asarray(one[:, 1:])

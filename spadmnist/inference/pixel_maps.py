@@ -11,9 +11,10 @@ from scipy import special, stats
 
 from ..effects import Effect
 from ..sensor import Sensor
-from . import blind_times
+from . import blind_times, mixed_model
 from .candidates import Candidate
 from .coordinates import Key
+from .mixed_model import PatternEvidence
 from .results import Value
 
 TAILS = 3.0  # degrees of freedom of the prior
@@ -36,7 +37,6 @@ GRID, ROUNDS = (-4.0, 8.0, 97), 100
 # spread being too small by 1 %; below the second it spreads as if it had so much, lest noise be blown up five times
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
 NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
-_FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off
 HALF_95 = 1.96  # standard deviations: half of a 95 % interval
 
 
@@ -236,36 +236,16 @@ def summary(map_: PixelMap) -> dict[str, float]:
     }
 
 
-def pattern_tests(map_: PixelMap, designs: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    """The test of each pattern in a map over pixels, by name: (p-value, Schwarz criterion).
-
-    The p-value is that of an F test of the pattern against the scatter of the rest. The criterion compares patterns
-    that are all significant (Schwarz, Ann. Statist. 6, 1978).
+def evidence_of_patterns(map_: PixelMap, patterns: dict[str, np.ndarray]) -> dict[str, PatternEvidence]:
+    """The evidence for each pattern in a map over pixels, by name; see `mixed_model`.
 
     Args:
-        designs: (pixels, k) columns of each pattern, without the mean.
+        patterns: (pixels, shapes), or the group of each pixel, (pixels,).
     """
-    y = np.exp(np.clip(map_.raw[map_.informed], -MOST, MOST))
-    if y.size < 3:
-        return dict.fromkeys(designs, (1.0, 0.0))
-    middle, width = median_of(y), 1.4826 * median_of(np.abs(y - median_of(y)))
-    y = np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)  # odd pixels do not make a pattern
-    out = {}
-    ones = np.ones((len(y), 1))
-    for name, design in designs.items():
-        design = design[map_.informed]
-        full = np.linalg.lstsq(np.hstack([ones, design]), y, rcond=None)[0]
-        left = y - np.hstack([ones, design]) @ full
-        k = np.linalg.matrix_rank(np.hstack([ones, design])) - 1
-        free = len(y) - k - 1
-        if free < 1:  # the columns of a line are its pixels: no pattern, but the map itself
-            out[name] = 1.0, math.inf
-            continue
-        explained = float(((y - y.mean()) ** 2).sum() - (left**2).sum())
-        square = max(float((left**2).sum()), 1e-30)
-        p = float(stats.f.sf(explained / max(k, 1) / (square / free), k, free))
-        out[name] = p, len(y) * math.log(square) + k * math.log(len(y))
-    return out
+    some = map_.informed
+    y = np.exp(np.clip(map_.raw[some], -MOST, MOST))
+    error = map_.raw_error[some] * (median_of(y) if y.size else 1.0)
+    return mixed_model.evidence_of_patterns(y, error, {name: x[some] for name, x in patterns.items()})
 
 
 def spread_p(map_: PixelMap) -> float:
@@ -318,34 +298,3 @@ def map_values(map_: PixelMap) -> dict[str, Value]:
     if math.isfinite(error):  # without low pixels there is no ratio
         results["low_ratio"] = Value(ratio, max(ratio - HALF_95 * error, 0.0), ratio + HALF_95 * error)
     return results
-
-
-def p_of_explained(
-    before: np.ndarray, after: np.ndarray, information: np.ndarray, sigma: float, parameters: int
-) -> float:
-    """The p-value of what some parameters take from the residuals of pixels: an F test against the rest.
-
-    Pixels that differ by themselves, by `sigma`, are a random effect: residuals are first whitened for it.
-
-    Args:
-        before, after: (captures, pixels) residuals without and with the parameters.
-        information: (captures, pixels) squared slope of a residual on the logarithm of its pixel's value.
-        sigma: standard deviation of a logarithm.
-        parameters: their number.
-    """
-    z, left = (_whitened(x, np.sqrt(information), sigma).ravel() for x in (before, after))
-    free = z.size - parameters
-    if free < 1:
-        return 1.0
-    middle = median_of(z)
-    far = _FAR_OFF * max(1.4826 * median_of(np.abs(z - middle)), 1.0)
-    z, left = (np.clip(x, middle - far, middle + far) for x in (z, left))  # as of odd pixels in `pattern_tests`
-    square = max(float(left @ left), 1e-30)
-    return float(stats.f.sf((float(z @ z) - square) / parameters / (square / free), parameters, free))
-
-
-def _whitened(z: np.ndarray, sensitivity: np.ndarray, sigma: float) -> np.ndarray:
-    """(captures, pixels) residuals of unit variance, independent although each pixel differs by `sigma`."""
-    square = (sensitivity**2).sum(axis=0)
-    along = (sensitivity * z).sum(axis=0) / np.maximum(square, 1e-300)
-    return np.asarray(z - sensitivity * along * (1 - 1 / np.sqrt(1 + sigma**2 * square)))

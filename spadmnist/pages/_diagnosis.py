@@ -417,7 +417,9 @@ that scatter (sigmas); coloured lines are the residuals before of further captur
 <section class="card">
 <h3>{{ loop.index }}. {{ card.title }}</h3>
 <p class="tag">{{ card.kind }} &middot; <b>{{ "%.1f" | format(card.step.significance) }} sigma</b> &middot; \
-<b>{{ card.step.material }}</b>{% if card.step.where %} &middot; {{ card.step.where }}{% endif %} &middot; misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
+<b>{{ card.step.material }}</b> &middot; \
+{% if card.step.where %}{{ card.step.where }} &middot; {% endif %}\
+misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 {% if card.about %}<p>{{ card.about }}</p>{% endif %}
 <div class="pair">
 {% if card.numbers %}

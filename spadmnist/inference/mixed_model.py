@@ -1,0 +1,181 @@
+"""Pixels that differ at random and patterns over the array, in one linear mixed model.
+
+    y = mu + X b + u_group + u_pixel + e
+
+y: the light that each pixel sees or detects, relative to the others; X: shapes of a pattern with fixed coefficients b;
+u_group: one random effect for each row or column; u_pixel: one for each pixel; e: noise of known variance. The
+variances of the random effects and b are those of maximum likelihood. So patterns are compared with each other, and
+with pixels that differ in addition, by one evidence: twice the log-likelihood ratio less two for each parameter.
+Source: Laird and Ware, Biometrics 38 (1982) 963; Akaike, IEEE Trans. Autom. Control 19 (1974) 716.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+_FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off: odd pixels make no pattern
+_EACH = 2.0  # in chi square: the price of a parameter
+_LEAST = 1e-3  # of the noise: the least standard deviation of a random effect, which is none
+_STARTS = (0.1, 1.0)  # of the spread of all values: standard deviations of a group at which a search starts
+_LEAST_PIXELS = 3  # fewer have no pattern
+
+
+@dataclass(frozen=True)
+class PatternEvidence:
+    """The evidence for a pattern, in chi square.
+
+    Attributes:
+        beside: where pixels differ at random: of both, over these alone.
+        alone: over pixels that are all alike.
+        pixels: for pixels that differ at random, over pixels that are all alike.
+    """
+
+    beside: float
+    alone: float
+    pixels: float
+
+
+NO_PATTERN = PatternEvidence(-math.inf, -math.inf, 0.0)
+
+
+def _clipped(y: np.ndarray) -> np.ndarray:
+    """The values, those far from most of them cut off."""
+    middle = float(np.median(y))
+    width = 1.4826 * float(np.median(np.abs(y - middle)))
+    return np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)
+
+
+def evidence_of_patterns(
+    y: np.ndarray, error: np.ndarray, patterns: Mapping[str, np.ndarray]
+) -> dict[str, PatternEvidence]:
+    """The evidence for each of some patterns in the values of pixels, by name.
+
+    Args:
+        y: (pixels,) relative values, odd ones included.
+        error: (pixels,) standard deviation of their noise.
+        patterns: (pixels, shapes) of float, with fixed coefficients, without the mean; or (pixels,) of int, the group
+            of each pixel, with a random effect for each group.
+    """
+    if y.size < _LEAST_PIXELS:
+        return dict.fromkeys(patterns, NO_PATTERN)
+    y, noise = _clipped(y), np.maximum(error, 1e-12) ** 2
+    ones = np.ones((y.size, 1))
+    nothing, differ = (_most_likely(y, noise, ones, None, pixels) for pixels in (False, True))
+    out = {}
+    for name, pattern in patterns.items():
+        groups = np.unique(pattern, return_inverse=True)[1] if pattern.ndim == 1 else None
+        if groups is not None and np.bincount(groups).max() == 1:
+            out[name] = NO_PATTERN  # each group is a pixel: the map itself
+            continue
+        design = ones if groups is not None else np.hstack([ones, pattern])
+        number = 1 if groups is not None else int(np.linalg.matrix_rank(design)) - 1
+        alone, both = (_most_likely(y, noise, design, groups, pixels) for pixels in (False, True))
+        price = _EACH * number
+        out[name] = PatternEvidence(
+            2 * (both - differ) - price, 2 * (alone - nothing) - price, 2 * (differ - nothing) - _EACH
+        )
+    return out
+
+
+def evidence_of_scene(
+    before: np.ndarray, after: np.ndarray, information: np.ndarray, sigma: float, parameters: int
+) -> PatternEvidence:
+    """The evidence for what changes the scene, by what its parameters take from the residuals of pixels.
+
+    Its effect on a pixel depends on the scene around it, so that no shape over the array stands for it. Pixels that
+    differ by themselves, by `sigma`, are a random effect, for which the residuals are whitened; the scatter of what is
+    left is the noise.
+
+    Args:
+        before, after: (captures, pixels) residuals without and with the parameters.
+        information: (captures, pixels) squared slope of a residual on the logarithm of its pixel's value.
+        sigma: standard deviation of a logarithm.
+        parameters: their number.
+    """
+    z, left = (_whitened(x, np.sqrt(information), sigma).ravel() for x in (before, after))
+    if z.size <= parameters:
+        return NO_PATTERN
+    middle = float(np.median(z))
+    far = _FAR_OFF * max(1.4826 * float(np.median(np.abs(z - middle))), 1.0)
+    z, left = (np.clip(x, middle - far, middle + far) for x in (z, left))
+    square = max(float(left @ left), 1e-30)
+    fall = (float(z @ z) - square) / (square / (z.size - parameters))
+    return PatternEvidence(fall - _EACH * parameters, -math.inf, 0.0)
+
+
+def _whitened(z: np.ndarray, sensitivity: np.ndarray, sigma: float) -> np.ndarray:
+    """(captures, pixels) residuals of unit variance, independent although each pixel differs by `sigma`."""
+    square = (sensitivity**2).sum(axis=0)
+    along = (sensitivity * z).sum(axis=0) / np.maximum(square, 1e-300)
+    return np.asarray(z - sensitivity * along * (1 - 1 / np.sqrt(1 + sigma**2 * square)))
+
+
+def _most_likely(
+    y: np.ndarray, noise: np.ndarray, design: np.ndarray, groups: np.ndarray | None, pixels: bool
+) -> float:
+    """The largest log-likelihood over the variances of the random effects, and over the fixed coefficients.
+
+    Args:
+        noise: (pixels,) variances.
+        design: (pixels, k) with the mean.
+        groups: (pixels,) of int, with random effects; None without.
+        pixels: with a random effect of each pixel.
+    """
+    spread = max(float(np.std(y)), 1e-12)
+    low = math.log(_LEAST * math.sqrt(float(np.median(noise))))
+    high = math.log(2 * spread + math.exp(low))
+    free = pixels + (groups is not None)
+
+    def cost(logs: np.ndarray) -> float:
+        variances = [math.exp(2 * min(max(float(x), low), high)) for x in logs]
+        of_pixel = variances.pop(0) if pixels else 0.0
+        return -_log_likelihood(y, noise + of_pixel, design, groups, variances.pop() if variances else 0.0)
+
+    if not free:
+        return -cost(np.zeros(0))
+    if free == 1:
+        grid = np.linspace(low, high, 25)
+        best = grid[int(np.argmin([cost(np.array([x])) for x in grid]))]
+        ends = best - (grid[1] - grid[0]), best + (grid[1] - grid[0])
+        found = optimize.minimize_scalar(lambda x: cost(np.array([x])), bounds=ends, method="bounded")
+        return -float(min(found.fun, cost(np.array([low]))))
+    falls = [
+        optimize.minimize(cost, np.log([spread, start * spread]), method="Nelder-Mead", options={"maxiter": 200})
+        for start in _STARTS
+    ]
+    # without either effect, too: no search ends at a bound
+    edges = [_most_likely(y, noise, design, groups, False), _most_likely(y, noise, design, None, True)]
+    return max([-float(found.fun) for found in falls] + edges)
+
+
+def _log_likelihood(
+    y: np.ndarray, variance: np.ndarray, design: np.ndarray, groups: np.ndarray | None, of_group: float
+) -> float:
+    """The log-likelihood at the best fixed coefficients, up to a constant.
+
+    Args:
+        variance: (pixels,) of noise and pixels together.
+        of_group: variance of the random effect of a group.
+    """
+    which = np.zeros(y.size, np.int64) if groups is None else groups
+    precision = np.bincount(which, 1 / variance)
+    shrink = of_group / (1 + of_group * precision)
+
+    def weighed(x: np.ndarray) -> np.ndarray:
+        """The inverse covariance times the columns, (pixels, columns)."""
+        scaled = x / variance[:, None]
+        if groups is None:
+            return scaled
+        sums = np.stack([np.bincount(which, column, precision.size) for column in scaled.T], axis=1)
+        return np.asarray(scaled - (shrink[:, None] * sums)[which] / variance[:, None])
+
+    of_design = weighed(design)
+    coefficients = np.linalg.lstsq(design.T @ of_design, of_design.T @ y, rcond=None)[0]
+    left = y - design @ coefficients
+    determinant = float(np.log(variance).sum() + np.log1p(of_group * precision).sum() * (groups is not None))
+    return -0.5 * (determinant + float(left @ weighed(left[:, None])[:, 0]))
