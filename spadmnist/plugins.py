@@ -69,6 +69,7 @@ class Parameter:
     needs: str = ""  # the parameter without which this one does nothing
     later: bool = False  # datasets of earlier programs do not name it
     kind: str = ""  # how a search and a fit move it (see `KINDS`); "" until its class is made
+    informed_by: str = ""  # the statistic that tells its value in each pixel; "": the counts
     name: str = ""
 
     @property
@@ -119,6 +120,7 @@ def parameter(
     needs: str = "",
     later: bool = False,
     kind: str = "",
+    informed_by: str = "",
 ) -> Any:
     """Declare a parameter in the body of a plug-in's class.
 
@@ -129,7 +131,8 @@ def parameter(
     table over the wavelength. choices: the words that are allowed, where it is no number. needs: another parameter,
     without which this one does nothing. later: datasets have been made with this effect before it had this parameter,
     whose default does what was done then: a manifest names it only where it has another value. kind: how a search and a
-    fit move it, one of `KINDS`; default: what `_kind_of` makes of the unit.
+    fit move it, one of `KINDS`; default: what `_kind_of` makes of the unit. informed_by: the statistic whose
+    `unit_likelihood` tells the value in each pixel, for maps; default: the counts of the pixels.
     """
     per = "pixel" if per_pixel else per
     if per not in PER:
@@ -140,11 +143,13 @@ def parameter(
         raise TypeError(f"{unit!r} is not an SI unit that is known here")
     if kind not in ("", *KINDS):
         raise TypeError(f"{kind!r} is none of the kinds {', '.join(KINDS)}")
+    if informed_by and per != "pixel":
+        raise TypeError(f"{about}: informed_by is of maps over pixels: give per_pixel=True")
     if later and required:
         raise TypeError(f"{about}: it came later, so that old configs lack it: it cannot be required")
     return Parameter(
         *(default, unit, about, symbol, bounds, open_bounds, off, search, per),
-        *(by_wavelength, choices, required, needs, later, kind),
+        *(by_wavelength, choices, required, needs, later, kind, informed_by),
     )
 
 

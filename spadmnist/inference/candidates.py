@@ -52,6 +52,7 @@ class Candidate:
     carrier: Key | None = None  # of a map: the parameter that holds it
     relative: bool = False  # the map multiplies
     blinds: bool = False  # a map of dead times: the shortest intervals inform it, the counts do not
+    informed_by: str = ""  # the statistic that informs a map instead of the counts
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -194,8 +195,11 @@ def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[C
         key = effect.name, carrier
         if isinstance(at, (ByWavelength, bool)) or key in fitted:
             continue
-        blinds = declared.kind in ("time", "edge") and _blinds(sensor, key, value)
-        yield Candidate("per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds)
+        blinds = not declared.informed_by and declared.kind in ("time", "edge") and _blinds(sensor, key, value)
+        own = declared.informed_by
+        yield Candidate(
+            "per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds, informed_by=own
+        )
 
 
 def maps_beside(sensor: Sensor, start: Sensor) -> list[Key]:

@@ -44,6 +44,7 @@ from .pixel_maps import (
 )
 from .point_process import blur_of
 from .replicates import Replicates
+from .statistic_maps import fit_by_statistic
 
 # Logarithms of a parameter relative to the array, unless another unit is named. Those of an iteration decide how fast a
 # fit moves, not where it ends. They are rules of thumb: no measurement that is kept chose them.
@@ -68,7 +69,8 @@ def base_of(sensor: Sensor, candidate: Candidate) -> float:
     return float(off if off is not None else 1.0)
 
 
-def _bounds_of(carrier: Key) -> tuple[float, float]:
+def bounds_of(carrier: Key) -> tuple[float, float]:
+    """The least and the largest value of a parameter, SI."""
     low, high = Effect.registry.find(carrier[0]).parameters[carrier[1]].bounds
     return 0.0 if low is None else low, math.inf if high is None else high
 
@@ -116,7 +118,7 @@ class _Fitted:
             candidate,
             base if base > 0 else float((declared.scan or (1e-3, 1))[0]),
             group,
-            *_bounds_of(candidate.carrier),
+            *bounds_of(candidate.carrier),
             acts_on_light(start, candidate),
             logs=np.zeros(size),
             variance=np.ones(size),
@@ -237,6 +239,11 @@ def fit_maps(
     out |= {
         c.carrier: fit_blind_times(replicates, values, c, use) for c in wanted if c.blinds and c.carrier is not None
     }
+    for c in wanted:
+        if c.informed_by and c.carrier is not None:
+            start = with_values(replicates.start, {k: v for k, v in values.items() if k != c.carrier})
+            bounds = bounds_of(c.carrier)
+            out[c.carrier] = fit_by_statistic(replicates, values, c, base_of(start, c), bounds, use)
     wanted = [c for c in wanted if by_counts(c)]
     if not wanted:
         return out
@@ -470,7 +477,7 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     weights /= weights.sum(axis=1, keepdims=True)
     estimate, error = mean_of(weights, grid)
     raw, raw_error = mean_of(likely, grid)
-    low, high = _bounds_of(candidate.carrier)
+    low, high = bounds_of(candidate.carrier)
     map_ = PixelMap(
         candidate.carrier, base, groups_of(start, candidate.per), estimate, error, raw, raw_error, width.sigma
     )

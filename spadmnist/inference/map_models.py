@@ -9,10 +9,11 @@ import numpy as np
 
 from ..errors import SpadError
 from ..sensor import Sensor
+from . import statistic_maps
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
 from .count_model import CountModel
-from .map_fits import base_of, fit_maps
+from .map_fits import base_of, bounds_of, fit_maps
 from .models import Model
 from .pixel_maps import ALONE, CODES, PixelMap, groups_of, spread_p
 from .replicates import Replicates
@@ -31,8 +32,12 @@ def information(
     """
     if candidate.per == "code":
         return {id: np.array([seen.total * (CODES in seen.summaries)]) for id, seen in replicates.seen.items()}
-    assert candidate.carrier is not None
     pixels = replicates.start.layout.pixels
+    assert candidate.carrier is not None
+    if candidate.informed_by:
+        start = with_values(replicates.start, {k: v for k, v in values.items() if k != candidate.carrier})
+        bounds = bounds_of(candidate.carrier)
+        return statistic_maps.information(replicates, values, candidate, base_of(start, candidate), bounds)
     if candidate.blinds:
         base = base_of(
             with_values(replicates.start, {k: v for k, v in values.items() if k != candidate.carrier}), candidate

@@ -205,7 +205,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             low, high = ends.get((step.candidate.effect, name), (value.low, value.high))
             how = "simulation"
             if step.candidate.carrier:
-                how = "intervals" if step.candidate.blinds else "counts"
+                how = step.candidate.informed_by or ("intervals" if step.candidate.blinds else "counts")
             step.values[name] = replace(value, low=low, high=high, method=how)
 
 

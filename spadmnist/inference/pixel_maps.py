@@ -271,7 +271,7 @@ def code_periods(cells: int) -> dict[int, slice]:
 
 def by_counts(candidate: Candidate) -> bool:
     """Whether the counts of the pixels inform a map."""
-    return candidate.per != "code" and not candidate.blinds
+    return candidate.per != "code" and not candidate.blinds and not candidate.informed_by
 
 
 def acts_on_light(sensor: Sensor, candidate: Candidate) -> bool:

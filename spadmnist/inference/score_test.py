@@ -22,6 +22,7 @@ from .evaluation import Evaluation, stacked
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, signatures, template_of
 from .spectral_lines import Line
+from .statistic_maps import p_of_width
 from .trial import Trial, shape_of
 
 LEAST_P = 1e-300  # a p-value is never 0
@@ -340,6 +341,12 @@ def p_of_map(
         information = map_models.information(replicates, values, candidate, levels)
     except (SpadError, np.linalg.LinAlgError):
         return 1.0
+    if candidate.informed_by:
+        try:
+            fitted = map_fits.fit_maps(replicates, values, [candidate], levels)
+        except SpadError:
+            return 1.0
+        return p_of_width(fitted[candidate.carrier])  # type: ignore[index]
     if candidate.blinds:
         return _p_of_blind_times(replicates, evaluation, candidate, values, information)
     name = pixel_maps.CODES if candidate.per == "code" else PIXELS

@@ -10,14 +10,17 @@ the level is not known exactly: what is left of it is taken out by regression on
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
 from ..plugins import Plugin, Registry, parameter
 from ..recording import Recording
+
+if TYPE_CHECKING:
+    from ..sensor import Sensor
 
 __all__ = ["LAWS", "Recording", "Statistic", "Summary", "parameter"]
 
@@ -101,6 +104,17 @@ class Statistic(Plugin, abstract=True):
             measured, expected: (cells,) in the unit of the statistic.
             residuals: (cells,) standard deviations.
             detections: of the capture.
+        """
+        raise NotImplementedError
+
+    def unit_likelihood(self, recording: Recording, sensors: Sequence[Sensor]) -> np.ndarray:
+        """The log-likelihood of what each pixel recorded, (pixels, sensors), each row up to a constant.
+
+        For maps of a parameter that is `informed_by` this statistic. The captures are those that `reduce` gives a
+        summary of.
+
+        Args:
+            sensors: models that differ in the value of that parameter, which is the same in all pixels of each.
         """
         raise NotImplementedError
 
