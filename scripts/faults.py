@@ -213,11 +213,15 @@ def tried(patterns: Sequence[str], seed: int, sample: int | None, jobs: int, num
         random.Random(seed).shuffle(tries)  # so that no worker has all that take long
         # none of them is ended by SIGTERM: the program's own answer to it is there, and is lost in one just forked
         with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
-            for n, (one, lost) in enumerate(zip(tries, pool.map(_attempted, tries, chunksize=4), strict=True)):
-                if lost:
-                    found[one.index].append(lost)
-                if sys.stderr.isatty():
-                    print(f"\r{n + 1} of {len(tries)}, {sum(map(len, found))} lost", end="", file=sys.stderr)
+            try:
+                for n, (one, lost) in enumerate(zip(tries, pool.map(_attempted, tries, chunksize=4), strict=True)):
+                    if lost:
+                        found[one.index].append(lost)
+                    if sys.stderr.isatty():
+                        print(f"\r{n + 1} of {len(tries)}, {sum(map(len, found))} lost", end="", file=sys.stderr)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
         counts = [sum(one.index == index for one in tries) for index in range(len(_classes))]
         return [Row(c.name, n, tuple(lost)) for c, n, lost in zip(_classes, counts, found, strict=True)]
 

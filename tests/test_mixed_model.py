@@ -73,11 +73,46 @@ def test_the_likelihood_is_that_of_the_normal_law() -> None:
     assert _log_likelihood(y, variance, np.ones((12, 1)), None, 0.0) == pytest.approx(alone, rel=1e-9)
 
 
-def test_groups_of_one_pixel_are_the_map_itself() -> None:
-    y, error = np.arange(5.0), np.ones(5)
-    found = evidence_of_patterns(y, error, {"each": np.arange(5), "two": np.arange(5) % 2})
-    assert found["each"] is NO_PATTERN and math.isfinite(found["two"].beside)
+def test_what_is_no_pattern_has_no_evidence() -> None:
+    """One group, groups of a pixel each, shapes that are constant, and as many shapes as pixels."""
+    y, error = np.arange(8.0), np.ones(8)
+    none = {"each": np.arange(8), "one": np.zeros(8, int), "even": np.ones((8, 2)), "many": np.eye(8)[:, 1:]}
+    found = evidence_of_patterns(y, error, {**none, "two": np.arange(8) % 2})
+    assert all(found[name] is NO_PATTERN for name in none) and math.isfinite(found["two"].beside)
     assert evidence_of_patterns(y[:2], error[:2], {"two": np.arange(2)}) == {"two": NO_PATTERN}
+
+
+def test_the_unit_of_a_shape_does_not_matter() -> None:
+    """Nor do shapes that say the same twice, nor a pixel of which nothing is known."""
+    rng = np.random.default_rng(1)
+    y, error = 1 + 0.05 * DOWN + NOISE * rng.standard_normal(N), np.full(N, NOISE)
+    units = np.array([1e8, 1e-8, 1.0])
+    shapes = {"as it is": GRADIENT, "scaled": GRADIENT * units, "twice": np.hstack([GRADIENT, 3 * GRADIENT])}
+    found = evidence_of_patterns(y, error, shapes)
+    assert found["as it is"].beside > 100
+    for name in shapes:
+        assert found[name].beside == pytest.approx(found["as it is"].beside, abs=1e-3), name
+    y[3], error[3] = 1e9, math.inf
+    assert evidence_of_patterns(y, error, shapes)["scaled"].beside == pytest.approx(found["scaled"].beside, rel=0.05)
+
+
+@pytest.mark.parametrize("shape", [(1, 4), (2, 2), (2, 3), (3, 3)])
+def test_few_pixels_are_no_gradient_by_chance(shape: tuple[int, int]) -> None:
+    """Of 200 arrays 12 in chi square are for a gradient in at most 4, which is one in a hundred and two sigma."""
+    rng = np.random.default_rng(6)
+    down, along = (x.ravel() / 4 for x in np.indices(shape))
+    gradient = np.stack([along, down, along**2 + down**2], axis=1)
+    values = 1 + 0.05 * rng.standard_normal((200, down.size))
+    found = [evidence_of_patterns(y, np.full(y.size, NOISE), {"it": gradient})["it"].beside for y in values]
+    assert sum(one >= 12 for one in found) <= 4
+
+
+def test_a_pattern_of_few_counts_is_not_cut_off() -> None:
+    """Most pixels have none, so that most of them are alike: their noise says how far the others are from them."""
+    rng = np.random.default_rng(4)
+    counts = rng.poisson(np.where(ROWS % 4 == 0, 1.5, 0.2)).astype(float)
+    found = evidence_of_patterns(counts, np.full(N, math.sqrt(counts.mean())), {"rows": ROWS})
+    assert found["rows"].beside > 12
 
 
 def test_what_a_scene_takes_from_residuals_is_beyond_what_it_leaves() -> None:

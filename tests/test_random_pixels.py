@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,12 @@ from tinylab import bench_of, change_of, quiet
 
 import spadmnist
 from spadmnist import config, measurement, twin
+from spadmnist.errors import UNABLE
 from spadmnist.inference import random_pixels
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.comparison import comparison_with
 from spadmnist.inference.evaluation import block_checks, evaluate, failing
+from spadmnist.inference.models import Model
 from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
@@ -35,31 +38,70 @@ captures:
   - {id: lit, modality: qis, frames: 10000, frame_time: 10 us, frame_period: 10 us,
      light: {kind: flat, wavelength: 500 nm, irradiance: 5 nW/cm^2, relative_uncertainty: 0.02}}
 """
-CHIP = 77
+CHIP, NAME = 77, "blinking_dark_counts"
 TRUTH = {"amplitude": 5000.0, "rate_on": 100.0, "rate_off": 100.0, "fraction": 0.08}
 
 
-def camera(folder: Path, seed: int = 3) -> tuple[Sensor, Measurement]:
-    """(the sensor without what blinks, data of a chip with it)."""
-    for name, text in (("plan", PLAN), ("model", SENSOR), ("truth", SENSOR + BLINKS)):
+def camera(folder: Path, seed: int = 3, brighter: float = 1.0) -> tuple[Sensor, Measurement]:
+    """(the sensor without what blinks, data of a chip with it). brighter: the light, relative to what is stated."""
+    shown = PLAN.replace("5 nW", f"{5 * brighter:g} nW")
+    for name, text in (("plan", shown), ("model", SENSOR), ("truth", SENSOR + BLINKS)):
         (folder / f"{name}.yaml").write_text(text)
     plan = measurement.open(folder / "plan.yaml", planned=True)
     truth = config.read_sensor(folder / "truth.yaml").changed(chip_seed=CHIP)
-    return config.read_sensor(folder / "model.yaml"), measurement.open(twin.simulate(truth, plan, folder / "lab", seed))
+    made = twin.simulate(truth, plan, folder / "lab", seed)
+    stated = made / "measurement.yaml"
+    stated.write_text(re.sub(r"irradiance: \S+ nW", "irradiance: 5 nW", stated.read_text()))
+    return config.read_sensor(folder / "model.yaml"), measurement.open(made)
 
 
 def hit_in_truth(folder: Path) -> np.ndarray:
     truth = config.read_sensor(folder / "truth.yaml").changed(chip_seed=CHIP).resolved()
-    return np.asarray(truth.effect("blinking_dark_counts").added(None) > 0)  # type: ignore[union-attr, arg-type]
+    return np.asarray(truth.effect(NAME).added(None) > 0)  # type: ignore[union-attr, arg-type]
 
 
 def test_an_effect_says_how_it_is_in_given_pixels(tmp_path: Path) -> None:
     """One that does not keeps the pixels that are drawn."""
     (tmp_path / "sensor.yaml").write_text(SENSOR + BLINKS)
     sensor, hit = config.read_sensor(tmp_path / "sensor.yaml"), np.arange(256) % 9 == 0
-    own = with_values(sensor, random_pixels.of_pixels(sensor, "blinking_dark_counts", hit))
-    assert np.array_equal(own.resolved().effect("blinking_dark_counts").added(None) > 0, hit)
+    own = with_values(sensor, random_pixels.of_pixels(sensor, NAME, hit))
+    assert np.array_equal(own.resolved().effect(NAME).added(None) > 0, hit)
     assert random_pixels.of_pixels(sensor, "dark_counts", hit) == {}
+
+
+@pytest.mark.parametrize("brighter", [1.0, 1.05])
+def test_the_pixels_that_are_hit_are_known_whatever_the_light(tmp_path: Path, brighter: float) -> None:
+    """By their counts. The level of the replicates is the stated one, and their chip another than that of the data."""
+    replicates = bench_of(camera(tmp_path, brighter=brighter), 4)
+    values = {(NAME, name): value for name, value in TRUTH.items()}
+    evaluation = evaluate(replicates, {}, Model.same(replicates.start).changed(values, chips=True))
+    seen = random_pixels.pixels_hit(replicates, evaluation, values, NAME)
+    assert seen is not None and np.array_equal(seen.hit, hit_in_truth(tmp_path))
+    # 20 Hz in many of the pixels are seen in all of them together, and in no one of them
+    faint = {**values, (NAME, "amplitude"): 20.0, (NAME, "fraction"): 0.4}
+    assert random_pixels.pixels_hit(replicates, evaluation, faint, NAME) is None
+    assert random_pixels.pixels_hit(replicates, evaluation, values, "dark_counts") is None
+
+
+@pytest.mark.parametrize(
+    ("said", "wrong"),
+    [
+        ({"amplitud": 1.0}, "of_pixels must be a dict of parameters, amplitude"),
+        ({1: 2.0}, "of_pixels must be a dict"),
+        (None, "of_pixels must be a dict"),
+        ({"amplitude": float("nan")}, "amplitude"),
+        ({"amplitude": np.full(256, -1.0)}, "amplitude"),
+        ({"fraction": 2.0}, "fraction"),
+    ],
+)
+def test_pixels_that_cannot_be_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: object, wrong: str
+) -> None:
+    (tmp_path / "sensor.yaml").write_text(SENSOR + BLINKS)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    monkeypatch.setattr(type(sensor.effect(NAME)), "of_pixels", lambda self, hit: said)
+    with pytest.raises(UNABLE, match=wrong):
+        random_pixels.of_pixels(sensor, NAME, np.zeros(256, bool))
 
 
 @pytest.mark.slow
@@ -86,13 +128,10 @@ def test_what_blinks_is_fitted_by_its_own_scatter(tmp_path: Path, monkeypatch: p
         true = TRUTH[coordinate.parameter]
         assert abs(coordinate.coordinate(value) - coordinate.coordinate(true)) < 5 * error < 2.5, coordinate
     # the sensor of the data has it in the pixels that its counts show, which are those of the chip
-    values = {**found.values}
-    hit = random_pixels.pixels_hit(replicates, found.evaluation, values, "blinking_dark_counts")
-    assert hit is not None and np.array_equal(hit, hit_in_truth(tmp_path))
-    drawn = with_values(replicates.start, values)
-    own = random_pixels.of_pixels(drawn, "blinking_dark_counts", hit)
-    assert comparison_with(replicates, {**values, **own}).verdict == "adequate"
-    assert comparison_with(replicates, values).verdict == "fails"  # other pixels blink
+    seen = random_pixels.pixels_hit(replicates, found.evaluation, found.values, NAME)
+    assert seen is not None and np.array_equal(seen.hit, hit_in_truth(tmp_path))
+    assert comparison_with(replicates, {**found.values, **seen.values}).verdict == "adequate"
+    assert comparison_with(replicates, found.values).verdict == "fails"  # other pixels blink
 
 
 @pytest.mark.slow

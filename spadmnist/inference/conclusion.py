@@ -101,8 +101,7 @@ def answer(
     replicates = path.replicates
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
     excluded, invisible, unlimited = limits
-    for step in path.steps:
-        step.hit = path.pixels_hit(step)
+    path.locate()
     unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
     if unexplained and verdict == "unexplained" and path.nearest:
         unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]

@@ -53,18 +53,19 @@ class CountModel:
         share = np.clip(expected / self.conditions.frames, 1e-12, 1 - 1e-9)
         return np.asarray(counts * np.log(share) + (self.conditions.frames - counts) * np.log1p(-share))
 
-    def p_of_more(self, expected: np.ndarray) -> np.ndarray:
+    def p_of_more(self, counts: np.ndarray, expected: np.ndarray, wider: float) -> np.ndarray:
         """The p-value of as many counts or more, (pixels,).
 
         Args:
+            counts: (pixels,) detections.
             expected: (pixels,) detections.
+            wider: variance of the counts relative to that of their law.
         """
-        counts = self.seen.counts
-        assert counts is not None
+        least = np.floor(counts / wider) - 1
         if not self.frames:
-            return np.asarray(stats.poisson.sf(counts - 1, expected))
+            return np.asarray(stats.poisson.sf(least, expected / wider))
         frames = self.conditions.frames
-        return np.asarray(stats.binom.sf(counts - 1, frames, np.minimum(expected / frames, 1.0)))
+        return np.asarray(stats.binom.sf(least, max(round(frames / wider), 1), np.minimum(expected / frames, 1.0)))
 
     def saturated(self, counts: np.ndarray) -> bool:
         """Whether half of the pixels have a detection in nearly every frame.

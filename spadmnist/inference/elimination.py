@@ -34,11 +34,12 @@ def drop_needless(path: ModelPath) -> None:
             if not path.steps[-1].candidate.carrier:  # a later map may be what makes the pixels differ
                 _drop_unless_missed(path, step)
             continue
-        if step.fluctuates:  # the squares of residuals do not judge a fluctuating step
+        if step.fluctuates or step.chips:  # the squares of residuals do not judge what has a scatter of its own
             _drop_unless_missed(path, step)
             continue
         rest = {k: v for k, v in path.values.items() if k not in keys_of(step.candidate, path)}
-        sensors = Model.same(replicates.start).changed(rest, path.scan.phases)
+        chips = any(s.chips for s in path.steps)
+        sensors = Model.same(replicates.start).changed(rest, path.scan.phases, chips)
         if any(s.candidate.carrier for s in path.steps):
             continue  # a map would have to be fitted anew
         (signature,) = signatures(replicates, path.evaluation, [sensors], FEW)
@@ -76,7 +77,7 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
     path.values = {k: x for k, x in path.values.items() if k in kept}
     fit_all(path)
     missed = len(path.failed) > failed
-    if step.fluctuates and not missed:
+    if (step.fluctuates or step.chips) and not missed:
         template = {cell: step.template.get(cell, np.zeros_like(z)) for cell, z in before[0].residuals.items()}
         missed = log_likelihood_ratio(path.evaluation, before[0], template) > _NEEDLESS
     if missed:
@@ -92,7 +93,7 @@ def _fit_from_templates(path: ModelPath) -> None:
     A shape that was fitted together with the dropped step may lie in another minimum, which no gradient leaves.
     """
     for step in path.steps:
-        if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates:
+        if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates or step.chips:
             continue
         before, steps = path.kept(), path.steps
         path.steps = [other for other in steps if other is not step]

@@ -101,10 +101,11 @@ def best_of(
     pattern: Trial | None = None,
     margin: Callable[[float], float] = lambda merit: 0.0,
 ) -> Trial:
-    """The fitted trial with the most merit, of equals a map of pixels; a pattern that is significant in a map.
+    """The fitted trial with the most merit; a pattern that has evidence beside a map comes before all others.
 
-    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name. A map is
-    the first of a tie with random odd pixels: it says which pixels differ and not why.
+    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name. Of equals
+    a map of pixels is the best. It is the best of a tie with random odd pixels, too: it says which pixels differ and
+    not why.
 
     Args:
         merit: the evidence; or what falls with the p-value, where no check fails.

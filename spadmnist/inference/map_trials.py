@@ -34,6 +34,8 @@ LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS = 1e-3, 0.05
 # of a logarithm: widths of the pixels' differences that counts do not show
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)
 _TOLD = 50.0  # information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
+# in chi square: the least evidence for a pattern that says as much as the map (p of 8e-4 with one number)
+_LITTLE = 8.0
 _LIKE = 0.4  # cosine of two signatures: below it they are not alike
 # the least width of a map that is tried, and its least mean square relative to its noise
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05
@@ -119,7 +121,8 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
 
     def is_real(e: PatternEvidence) -> bool:
         own = math.inf if chance is None else max(sigmas_of(chance) ** 2, e.pixels)
-        return e.beside >= LEAST_GAIN or (own < math.inf and e.alone > own - tie(own))
+        as_much = own < math.inf and e.alone > own - tie(own)
+        return e.beside >= LEAST_GAIN or (as_much and e.alone >= _LITTLE)
 
     real = [t for t in patterns if is_real(evidence.get(t.candidate.name, NO_PATTERN))]
     rest = [t for t in tried if not is_pattern(t) or any(t is one for one in real)]
@@ -160,6 +163,8 @@ def _evidence_of_scene(
         candidate, free: the map of pixels that it is compared with, and its fit.
     """
     ids = [id for id, name in evaluation.residuals if name == PIXELS and replicates.of_scene(id)]
+    if not ids:
+        return NO_PATTERN
     after = residuals_at(replicates, evaluation, one.signature, one.times)
     levels = count_model.light_levels_of(replicates, evaluation)
     information = map_models.information(replicates, evaluation.values, candidate, levels)

@@ -22,6 +22,8 @@ _FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut o
 _EACH = 2.0  # in chi square: the price of a parameter
 _LEAST = 1e-3  # of the noise: the least standard deviation of a random effect, which is none
 _STARTS = (0.1, 1.0)  # of the spread of all values: standard deviations of a group at which a search starts
+_ROUNDING = 1e-9  # relative: smaller differences of a shape are those of rounding
+_SEARCH = {"xatol": 0.01, "fatol": 0.01, "maxiter": 100}  # of a logarithm, of a log-likelihood: they decide nothing
 _LEAST_PIXELS = 3  # fewer have no pattern
 
 
@@ -43,10 +45,10 @@ class PatternEvidence:
 NO_PATTERN = PatternEvidence(-math.inf, -math.inf, 0.0)
 
 
-def _clipped(y: np.ndarray) -> np.ndarray:
-    """The values, those far from most of them cut off."""
+def _clipped(y: np.ndarray, noise: float) -> np.ndarray:
+    """The values, those far from most of them cut off, by their scatter or by their noise."""
     middle = float(np.median(y))
-    width = 1.4826 * float(np.median(np.abs(y - middle)))
+    width = max(1.4826 * float(np.median(np.abs(y - middle))), noise)
     return np.clip(y, middle - _FAR_OFF * width, middle + _FAR_OFF * width)
 
 
@@ -61,25 +63,46 @@ def evidence_of_patterns(
         patterns: (pixels, shapes) of float, with fixed coefficients, without the mean; or (pixels,) of int, the group
             of each pixel, with a random effect for each group.
     """
+    known = np.isfinite(error)
+    y, error = y[known], np.maximum(error[known], 1e-12)
     if y.size < _LEAST_PIXELS:
         return dict.fromkeys(patterns, NO_PATTERN)
-    y, noise = _clipped(y), np.maximum(error, 1e-12) ** 2
+    y, noise = _clipped(y, float(np.median(error))), error**2
     ones = np.ones((y.size, 1))
     nothing, differ = (_most_likely(y, noise, ones, None, pixels) for pixels in (False, True))
     out = {}
     for name, pattern in patterns.items():
-        groups = np.unique(pattern, return_inverse=True)[1] if pattern.ndim == 1 else None
-        if groups is not None and np.bincount(groups).max() == 1:
-            out[name] = NO_PATTERN  # each group is a pixel: the map itself
+        groups, design, number = None, ones, 1
+        if pattern.ndim == 1:
+            groups = np.unique(pattern[known], return_inverse=True)[1]
+            sizes = np.bincount(groups)
+            if sizes.size < 2 or sizes.max() == 1:
+                out[name] = NO_PATTERN  # of one group, or of each pixel: no differences, or the map itself
+                continue
+        else:
+            design = np.hstack([ones, _orthonormal(pattern[known])])
+            number = design.shape[1] - 1
+        free = y.size - number - 2
+        if number == 0 or free < 1:
+            out[name] = NO_PATTERN
             continue
-        design = ones if groups is not None else np.hstack([ones, pattern])
-        number = 1 if groups is not None else int(np.linalg.matrix_rank(design)) - 1
+        price = _EACH * number * y.size / free  # Hurvich and Tsai, Biometrika 76 (1989) 297: of few pixels
         alone, both = (_most_likely(y, noise, design, groups, pixels) for pixels in (False, True))
-        price = _EACH * number
         out[name] = PatternEvidence(
             2 * (both - differ) - price, 2 * (alone - nothing) - price, 2 * (differ - nothing) - _EACH
         )
     return out
+
+
+def _orthonormal(shapes: np.ndarray) -> np.ndarray:
+    """Columns that span the same differences of pixels, each of mean 0 and mean square 1, whatever their units."""
+    apart = shapes - shapes.mean(axis=0)
+    largest = np.abs(apart).max(axis=0)
+    apart = apart[:, largest > _ROUNDING * np.abs(shapes).max(axis=0)]
+    if not apart.size:
+        return np.zeros((len(shapes), 0))
+    columns, sizes, _ = np.linalg.svd(apart / np.abs(apart).max(axis=0), full_matrices=False)
+    return np.asarray(columns[:, sizes > _ROUNDING * sizes[0]] * math.sqrt(len(shapes)))
 
 
 def evidence_of_scene(
@@ -145,7 +168,7 @@ def _most_likely(
         found = optimize.minimize_scalar(lambda x: cost(np.array([x])), bounds=ends, method="bounded")
         return -float(min(found.fun, cost(np.array([low]))))
     falls = [
-        optimize.minimize(cost, np.log([spread, start * spread]), method="Nelder-Mead", options={"maxiter": 200})
+        optimize.minimize(cost, np.log([spread, start * spread]), method="Nelder-Mead", options=_SEARCH)
         for start in _STARTS
     ]
     # without either effect, too: no search ends at a bound

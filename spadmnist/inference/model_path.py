@@ -21,7 +21,7 @@ from .gauss_newton import Fit, error_scale, gauss_newton_step
 from .models import Model
 from .phases import evaluate_start
 from .pixel_maps import HALF_95, map_values
-from .random_pixels import of_pixels, pixels_hit
+from .random_pixels import PixelsHit, pixels_hit
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value, title
 from .scan import Scan
@@ -114,16 +114,21 @@ class ModelPath:
         """
         maps = {step.candidate.carrier: step.map for step in self.steps if step.candidate.carrier and step.map}
         values = {**self.values, **{key: map_.spread_values() for key, map_ in maps.items() if key in self.values}}
-        sensor = with_values(self.replicates.start, self.values)
         for step in self.steps:
-            hit = self.pixels_hit(step)
-            values |= {} if hit is None else of_pixels(sensor, step.candidate.effect, hit)
+            found = self.pixels_hit(step)
+            values |= {} if found is None else found.values
         return values
 
-    def pixels_hit(self, step: Step) -> np.ndarray | None:
-        """The pixels of the chip that a step's effect has hit, (pixels,) bool; None where that is not known."""
+    def locate(self) -> None:
+        """Write into each step the pixels that its effect has hit."""
+        for step in self.steps:
+            found = self.pixels_hit(step)
+            step.hit = None if found is None else found.hit
 
-        def made() -> np.ndarray | None:
+    def pixels_hit(self, step: Step) -> PixelsHit | None:
+        """The pixels of the chip that a step's effect has hit; None where that is not known."""
+
+        def made() -> PixelsHit | None:
             with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
                 return pixels_hit(self.replicates, self.evaluation, self.values, step.candidate.effect)
             return None
@@ -194,11 +199,13 @@ def fit_all(path: ModelPath, fit: Fit | None = None, known: Evaluation | None = 
     evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
     coordinates = tuple(d for step in path.steps for d in step.coordinates)
     found: Fit | None = None
-    if coordinates:
+    if known is not None and fit is not None and fit.own and fit.coordinates == coordinates:
+        found = fit  # by the likelihood, of which squares know nothing
+    elif coordinates:
         found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit))
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.evaluation = evaluation
-    path.fit = found = None if found is None else _bounded(path, found)
+    path.fit = found = found if found is None or found.own else _bounded(path, found)
     _write_values(path, found, maps)
 
 

@@ -26,6 +26,7 @@ from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .model_path import ModelPath, accept, begin, edge_errors, fit_all, material, scale_errors
 from .replicates import FEW, REPLICATES, Replicates
 from .results import Diagnosis, Step, Value, title
+from .scan import of_other_shapes
 from .score_test import LEAST_P, p_of_map
 from .signature import Signature, signature_of_totals, template_of
 from .trial import Trial
@@ -94,6 +95,7 @@ def fit_named(
         scale_errors(path)
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
+        path.locate()
         return Diagnosis(
             replicates.start.name,
             measurement.name,
@@ -223,7 +225,8 @@ def _started(path: ModelPath, candidate: Candidate) -> Trial:
     found = path.scan.looked_at(path.evaluation, candidate, path.scan.begun(path.evaluation, candidate))
     if not found:
         raise InputError(f"{title(candidate)} cannot be simulated in these captures")
-    return max(found, key=lambda t: t.fall)
+    best = max(found, key=lambda t: t.fall)
+    return replace(best, others=of_other_shapes(best, sorted(found, key=lambda t: -t.fall))) if best.chips else best
 
 
 def _halves(name: str) -> tuple[str, str]:

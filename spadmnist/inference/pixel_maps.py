@@ -244,7 +244,7 @@ def evidence_of_patterns(map_: PixelMap, patterns: dict[str, np.ndarray]) -> dic
     """
     some = map_.informed
     y = np.exp(np.clip(map_.raw[some], -MOST, MOST))
-    error = map_.raw_error[some] * (median_of(y) if y.size else 1.0)
+    error = map_.raw_error[some] * np.exp(np.clip(map_.estimate[some], -MOST, MOST))
     return mixed_model.evidence_of_patterns(y, error, {name: x[some] for name, x in patterns.items()})
 
 

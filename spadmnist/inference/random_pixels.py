@@ -1,16 +1,17 @@
-"""Fits of effects that hit pixels at random, by the likelihood with the scatter of the effect itself.
+"""Effects that hit pixels at random: fits by the likelihood with their own scatter, and which pixels were hit.
 
-Which pixels such an effect hits is chance. The squares of residuals under the model without it are those of the few
-pixels that the data's chip has, which no strength and no time constant lowers; in units of the scatter that the effect
-brings with it they are ordinary. So its shape is chosen by the quasi-likelihood ratio, and its coordinates are fitted
-by Gauss-Newton steps from evaluations of the model with the effect (iteratively reweighted least squares).
+Which pixels such an effect hits is chance. In units of the scatter of the model without it, the residuals of those that
+the data's chip has are far larger than all others, at any strength and any time constant, so that their squares say
+nothing of these. In units of the scatter that the effect brings with it they are ordinary. So its shape is chosen by
+the quasi-likelihood ratio, and its coordinates are fitted by Gauss-Newton steps from evaluations of the model with the
+effect (iteratively reweighted least squares).
 Source: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 9.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from .. import plugins
 from ..errors import SpadError
 from ..sensor import Sensor
 from . import count_model
+from .budget import OutOfBudget
 from .candidates import with_values
 from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
@@ -28,11 +30,14 @@ from .replicates import FEW, Replicates
 from .signature import residuals_at, signatures, template_of
 from .trial import Trial
 
-_OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: four share what the worst of a few decides
+_OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: few, for there may be a dozen shapes
 _TURNS = 6  # steps at most; from the nearest of the shapes four were enough for dark counts that blink
 _VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise
-_CHANCE = 0.5  # pixels that are taken as hit by chance, in the mean over all: less than one
 _PROMISED = 5.0  # in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian
+_CHANCE = 0.5  # pixels that are taken as hit by chance, in the mean over all: less than one
+_ENOUGH = 0.1  # of what a hit adds in the mean: the least excess of a pixel that is taken as hit
+_MOST = 0.4  # share of the pixels: with more of them hit, the median of all is no longer that of the others
+_LEVEL = 10.0  # detections of most pixels, from which on their median gives the level and their scatter
 
 
 def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Trial) -> Trial:
@@ -55,50 +60,84 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     def ratio(there: Evaluation) -> float:
         return log_likelihood_ratio(evaluation, there, template)
 
-    coordinates = one.fit.coordinates
-    here, there, most = dict(one.values), one.evaluation, ratio(one.evaluation)
-    for other in one.others:
-        values = other.scaled()
+    coordinates, given = one.fit.coordinates, ratio(one.evaluation)
+    here, there = dict(one.values), one.evaluation
+    values = _of_the_best_shape(replicates, one, model, ratio)
+    if values is not None:
         try:
-            few = evaluate(replicates, {}, model(values), _OF_A_SHAPE)
+            other = evaluate(replicates, {}, model(values))
+            here, there = (values, other) if ratio(other) > given else (here, there)
         except SpadError:
-            continue  # there is no such model at this strength
-        if ratio(few) > most:
-            here, there, most = values, few, ratio(few)
-    if there is not one.evaluation:
-        there = evaluate(replicates, {}, there.sensors, known=there)
+            pass  # with more replicates there is no such model
     best: tuple[float, Evaluation, Fit] | None = None
     vain = 0
     for _ in range(_TURNS):
-        found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW)
-        if isinstance(found, str):
-            break
-        at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)
-        if best is None or ratio(there) > best[0]:
-            best, vain = (ratio(there), there, at), 0
-        else:
-            vain += 1
-        if vain == _VAIN or square(there.residuals) - found.square < _PROMISED * len(coordinates):
-            break
         try:
+            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW)
+            if isinstance(found, str):
+                break
+            at = replace(
+                found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals, own=True
+            )
+            if best is None or ratio(there) > best[0]:
+                best, vain = (ratio(there), there, at), 0
+            else:
+                vain += 1
+            if vain == _VAIN or square(there.residuals) - found.square < _PROMISED * len(coordinates):
+                break
             here, there = dict(found.values), evaluate(replicates, {}, model(found.values))
+        except OutOfBudget:
+            if best is None:
+                raise
+            break
         except SpadError:
             break  # the step leads to where no model is
     if best is None:
         return one
-    _, one.evaluation, one.fit = best
-    one.fit = replace(one.fit, square=square(one.evaluation.residuals))
-    one.values, one.sensors, one.times = dict(one.fit.values), one.evaluation.sensors, 1.0
-    (signature,) = signatures(replicates, evaluation, [one.sensors])
+    _, there, fit = best
+    (signature,) = signatures(replicates, evaluation, [there.sensors])
     if isinstance(signature, str):
         raise SpadError(signature)
-    one.there, one.residuals = signature, residuals_at(replicates, evaluation, signature)
-    one.fall = square(evaluation.residuals) - square(one.residuals)
+    residuals = residuals_at(replicates, evaluation, signature)
+    one.evaluation, one.sensors, one.fit = there, there.sensors, replace(fit, square=square(there.residuals))
+    one.values, one.times = dict(fit.values), 1.0
+    one.signature, one.there, one.residuals = signature, signature, residuals
+    one.fall = square(evaluation.residuals) - square(residuals)
     return one
 
 
-def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, effect: str) -> np.ndarray | None:
-    """The pixels whose counts show an effect that hits pixels at random, (pixels,) bool; None where it does not say.
+def _of_the_best_shape(
+    replicates: Replicates, one: Trial, model: Callable[[Values], Model], ratio: Callable[[Evaluation], float]
+) -> dict[Key, Any] | None:
+    """The values of another shape that is likelier than the fitted one, by a few replicates of each; None: none is."""
+    likeliest: tuple[float, dict[Key, Any] | None] | None = None
+    for values in ([dict(one.values)] if one.others else []) + [other.scaled() for other in one.others]:
+        try:
+            found = ratio(evaluate(replicates, {}, model(values), _OF_A_SHAPE))
+        except SpadError:
+            continue  # there is no such model at this strength
+        if likeliest is None or found > likeliest[0]:
+            likeliest = found, values
+    return None if likeliest is None or likeliest[1] == one.values else likeliest[1]
+
+
+@dataclass(frozen=True)
+class PixelsHit:
+    """The pixels that an effect has hit.
+
+    Attributes:
+        hit: (pixels,) bool.
+        values: the parameters under which the effect is in exactly these, SI.
+    """
+
+    hit: np.ndarray
+    values: dict[Key, Any]
+
+
+def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, effect: str) -> PixelsHit | None:
+    """The pixels whose counts show an effect that hits pixels at random; None where they do not tell which ones.
+
+    The median of the pixels gives the level of a capture, which the pixels that are hit by chance in a model do not.
 
     Args:
         evaluation: of the model with the effect.
@@ -107,17 +146,33 @@ def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, e
         SpadError: where a user's effect says something else.
     """
     pixels = replicates.start.layout.pixels
-    none = of_pixels(with_values(replicates.start, values), effect, np.zeros(pixels, bool))
-    if not none:
-        return None
-    without = with_values(replicates.start, {**values, **none})
-    levels = count_model.light_levels_of(replicates, evaluation)
     counted = [id for id, seen in replicates.seen.items() if seen.counts is not None]
-    p = np.ones(pixels)
+    sensor = with_values(replicates.start, values)
+    if not counted or not of_pixels(sensor, effect, np.zeros(pixels, bool)):
+        return None
+    without, throughout = (
+        with_values(replicates.start, {**values, **of_pixels(sensor, effect, np.full(pixels, hit))})
+        for hit in (False, True)
+    )
+    levels = count_model.light_levels_of(replicates, evaluation)
+    p, of_a_hit = np.ones(pixels), np.ones(pixels)  # p-values of each pixel, and of one that is hit
     for id in counted:
         line = count_model.CountModel(replicates, id, levels[id])
-        p = np.minimum(p, len(counted) * line.p_of_more(line.expected(without)))
-    return np.asarray(p < _CHANCE / pixels)
+        counts, low, high = replicates.seen[id].counts, line.expected(without), line.expected(throughout)
+        assert counts is not None
+        wider = 1.0
+        if (median := float(np.median(counts))) >= _LEVEL:
+            scale = median / float(np.median(low))
+            low, high = low * scale, high * scale
+            scatter = 1.4826 * float(np.median(np.abs(counts - low)))
+            wider = max(scatter**2 / float(np.median(line.variance(low, 0.0))), 1.0)
+        more = counts - low > _ENOUGH * (high - low)
+        p = np.minimum(p, np.where(more, len(counted) * line.p_of_more(counts, low, wider), 1.0))
+        of_a_hit = np.minimum(of_a_hit, len(counted) * line.p_of_more(high, low, wider))
+    hit = p < _CHANCE / pixels
+    if float(np.median(of_a_hit)) > _CHANCE / pixels or not 0 < float(np.mean(hit)) < _MOST:
+        return None
+    return PixelsHit(hit, of_pixels(sensor, effect, hit))
 
 
 def of_pixels(sensor: Sensor, effect: str, hit: np.ndarray) -> dict[Key, Any]:
@@ -126,9 +181,13 @@ def of_pixels(sensor: Sensor, effect: str, hit: np.ndarray) -> dict[Key, Any]:
     Args:
         hit: (pixels,) bool.
     Raises:
-        EffectError: where a user's effect fails.
+        EffectError: where a user's effect fails, or says what it cannot be.
     """
     own = sensor.effect(effect)
     assert own is not None
     with plugins.blaming(type(own)):
-        return {(effect, name): value for name, value in own.of_pixels(hit).items()}
+        said = own.of_pixels(hit)
+        if not isinstance(said, dict) or not said.keys() <= own.parameters.keys():
+            raise ValueError(f"of_pixels must be a dict of parameters, {', '.join(own.parameters)}; not {said!r:.80}")
+        plugins.check_values(type(own)(**{**{name: getattr(own, name) for name in own.parameters}, **said}))
+    return {(effect, name): value for name, value in said.items()}

@@ -398,7 +398,7 @@ class Scan:
                 further += _faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
                 break
-        best = [replace(one, others=_of_other_shapes(one, tried)) if one.chips else one for one in best + further]
+        best = [replace(one, others=of_other_shapes(one, tried)) if one.chips else one for one in best + further]
         out: list[Trial] = []
         sizes: dict[int, float] = {}  # of the signature as it was simulated first, by the trial's id
         kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
@@ -468,7 +468,7 @@ def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     return list(others)[:1]
 
 
-def _of_other_shapes(best: Trial, tried: Sequence[Trial]) -> tuple[Trial, ...]:
+def of_other_shapes(best: Trial, tried: Sequence[Trial]) -> tuple[Trial, ...]:
     """The best trial of the same candidate at each other shape.
 
     Args:
