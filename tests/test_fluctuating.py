@@ -15,8 +15,9 @@ from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
 from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.gauss_newton import gauss_newton_step
+from spadmnist.inference.joint_fit import _bounded, _gauss_newton
 from spadmnist.inference.laws import Law
-from spadmnist.inference.model_path import _bounded, _gauss_newton, begin
+from spadmnist.inference.model_path import begin
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.signature import Signature, _mean_shift, signatures
 from spadmnist.inference.trial import Trial
@@ -138,7 +139,7 @@ def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, 
     """
     many: list[int] = []
     step, simulated = gauss_newton_step, signatures
-    monkeypatch.setattr("spadmnist.inference.model_path.gauss_newton_step", lambda *a: many.append(a[5]) or step(*a))
+    monkeypatch.setattr("spadmnist.inference.joint_fit.gauss_newton_step", lambda *a: many.append(a[5]) or step(*a))
     for noise, lamp, replicates in [(False, False, 40), (False, True, 40), (False, True, 16), (True, True, 40)]:
         stated = f"    source_noise: {{contrast: {0.2 if lamp else 0.0}, coherence_time: 20 ms}}\n"
         sensor, data = lab(stated if lamp else "", light=1000)
@@ -149,7 +150,7 @@ def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, 
             path.evaluation = evaluate(path.replicates, {CONTRAST: 0.2, COHERENCE: 20e-3})
         held: list[int] = []
         with monkeypatch.context() as patch:
-            patch.setattr("spadmnist.inference.model_path.signatures", lambda *a: held.append(a[3]) or simulated(*a))  # noqa: B023
+            patch.setattr("spadmnist.inference.joint_fit.signatures", lambda *a: held.append(a[3]) or simulated(*a))  # noqa: B023
             coordinates = tuple(change_of(path.replicates, "add crosstalk").coordinates[:1])
             path.values[CROSSTALK] = 0.01
             found, _, _ = _gauss_newton(path, path.evaluation, {}, coordinates, {})

@@ -18,7 +18,9 @@ from spadmnist.inference.evidence import _share_of_counts, best_of, evidence_of,
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
 from spadmnist.inference.findings import mimicked
 from spadmnist.inference.gauss_newton import Fit
-from spadmnist.inference.model_path import ModelPath, _bounded, begin, sharpen
+from spadmnist.inference.intervals import sharpen
+from spadmnist.inference.joint_fit import _bounded
+from spadmnist.inference.model_path import ModelPath, begin
 from spadmnist.inference.model_selection import _added, _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.replicates import TOTALS
@@ -264,13 +266,13 @@ def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
     fit = Fit(coordinates, further, np.eye(1), {}, {}, 0.0, {CROSSTALK: 0.02})
     now = square(path.evaluation.residuals)
     for there, point in ((now + 1e3, 0.01), (now + 1.0, 0.02)):
-        monkeypatch.setattr("spadmnist.inference.model_path.signatures", lambda *_, **__: [Signature({}, {}, {})])
+        monkeypatch.setattr("spadmnist.inference.joint_fit.signatures", lambda *_, **__: [Signature({}, {}, {})])
         monkeypatch.setattr(
-            "spadmnist.inference.model_path.square", lambda z, s=there: now if z is path.evaluation.residuals else s
+            "spadmnist.inference.joint_fit.square", lambda z, s=there: now if z is path.evaluation.residuals else s
         )
         held = _bounded(path, fit)
         assert coordinates[0].value(float(held.point[0])) == pytest.approx(point)
-    monkeypatch.setattr("spadmnist.inference.model_path.signatures", lambda *_, **__: ["beyond what can be simulated"])
+    monkeypatch.setattr("spadmnist.inference.joint_fit.signatures", lambda *_, **__: ["beyond what can be simulated"])
     assert coordinates[0].value(float(_bounded(path, fit).point[0])) == pytest.approx(0.01)
 
 
@@ -424,7 +426,7 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(ModelPath, "failed", property(lambda self: [] if self.evaluation is evaluation else [check]))
     exact = MaximumLikelihood({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, [1.0], (DURATION,), np.eye(1))
-    monkeypatch.setattr("spadmnist.inference.model_path.maximise", lambda *_, **__: exact)
+    monkeypatch.setattr("spadmnist.inference.intervals.maximise", lambda *_, **__: exact)
     sharpen(path, data)
     assert bool(path.failed) != rival and (path.evaluation is evaluation) == rival
     assert (step.values == usual) == rival

@@ -18,10 +18,12 @@ from spadmnist.inference.coordinates import Coordinate
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio, square
 from spadmnist.inference.evidence import best_of, evidence_of, worth_fitting
 from spadmnist.inference.gauss_newton import Fit
+from spadmnist.inference.intervals import open_ends, sharpen
+from spadmnist.inference.joint_fit import edge_errors
 from spadmnist.inference.laws import Law
 from spadmnist.inference.light_levels import levels_about
 from spadmnist.inference.map_trials import candidate_maps
-from spadmnist.inference.model_path import begin, edge_errors, open_ends, sharpen
+from spadmnist.inference.model_path import begin
 from spadmnist.inference.null_distribution import learn
 from spadmnist.inference.replicates import Replicates, no_size
 from spadmnist.inference.results import Value
@@ -251,7 +253,7 @@ def test_an_end_of_the_range_that_the_data_leave_open_is_in_the_interval(lab, mo
     nothing = Signature({}, {}, {})
     worse = Signature({}, {}, dict.fromkeys(replicates.seen, 10.0))
     for low, high in ((nothing, worse), (worse, nothing), (worse, worse)):
-        monkeypatch.setattr("spadmnist.inference.model_path.signatures", lambda *_, ends=(low, high), **__: list(ends))
+        monkeypatch.setattr("spadmnist.inference.intervals.signatures", lambda *_, ends=(low, high), **__: list(ends))
         step.values = dict(told)
         open_ends(path)
         value = step.values["delay"]

@@ -16,9 +16,10 @@ from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, square
 from spadmnist.inference.evidence import evaluation_of, optimism
 from spadmnist.inference.gauss_newton import Fit
+from spadmnist.inference.joint_fit import _of_pixels
 from spadmnist.inference.map_trials import patterns_first
 from spadmnist.inference.mixed_model import PatternEvidence
-from spadmnist.inference.model_path import ModelPath, _of_pixels, accept, begin
+from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step
 from spadmnist.inference.scan import Scan

@@ -10,8 +10,9 @@ import numpy as np
 from ..errors import SpadError
 from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
 from .gauss_newton import Fit, gauss_newton
+from .joint_fit import fit_all, without_fit
 from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
-from .model_path import ModelPath, fit_all, keys_of, without_fit
+from .model_path import ModelPath, keys_of
 from .models import Model
 from .replicates import FEW, TOTALS, Cell
 from .results import Step, title

@@ -28,10 +28,11 @@ from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
 from .evidence import best_of, evidence_of, judge_maps_by_odd_pixels, worth_fitting
 from .findings import mimicked
+from .intervals import open_ends, scale_errors, sharpen
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_GAIN
 from .map_trials import patterns_first, unseen_maps
-from .model_path import ModelPath, accept, begin, open_ends, scale_errors, sharpen
+from .model_path import ModelPath, accept, begin
 from .replicates import REPLICATES, TOTALS, Replicates
 from .results import Diagnosis, title
 from .score_test import explains_its_signature, p_of_any, p_of_best

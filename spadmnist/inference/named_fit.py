@@ -23,7 +23,9 @@ from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
-from .model_path import ModelPath, accept, begin, edge_errors, fit_all, material, scale_errors
+from .intervals import scale_errors
+from .joint_fit import edge_errors, fit_all
+from .model_path import ModelPath, accept, begin, material
 from .replicates import FEW, REPLICATES, Replicates
 from .results import Diagnosis, Step, Value, title
 from .scan import of_other_shapes

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spadmnist.inference import model_path
+from spadmnist.inference import joint_fit
 from spadmnist.inference.coordinates import Coordinate, Key
 from spadmnist.inference.gauss_newton import Fit
 
@@ -50,13 +50,13 @@ def fitted(monkeypatch: pytest.MonkeyPatch, step: float, noise: np.ndarray) -> d
     start = {STRENGTH.key: 0.01, SHAPE.key: 1e-7}
     candidate = SimpleNamespace(shapes=(SHAPE,))
     path: Any = SimpleNamespace(replicates=None, values=start, steps=[SimpleNamespace(candidate=candidate)])
-    monkeypatch.setattr(model_path, "_known_jacobian", lambda path: {})
-    monkeypatch.setattr(model_path, "_recordings", lambda evaluation: 8)
-    monkeypatch.setattr(model_path, "_model", lambda path: (None, {}))
-    monkeypatch.setattr(model_path, "gauss_newton_step", one_step)
-    monkeypatch.setattr(model_path, "evaluate", lambda replicates, values, sensors: evaluation_at(values, noise))
+    monkeypatch.setattr(joint_fit, "_known_jacobian", lambda path: {})
+    monkeypatch.setattr(joint_fit, "_recordings", lambda evaluation: 8)
+    monkeypatch.setattr(joint_fit, "model_of", lambda path: (None, {}))
+    monkeypatch.setattr(joint_fit, "gauss_newton_step", one_step)
+    monkeypatch.setattr(joint_fit, "evaluate", lambda replicates, values, sensors: evaluation_at(values, noise))
     begun = evaluation_at(start, np.zeros(CELLS))
-    _, found, _ = model_path._gauss_newton(path, begun, {}, (STRENGTH, SHAPE), {})
+    _, found, _ = joint_fit._gauss_newton(path, begun, {}, (STRENGTH, SHAPE), {})
     return dict(found.values)
 
 
