@@ -254,7 +254,7 @@ def test_a_map_is_fitted_by_the_statistic_that_a_user_declares(tmp_path) -> None
     ("named", "returned", "says"),
     [
         ("halves_of_pixel", RIGHT, "informed_by names no statistic that is loaded, 'halves_of_pixel'; there are"),
-        ("fano", RIGHT, "the statistic fano defines no unit_likelihood"),
+        ("pixel_fano", RIGHT, "the statistic pixel_fano defines no unit_likelihood"),
         ("halves_of_pixels", f"({RIGHT}).T", r"unit_likelihood must be \(36, \d+\) without nan, not \(\d+, 36\)"),
         ("halves_of_pixels", f"0 * ({RIGHT})", "tells depth of fewer than two pixels"),
         ("halves_of_pixels", "1 / 0", r"wave\.py:\d+: the statistic halves_of_pixels failed: ZeroDivisionError"),
@@ -269,4 +269,4 @@ def test_a_statistic_that_tells_no_map_is_named(tmp_path, named: str, returned: 
 
 def test_only_a_map_over_pixels_is_informed_by_a_statistic() -> None:
     with pytest.raises(TypeError, match="informed_by is of maps over pixels: give per_pixel=True"):
-        parameter(0.2, "", "of each row", per="row", informed_by="fano")
+        parameter(0.2, "", "of each row", per="row", informed_by="pixel_fano")
