@@ -38,7 +38,6 @@ class Fit:
         square: the sum of their squares.
         values: all values at the estimate, SI.
         phases: by (capture, parameter), rad.
-        own: residuals and Jacobian are in units of the scatter of the model at the estimate.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -49,7 +48,6 @@ class Fit:
     square: float
     values: dict[Key, Any]
     phases: dict[tuple[str, Key], float] = field(default_factory=dict)
-    own: bool = False
 
     def interval(self, i: int) -> tuple[float, float, float]:
         """(value, low, high) of a coordinate: the estimate and its 95 % interval, in the parameter's unit."""

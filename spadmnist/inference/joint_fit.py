@@ -44,13 +44,11 @@ def fit_all(path: ModelPath, fit: Fit | None = None, known: Evaluation | None = 
     evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
     coordinates = tuple(d for step in path.steps for d in step.coordinates)
     found: Fit | None = None
-    if known is not None and fit is not None and fit.own and fit.coordinates == coordinates:
-        found = fit  # by the likelihood, of which squares know nothing
-    elif coordinates:
+    if coordinates:
         found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit))
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.evaluation = evaluation
-    path.fit = found = found if found is None or found.own else _bounded(path, found)
+    path.fit = found = None if found is None else _bounded(path, found)
     _write_values(path, found, maps)
 
 

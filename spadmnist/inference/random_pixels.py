@@ -76,9 +76,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
             found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW)
             if isinstance(found, str):
                 break
-            at = replace(
-                found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals, own=True
-            )
+            at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)
             if best is None or ratio(there) > best[0]:
                 best, vain = (ratio(there), there, at), 0
             else:
