@@ -208,7 +208,7 @@ def test_the_same_seed_gives_the_same_answer_from_memory_and_anew(
     data = measured(sensor(), "str", 7)
     monkeypatch.setenv("SPADMNIST_CACHE", str(tmp_path))
     first = canonical(compared(sensor(), data))
-    stored = list(tmp_path.rglob("*.npz"))
+    stored = list(tmp_path.rglob("*.replicates"))
     assert len(stored) == 3
     assert canonical(compared(sensor(), data)) == first
     for path in stored:

@@ -131,9 +131,9 @@ def begun(command: str, tmp_path: Path) -> psutil.Popen:
     (tmp_path / "labs").mkdir()
     tinylab.labs(tmp_path / "labs")(dead=80)
     place = tmp_path / "labs" / "0"
-    more = ["--seed", 777]  # of which no null is kept, for no run of it ends
-    more += ["-o", tmp_path / "report"] if command == "diagnose" else []
-    return started(command, place / "sensor.yaml", place / "lab", "--jobs", 2, *more)
+    more = ["-o", tmp_path / "report"] if command == "diagnose" else []
+    env = {**os.environ, "SPADMNIST_CACHE": str(tmp_path / "cache")}  # with nulls that are kept no worker would start
+    return started(command, place / "sensor.yaml", place / "lab", "--jobs", 2, *more, env=env)
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_damaged_replicates_are_not_taken(at: float, tmp_path: Path, monkeypatch
     laws = {"map": ("poisson", None), "spread": ("normal", np.ones(2))}
     one = CaptureReplicates(np.arange(8, dtype=np.uint64), np.arange(8.0), values, laws)
     keep("entry", one)
-    file = tmp_path / "entry.npz"
+    file = tmp_path / "entry.replicates"
     whole = file.read_bytes()
     found = recall("entry")
     assert found is not None and all(np.array_equal(found.values[name], x) for name, x in values.items())
@@ -258,4 +258,4 @@ def test_damaged_replicates_are_not_taken(at: float, tmp_path: Path, monkeypatch
     file.write_bytes(whole[:place])
     assert recall("entry") is None
     keep("entry", one)
-    assert file.read_bytes() == whole and [path.name for path in tmp_path.iterdir()] == ["entry.npz"]
+    assert file.read_bytes() == whole and [path.name for path in tmp_path.iterdir()] == ["entry.replicates"]

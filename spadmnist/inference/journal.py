@@ -34,7 +34,9 @@ class Journal:
     def __init__(self, folder: Path):
         """Open the journal in a folder, which need not be there yet."""
         self.folder = folder
-        self.bytes = sum(path.stat().st_size for path in folder.glob("*.npz")) if self._own() else 0
+        self.bytes = (
+            sum(path.stat().st_size for path in folder.glob(f"*{replicate_cache.SUFFIX}")) if self._own() else 0
+        )
 
     @staticmethod
     def name(
@@ -84,7 +86,7 @@ class Journal:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:
-        return self.folder / f"{name}.npz"
+        return self.folder / f"{name}{replicate_cache.SUFFIX}"
 
     def _own(self) -> bool:
         """Whether the folder is there, and no link."""

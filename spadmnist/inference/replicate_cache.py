@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import io
 import json
+import math
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from ..sensor import Sensor
 from .reduction import own_statistics
 from .replicates import CaptureReplicates
 
+SUFFIX = ".replicates"  # of the name of an entry's file
 _MOST_BYTES = 1 << 30  # bytes of all entries together
 
 
@@ -70,7 +70,7 @@ def recall(name: str | None) -> CaptureReplicates | None:
     """The replicates of an entry; None where no such entry can be read."""
     if name is None:
         return None
-    path = _folder() / f"{name}.npz"
+    path = _folder() / f"{name}{SUFFIX}"
     try:
         found = unpacked(path.read_bytes())
         os.utime(path)
@@ -86,60 +86,67 @@ def keep(name: str | None, made: CaptureReplicates) -> None:
     folder = _folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        disk.put_file(folder / f"{name}.npz", packed(made))
+        disk.put_file(folder / f"{name}{SUFFIX}", packed(made))
         _make_room(folder)
     except (OSError, SpadError):  # what is not in the cache is simulated again
         return
 
 
 def packed(made: CaptureReplicates) -> bytes:
-    """Replicates as the bytes of an entry."""
+    """Replicates as the bytes of an entry: a line of JSON that says what follows, the arrays, and a digest of all."""
     arrays = {"numbers": made.numbers, "totals": made.totals}
     for statistic, (_, scale) in made.laws.items():
         arrays[f"values/{statistic}"] = _narrow(made.values[statistic])
         if scale is not None:
             arrays[f"scale/{statistic}"] = scale
-    header = np.frombuffer(json.dumps({statistic: law for statistic, (law, _) in made.laws.items()}).encode(), np.uint8)
-    whole = io.BytesIO()
-    np.savez(whole, allow_pickle=False, facts=header, **arrays)
-    data = whole.getvalue()
+    facts = {
+        "laws": {statistic: law for statistic, (law, _) in made.laws.items()},
+        "arrays": {name: [x.dtype.str, list(x.shape)] for name, x in arrays.items()},
+    }
+    data = b"".join([json.dumps(facts).encode(), b"\n", *(np.ascontiguousarray(x).tobytes() for x in arrays.values())])
     return data + hashlib.sha256(data).digest()
 
 
 def unpacked(data: bytes) -> CaptureReplicates | None:
     """The replicates that an entry's bytes hold; None where they are damaged."""
     try:
-        with np.load(_intact(data), allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-        facts = from_json(arrays.pop("facts").tobytes())
-        laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts.items()}
-        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in facts}
+        head, rest = _intact(data)
+        facts, arrays, at = from_json(head), {}, 0
+        for name, (kind, shape) in facts["arrays"].items():
+            number = math.prod(shape)
+            arrays[name] = np.frombuffer(rest, kind, number, at).reshape(shape)
+            at += arrays[name].nbytes
+        laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts["laws"].items()}
+        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in laws}
         return CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
 def _narrow(values: np.ndarray) -> np.ndarray:
     """The same numbers; whole ones as unsigned integers of as few bytes as hold them."""
-    if values.size and float(values.min()) >= 0 and float(values.max()) < 2**32 and not np.any(values % 1):
-        return values.astype(np.min_scalar_type(int(values.max())))
+    if values.size and float(values.min()) >= 0 and float(values.max()) < 2**32:
+        whole = values.astype(np.min_scalar_type(int(values.max())))
+        return whole if np.array_equal(whole, values) else values
     return values
 
 
-def _intact(data: bytes) -> io.BytesIO:
-    """The archive of an entry.
+def _intact(data: bytes) -> tuple[bytes, memoryview]:
+    """(the line that says what follows, the arrays) of an entry.
 
     Raises:
         ValueError: where its digest is not that of its content.
     """
     size = hashlib.sha256().digest_size
-    if hashlib.sha256(data[:-size]).digest() != data[-size:]:
+    whole = memoryview(data)[:-size]
+    if hashlib.sha256(whole).digest() != data[-size:]:
         raise ValueError("damaged")
-    return io.BytesIO(data[:-size])
+    end = data.index(b"\n")
+    return data[:end], whole[end + 1 :]
 
 
 def _make_room(folder: Path) -> None:
-    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    entries = sorted(folder.glob("*.*"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
     for path in entries:
         total += path.stat().st_size

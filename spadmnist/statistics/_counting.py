@@ -14,7 +14,7 @@ import numpy as np
 from .. import units
 from ..kernels import inline, jit
 from ..recording import Recording
-from ._scores import poisson_score, shares
+from ._scores import poisson_score, shares, wilson_hilferty
 
 _FREE_RUNNING = 1e-11  # s: the tick that stands in where stamps are seconds
 _OCTAVE = 16  # entries of a guide for each octave
@@ -158,16 +158,11 @@ class Surplus(NamedTuple):
         low, high = 0.0, 10.0 * (mean + score * score + 10.0)
         for _ in range(100):
             middle = (low + high) / 2
-            if _wilson_hilferty(middle, mean) < score:
+            if wilson_hilferty(middle + 0.5, mean) < score:
                 low = middle
             else:
                 high = middle
         return high - mean
-
-
-def _wilson_hilferty(count: float, mean: float) -> float:
-    a = count + 0.5
-    return float(3.0 * math.sqrt(a) * (1.0 - 1.0 / (9.0 * a) - math.cbrt(mean / a)))
 
 
 def whole(count: float) -> str:
@@ -206,6 +201,7 @@ def of_pairs(pairs: Surplus, total: float) -> Callable[[int, float, float], tupl
     return size
 
 
+@lru_cache(maxsize=4096)  # each recording of a capture asks for the same ones
 def span(low: float, high: float, unit: str = "s") -> str:
     """Two quantities with a unit: 10 to 30 ns, or 300 ns to 1 us."""
     a, b = units.show(low, unit), units.show(high, unit)

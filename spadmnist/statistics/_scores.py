@@ -14,44 +14,72 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from ..kernels import inline, jit
 
 _FEW = 128  # up to so many detections the law of their pairs is worked out exactly
 _THIN = 0.1  # and if they fill less than this share of the slots, so that slots hardly matter
 _SPARSE = 30.0  # expectations below it are no normal variable
-_GOLDEN = 0x9E3779B97F4A7C15
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
-def _mixed(words: np.ndarray) -> np.ndarray:
-    """64 well mixed bits for each word (Steele, Lea and Flood, SplitMix64, 2014)."""
-    z = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+@inline
+def _mixed(word):  # type: ignore[no-untyped-def]
+    """64 well mixed bits for a word (Steele, Lea and Flood, SplitMix64, 2014)."""
+    z = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
 
 
 def shares(of: np.ndarray, size: int) -> np.ndarray:
     """(size,) numbers in (0, 1), as good as random, that are a function of the whole numbers `of`."""
-    places = np.arange(1, max(size, of.size) + 1, dtype=np.uint64) * np.uint64(_GOLDEN)
-    seed = np.bitwise_xor.reduce(_mixed(of.ravel().astype(np.uint64) + places[: of.size]), keepdims=True)
-    words = _mixed(places[:size] + seed)
-    return np.asarray(((words >> np.uint64(12)) + 0.5) * 2.0**-52)
+    return np.asarray(_shares(of.ravel().astype(np.uint64), size))
+
+
+@jit
+def _shares(of, size):  # type: ignore[no-untyped-def]
+    seed = np.uint64(0)
+    for i in range(of.size):
+        seed ^= _mixed(of[i] + np.uint64(i + 1) * _GOLDEN)
+    out = np.empty(size)
+    for i in range(size):
+        word = _mixed(np.uint64(i + 1) * _GOLDEN + seed)
+        out[i] = (np.float64(word >> np.uint64(12)) + 0.5) * 2.0**-52
+    return out
 
 
 def poisson_score(count: np.ndarray | float, mean: np.ndarray | float, share: np.ndarray | float) -> np.ndarray:
     """Score of Poisson counts. Below a mean of 30 by the exact law, above by that of Wilson and Hilferty (1931)."""
+    count, mean, share = np.broadcast_arrays(np.asarray(count, np.float64), np.asarray(mean, np.float64), share)
+    score = np.array(wilson_hilferty(count + share, mean))
+    few = mean < _SPARSE
+    if few.any():
+        exact = _exact_score(count[few], mean[few], share[few])
+        score[few] = np.where(np.abs(exact) < 6.7, exact, score[few])
+    return score
+
+
+def _poisson_score_of_one(count: float, mean: float, share: float) -> float:
+    """`poisson_score` of one number: much quicker, for it is needed for every cell of every recording."""
+    exact = float(_exact_score(count, mean, share)) if mean < _SPARSE else math.inf
+    return exact if abs(exact) < 6.7 else float(wilson_hilferty(count + share, mean))
+
+
+def wilson_hilferty(count: Any, mean: Any) -> Any:
+    """Score of a count of Poisson law, a number or an array, for means that are not small."""
+    return 3.0 * np.sqrt(count) * (1.0 - 1.0 / (9.0 * count) - np.cbrt(mean / count))
+
+
+def _exact_score(count: Any, mean: Any, share: Any) -> np.ndarray:
+    """Score of Poisson counts, numbers or arrays, by the exact law."""
     from scipy import special
 
-    count, mean, share = np.broadcast_arrays(np.asarray(count, np.float64), np.asarray(mean, np.float64), share)
-    a = count + share
-    score = np.array(3.0 * np.sqrt(a) * (1.0 - 1.0 / (9.0 * a) - np.cbrt(mean / a)))
-    few = mean < _SPARSE
-    k, m, u = count[few], mean[few], share[few]
-    own = np.exp(special.xlogy(k, m) - m - special.gammaln(k + 1.0))
-    exact = _from_tails(np.where(k > 0, special.pdtr(k - 1.0, m), 0.0) + u * own, special.pdtrc(k, m) + (1.0 - u) * own)
-    score[few] = np.where(np.abs(exact) < 6.7, exact, score[few])
-    return score
+    own = np.exp(special.xlogy(count, mean) - mean - special.gammaln(count + 1.0))
+    lower = np.where(count > 0, special.pdtr(count - 1.0, mean), 0.0) + share * own
+    return _from_tails(lower, special.pdtrc(count, mean) + (1.0 - share) * own)
 
 
 def largest_score(largest: np.ndarray, mean: np.ndarray, number: int, share: np.ndarray) -> np.ndarray:
@@ -96,21 +124,25 @@ def nested(laws: Sequence[Pairs]) -> np.ndarray:
     What is new in the larger number is independent of the smaller one. Of few pairs a part of the score is chance.
     """
     variance = np.array([float(law.variance) for law in laws])
-    told = np.sqrt([_told_by_count(float(law.mean)) for law in laws])
+    told = np.sqrt(_told_by_count(np.array([float(law.mean) for law in laws])))
     shared = np.sqrt(np.divide(variance[:-1], variance[1:], out=np.zeros(len(laws) - 1), where=variance[1:] > 0))
     return np.append(0.0, np.minimum(shared * told[:-1] * told[1:], 0.99))
 
 
-def _told_by_count(mean: float) -> float:
-    """Of the variance of the score of a Poisson count, what the count itself makes; the rest is its random share."""
+def _told_by_count(means: np.ndarray) -> np.ndarray:
+    """Of the variance of the scores of Poisson counts, what the count itself makes; the rest is its random share."""
     from scipy import special
 
-    if mean >= _SPARSE:
-        return 1.0
-    k = np.arange(100)
-    own = np.exp(special.xlogy(k, mean) - mean - special.gammaln(k + 1.0))
-    at = special.ndtri(np.clip(np.append(0.0, np.cumsum(own)), 1e-300, 1.0 - 1e-16))
-    return float(np.sum(np.diff(np.exp(-(at**2) / 2.0)) ** 2 / np.maximum(own, 1e-300)) / (2.0 * np.pi))
+    out = np.ones(len(means))
+    few = means < _SPARSE
+    if few.any():
+        k, mean = np.arange(100), means[few, None]
+        own = np.exp(special.xlogy(k, mean) - mean - special.gammaln(k + 1.0))
+        upto = np.cumsum(np.column_stack([np.zeros(len(mean)), own]), axis=1)
+        at = special.ndtri(np.clip(upto, 1e-300, 1.0 - 1e-16))
+        terms = np.diff(np.exp(-(at**2) / 2.0), axis=1) ** 2 / np.maximum(own, 1e-300)
+        out[few] = np.sum(terms, axis=1) / (2.0 * np.pi)
+    return out
 
 
 def pairs_law(detections: np.ndarray, boxes: int, slots: float = np.inf) -> Pairs:
@@ -168,10 +200,13 @@ def _third_of_poisson(m: np.ndarray) -> float:
 def gamma_score(number: np.ndarray | float, law: Pairs) -> np.ndarray:
     """Score by the gamma law with the same three cumulants, by its cube root (Wilson and Hilferty). Never infinite."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        shape = 4.0 * law.variance**3 / law.third**2
-        ratio = 1.0 + (number - law.mean) * law.third / (2.0 * law.variance**2)
-        score = 3.0 * np.sqrt(shape) * (np.cbrt(ratio) - 1.0 + 1.0 / (9.0 * shape))
-    return np.asarray(np.where(law.variance > 0, score, 0.0))
+        return np.asarray(np.where(law.variance > 0, _cube_root_score(number, *law), 0.0))
+
+
+def _cube_root_score(number: Any, mean: Any, variance: Any, third: Any) -> Any:
+    shape = 4.0 * variance**3 / third**2
+    ratio = 1.0 + (number - mean) * third / (2.0 * variance**2)
+    return 3.0 * np.sqrt(shape) * (np.cbrt(ratio) - 1.0 + 1.0 / (9.0 * shape))
 
 
 def number_at(score: float, scores: Callable[[float, float], float], mean: float) -> float:
@@ -199,8 +234,8 @@ def pooled_score(number: float, law: Pairs, share: float) -> float:
 
     mean, variance, third = (float(part) for part in law)
     if mean < _SPARSE and third <= 1.2 * variance:
-        return float(poisson_score(max(0.0, round(number)), mean, share))
-    score = float(gamma_score(number + share - 0.5, law))
+        return _poisson_score_of_one(max(0.0, float(round(number))), mean, share)
+    score = float(_cube_root_score(number + share - 0.5, mean, variance, third)) if variance > 0 else 0.0
     if mean >= _SPARSE:
         return score
     shape, scale = 4.0 * variance**3 / third**2, 2.0 * variance / third

@@ -24,11 +24,16 @@ _COINCIDENCES = 500.0  # pairs of detections with the same code, from which on c
 _TURNS = 16  # periods that an exposure or a frame holds at least, for what is left over at its end to be little
 
 
-def _steps() -> tuple[tuple[int, int], ...]:
+def _steps() -> np.ndarray:
+    """(steps, 4): where the histogram that is folded begins and its period, and the same of what it is folded to."""
     steps = list(_MIDDLE)
     for period in reversed(_FOLDS):
         steps.append((min(whole for _, whole in steps if whole % period == 0), period))
-    return tuple(steps)
+    begins, end = {_COMMON: 0}, _COMMON
+    for _, part in steps:
+        begins[part] = end
+        end += part
+    return np.array([(begins[whole], whole, begins[part], part) for whole, part in steps])
 
 
 _STEPS = _steps()
@@ -126,27 +131,31 @@ def _folds(recording: Recording) -> dict[int, np.ndarray]:
     known = recording._kept.get("code folds")
     if known is None:
         number = recording.totals.sum()
-        density = np.zeros(_COMMON, np.int32 if number < 2**31 else np.int64)
+        folded = np.zeros(_STEPS[-1, 2:].sum(), np.int32 if number < 2**31 else np.int64)
+        density = folded[:_COMMON]
         if recording.events is not None:
             assert recording.events.ticks is not None
             _remainders(recording.events.ticks, density)
         else:
             for _, found in first_stamps(recording):
                 _remainders(found.stamps, density)
-        folded = {_COMMON: density}
-        for whole, part in _STEPS:
-            folded[part] = np.zeros(part, density.dtype if part > 1000 else np.int64)
-            _fold(folded[whole], folded[part])
-        known = recording._kept["code folds"] = {period: folded[period] for period in _FOLDS}
+        _fold(folded, _STEPS)
+        known = recording._kept["code folds"] = {
+            part: folded[first : first + part] for _, _, first, part in _STEPS.tolist() if part in _FOLDS
+        }
     return known  # type: ignore[return-value]
 
 
 @jit
-def _fold(whole, part):
-    """Add up what lies a multiple of a period apart. whole: (times period,); part: (period,), added to."""
-    for first in range(0, whole.size, part.size):
-        for k in range(part.size):
-            part[k] += whole[first + k]
+def _fold(folded, steps):
+    """Add up what lies a multiple of a period apart. steps: (steps, 4), see `_steps`."""
+    for step in range(steps.shape[0]):
+        period = steps[step, 3]
+        part = folded[steps[step, 2] : steps[step, 2] + period]
+        for first in range(steps[step, 0], steps[step, 0] + steps[step, 1], period):
+            whole = folded[first : first + period]
+            for k in range(period):
+                part[k] += whole[k]
 
 
 @jit
