@@ -143,6 +143,8 @@ def test_what_blinks_is_named_and_not_a_map_of_it(tmp_path: Path) -> None:
     for name, value in found.steps[0].values.items():
         assert value.low is not None and value.high is not None
         assert value.low / 1.2 < TRUTH[name] < value.high * 1.2, (name, value)
+    # in the pixels of this chip the numbers are fitted once more; their share keeps its interval
+    assert found.steps[0].values["fraction"].high < 0.2
     hit = hit_in_truth(tmp_path)
     assert found.steps[0].where == f"seen in {hit.sum()} of 256 pixels, which the sensor file has"
     assert found.steps[0].where in " ".join(str(found).split())

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from ..measurement import Measurement
 from .candidates import with_values
-from .coordinates import Coordinate
-from .evaluation import evaluate, square
+from .coordinates import Coordinate, Key, Values
+from .evaluation import block_checks, evaluate, failing, square
 from .exact_likelihood import maximise, not_in_likelihood, recordings
-from .gauss_newton import error_scale
-from .joint_fit import model_of
+from .gauss_newton import error_scale, gauss_newton_step
+from .joint_fit import WORTH, model_of, replicates_of_jacobian, write_values
 from .model_path import ModelPath, keys_of
+from .models import Model
 from .pixel_maps import HALF_95
+from .random_pixels import of_pixels
 from .replicates import FEW
 from .results import Value
 from .signature import captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED, IGNORED
 
+_TURNS = 3  # steps of the fit in the pixels that were hit, which begins near its end
 _MOVED = 0.5  # standard deviations: a larger move of a coordinate needs another evaluation
 
 
@@ -74,6 +80,49 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
                 step.values = values
 
 
+def fit_where_hit(path: ModelPath) -> bool:
+    """Fit all coordinates once more with effects in the pixels that they have hit; whether that was done.
+
+    In replicates of other chips other pixels are hit, and their scatter hides what the pixels of this chip tell. A
+    coordinate that says how many pixels are hit keeps its value. The fit is not taken where another check fails.
+    """
+    replicates = path.replicates
+    hits = {step.candidate.effect: hit.hit for step in path.steps if (hit := path.pixels_hit(step)) is not None}
+    if not hits:
+        return False
+    replicates.say("the numbers of what is in the pixels that were hit")
+
+    def where(values: Values) -> dict[Key, Any]:
+        sensor = with_values(replicates.start, values)
+        return {key: x for effect, hit in hits.items() for key, x in of_pixels(sensor, effect, hit).items()}
+
+    numbers = {key for key, x in where(path.values).items() if np.ndim(x) == 0}  # the same for any strength
+    coordinates = tuple(d for step in path.steps for d in step.coordinates if d.key not in numbers)
+    before, best = path.kept(), None
+    for _ in range(_TURNS if coordinates else 0):
+        here = {d.key: path.values[d.key] for d in coordinates}
+        sensors, maps = model_of(path, where(path.values), hits)
+        there = evaluate(replicates, path.values, sensors)
+
+        def aside(values: Values, sensors: Model = sensors) -> Model:
+            return sensors.changed({**values, **where({**path.values, **values})})
+
+        fit = gauss_newton_step(replicates, there, coordinates, here, aside, replicates_of_jacobian(there))
+        if isinstance(fit, str) or (best is not None and square(there.residuals) > square(best[0].residuals)):
+            break
+        best = there, fit, maps, dict(path.values)
+        if square(there.residuals) - fit.square < WORTH:
+            break
+        path.values = {**path.values, **fit.values}
+    failed = {block.cell for block in path.failed}
+    if best is None or {b.cell for b in failing(block_checks(replicates, best[0], best[0].residuals))} - failed:
+        path.back_to(before)
+        return False
+    path.evaluation, path.fit, maps, path.values = best
+    write_values(path, path.fit, maps)
+    return True
+
+
 def scale_errors(path: ModelPath) -> None:
     """Scale the errors of all fitted values by the misfit of the cells that inform them; see `error_scale`."""
     if path.fit is None:
@@ -104,6 +153,8 @@ def open_ends(path: ModelPath) -> None:
     tests = []
     for step in path.steps:
         for coordinate in step.coordinates:
+            if path.fit is not None and coordinate not in path.fit.coordinates:
+                continue  # it keeps the interval that it had before the model had no use for it
             v = step.values[coordinate.parameter]
             if coordinate in step.candidate.shapes and v.low is not None and v.high is not None and not v.method:
                 tests += [

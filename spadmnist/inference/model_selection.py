@@ -28,7 +28,7 @@ from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
 from .evidence import best_of, evidence_of, judge_maps_by_odd_pixels, worth_fitting
 from .findings import mimicked
-from .intervals import open_ends, scale_errors, sharpen
+from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_GAIN
 from .map_trials import patterns_first, unseen_maps
@@ -117,6 +117,8 @@ def _diagnosed(
     if path.steps and not short:
         with _or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
+    with _or_as_before(path, "the fit in the pixels that were hit"):
+        fit_where_hit(path)
     with _or_as_before(path, "the intervals"):
         scale_errors(path)
     with _or_as_before(path, "the intervals"):

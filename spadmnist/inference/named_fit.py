@@ -23,7 +23,7 @@ from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
-from .intervals import scale_errors
+from .intervals import fit_where_hit, scale_errors
 from .joint_fit import edge_errors, fit_all
 from .model_path import ModelPath, accept, begin, material
 from .replicates import FEW, REPLICATES, Replicates
@@ -94,6 +94,8 @@ def fit_named(
             _by_simulation(path, wanted)
         else:
             _by_likelihood(path, wanted, exact)
+        if fit_where_hit(path):
+            path.last_rung()
         scale_errors(path)
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
