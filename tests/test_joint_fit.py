@@ -49,9 +49,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch, step: float, noise: np.ndarray) -> d
 
     start = {STRENGTH.key: 0.01, SHAPE.key: 1e-7}
     candidate = SimpleNamespace(shapes=(SHAPE,))
-    path: Any = SimpleNamespace(replicates=None, values=start, steps=[SimpleNamespace(candidate=candidate)])
+    steps = [SimpleNamespace(candidate=candidate)]
+    path: Any = SimpleNamespace(replicates=None, values=start, steps=steps, model_at=lambda evaluation, values: None)
     monkeypatch.setattr(joint_fit, "_known_jacobian", lambda path: {})
-    monkeypatch.setattr(joint_fit, "replicates_of_jacobian", lambda evaluation: 8)
+    monkeypatch.setattr(joint_fit, "_recordings", lambda evaluation: 8)
     monkeypatch.setattr(joint_fit, "model_of", lambda path: (None, {}))
     monkeypatch.setattr(joint_fit, "gauss_newton_step", one_step)
     monkeypatch.setattr(joint_fit, "evaluate", lambda replicates, values, sensors: evaluation_at(values, noise))

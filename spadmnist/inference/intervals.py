@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
-
+from ..errors import UNABLE
 from ..measurement import Measurement
 from .candidates import with_values
-from .coordinates import Coordinate, Key, Values
-from .evaluation import block_checks, evaluate, failing, square
+from .coordinates import Coordinate, Key
+from .evaluation import evaluate, square
 from .exact_likelihood import maximise, not_in_likelihood, recordings
-from .gauss_newton import error_scale, gauss_newton_step
-from .joint_fit import WORTH, model_of, replicates_of_jacobian, write_values
+from .gauss_newton import error_scale
+from .joint_fit import fit_all, model_of
 from .model_path import ModelPath, keys_of
-from .models import Model
 from .pixel_maps import HALF_95
-from .random_pixels import of_pixels
 from .replicates import FEW
 from .results import Value
 from .signature import captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED, IGNORED
 
-_TURNS = 3  # steps of the fit in the pixels that were hit, which begins near its end
 _MOVED = 0.5  # standard deviations: a larger move of a coordinate needs another evaluation
 
 
@@ -81,56 +77,48 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
 
 
 def fit_where_hit(path: ModelPath) -> bool:
-    """Fit all coordinates once more with effects in the pixels that they have hit; whether that was done.
+    """Fit effects that hit pixels at random in the pixels that they have hit; whether that fit was taken.
 
     In replicates of other chips other pixels are hit, and their scatter hides what the pixels of this chip tell. A
-    coordinate that says how many pixels are hit keeps its value. The fit is not taken where another check fails.
+    coordinate that says how many pixels are hit keeps its value. Beside a map of pixels, which takes up the excess of
+    those that are hit, nothing is done. A fit by which more fails than before is not taken.
+
+    Raises:
+        SpadError: where the model cannot be simulated; the path is as it was.
     """
-    replicates = path.replicates
     hits = {step.candidate.effect: hit.hit for step in path.steps if (hit := path.pixels_hit(step)) is not None}
-    if not hits:
+    if not hits or any(candidate.carrier for candidate in path.scan.accepted):
         return False
-    replicates.say("the numbers of what is in the pixels that were hit")
-
-    def where(values: Values) -> dict[Key, Any]:
-        sensor = with_values(replicates.start, values)
-        return {key: x for effect, hit in hits.items() for key, x in of_pixels(sensor, effect, hit).items()}
-
-    numbers = {key for key, x in where(path.values).items() if np.ndim(x) == 0}  # the same for any strength
-    coordinates = tuple(d for step in path.steps for d in step.coordinates if d.key not in numbers)
-    before, best = path.kept(), None
-    for _ in range(_TURNS if coordinates else 0):
-        here = {d.key: path.values[d.key] for d in coordinates}
-        sensors, maps = model_of(path, where(path.values), hits)
-        there = evaluate(replicates, path.values, sensors)
-
-        def aside(values: Values, sensors: Model = sensors) -> Model:
-            return sensors.changed({**values, **where({**path.values, **values})})
-
-        fit = gauss_newton_step(replicates, there, coordinates, here, aside, replicates_of_jacobian(there))
-        if isinstance(fit, str) or (best is not None and square(there.residuals) > square(best[0].residuals)):
-            break
-        best = there, fit, maps, dict(path.values)
-        if square(there.residuals) - fit.square < WORTH:
-            break
-        path.values = {**path.values, **fit.values}
-    failed = {block.cell for block in path.failed}
-    if best is None or {b.cell for b in failing(block_checks(replicates, best[0], best[0].residuals))} - failed:
+    path.replicates.say("fitting in the pixels that were hit")
+    before, failed = path.kept(), {block.cell: path.evaluation.square(block.cell) for block in path.failed}
+    try:
+        path.located = hits
+        free = path.free
+        scale_errors(path, {d.key for step in path.steps for d in step.coordinates if d not in free})
+        fit_all(path)
+    except UNABLE:
+        path.back_to(before)
+        raise
+    if any(path.evaluation.square(block.cell) > failed.get(block.cell, 0.0) for block in path.failed):
         path.back_to(before)
         return False
-    path.evaluation, path.fit, maps, path.values = best
-    write_values(path, path.fit, maps)
     return True
 
 
-def scale_errors(path: ModelPath) -> None:
-    """Scale the errors of all fitted values by the misfit of the cells that inform them; see `error_scale`."""
+def scale_errors(path: ModelPath, only: Collection[Key] | None = None) -> None:
+    """Scale the errors of the values of the last fit by the misfit of the cells that inform them; see `error_scale`.
+
+    Args:
+        only: the coordinates; all where it is None.
+    """
     if path.fit is None:
         return
     wider = error_scale(path.fit, path.evaluation)
     factors = {d.key: float(x) for d, x in zip(path.fit.coordinates, wider, strict=True)}
     for step in path.steps:
         for coordinate in step.coordinates:
+            if only is not None and coordinate.key not in only:
+                continue
             step.values[coordinate.parameter] = _scaled(
                 step.values[coordinate.parameter], coordinate, factors.get(coordinate.key, 1.0)
             )
@@ -150,18 +138,18 @@ def open_ends(path: ModelPath) -> None:
 
     The covariance does not show it.
     """
-    tests = []
+    tests, free = [], path.free
     for step in path.steps:
         for coordinate in step.coordinates:
-            if path.fit is not None and coordinate not in path.fit.coordinates:
-                continue  # it keeps the interval that it had before the model had no use for it
+            if coordinate not in free:
+                continue  # it changes nothing here
             v = step.values[coordinate.parameter]
             if coordinate in step.candidate.shapes and v.low is not None and v.high is not None and not v.method:
                 tests += [
                     (step, coordinate, end) for end in (coordinate.low, coordinate.high) if not v.low <= end <= v.high
                 ]
     evaluation, replicates = path.evaluation, path.replicates
-    models = [evaluation.sensors.changed({coordinate.key: end}) for _, coordinate, end in tests]
+    models = [path.model_at(evaluation, {coordinate.key: end}) for _, coordinate, end in tests]
     some = [captures_showing(step.template, IGNORED[0]) for step, _, _ in tests]
     now = square(evaluation.residuals)
     for (step, coordinate, end), signature in zip(

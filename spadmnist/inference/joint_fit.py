@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 _AGAIN = 4  # further fits of all coordinates at the model with the step
 _SAME = 0.35  # of a coordinate: how far a Jacobian holds
-WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
+_WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
@@ -42,14 +43,14 @@ def fit_all(path: ModelPath, fit: Fit | None = None, known: Evaluation | None = 
     """
     sensors, maps = model_of(path)
     evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
-    coordinates = tuple(d for step in path.steps for d in step.coordinates)
+    coordinates = path.free
     found: Fit | None = None
     if coordinates:
         found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit))
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.evaluation = evaluation
     path.fit = found = None if found is None else _bounded(path, found)
-    write_values(path, found, maps)
+    _write_values(path, found, maps)
 
 
 def _gauss_newton(
@@ -73,8 +74,8 @@ def _gauss_newton(
             evaluation,
             coordinates,
             here,
-            evaluation.sensors.changed,
-            replicates_of_jacobian(evaluation),
+            functools.partial(path.model_at, evaluation),
+            _recordings(evaluation),
             errors,
             known,
             near,
@@ -82,7 +83,7 @@ def _gauss_newton(
         if isinstance(closer, str):
             break
         fit = closer
-        if turn == _AGAIN or square(evaluation.residuals) - closer.square < WORTH:
+        if turn == _AGAIN or square(evaluation.residuals) - closer.square < _WORTH:
             break
         before = path.values, maps, evaluation
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
@@ -131,7 +132,7 @@ def _noise_of_square(evaluation: Evaluation) -> float:
     return 2 * math.sqrt(2 / len(own)) * float(np.std(along))
 
 
-def replicates_of_jacobian(evaluation: Evaluation) -> int:
+def _recordings(evaluation: Evaluation) -> int:
     """The number of replicates for a Jacobian: more where the light fluctuates."""
     return min(len(evaluation.replicate_residuals[TOTALS]), _MANY) if evaluation.fluctuates else 2 * FEW
 
@@ -143,16 +144,14 @@ def _bounded(path: ModelPath, fit: Fit) -> Fit:
     """
     replicates, evaluation, coordinates = path.replicates, path.evaluation, fit.coordinates
     there = {d.key: d.value(float(x)) for d, x in zip(coordinates, fit.point, strict=True)}
-    (signature,) = signatures(
-        replicates, evaluation, [evaluation.sensors.changed(there)], replicates_of_jacobian(evaluation)
-    )
+    (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], _recordings(evaluation))
     now = square(evaluation.residuals)
     if isinstance(signature, str) or square(residuals_at(replicates, evaluation, signature)) > now + _LOST:
         return replace(fit, point=point_of(coordinates, path.values), residuals=evaluation.residuals)
     return fit
 
 
-def write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_maps.PixelMap]) -> None:
+def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_maps.PixelMap]) -> None:
     """Write the fitted values of all steps with their intervals; what is no coordinate of the fit stays."""
     if fit is not None:
         place = {d.key: i for i, d in enumerate(fit.coordinates)}
@@ -237,22 +236,17 @@ def _known_jacobian(path: ModelPath) -> dict[Key, dict[Cell, np.ndarray]]:
     return out
 
 
-def model_of(
-    path: ModelPath, where: Mapping[Key, Any] | None = None, located: Collection[str] = ()
-) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
-    """(model with all steps, its maps, fitted to the data).
-
-    Args:
-        where: values under which the effects `located` are in the pixels that they have hit, SI.
-    """
+def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
+    """(model with all steps, its maps, fitted to the data)."""
     replicates, scan = path.replicates, path.scan
     held = [c for c in scan.accepted if c.carrier]
-    chips = any(step.chips and step.candidate.effect not in located for step in path.steps)
+    chips = any(step.chips and step.candidate.effect not in path.located for step in path.steps)
     if not held:
-        return Model.same(replicates.start).changed({**path.values, **(where or {})}, scan.phases, chips), {}
+        values = {**path.values, **path.where(path.values)}
+        return Model.same(replicates.start).changed(values, scan.phases, chips), {}
     levels = count_model.light_levels_of(replicates, path.evaluation)
     sensors, maps, path.values = map_models.models_with_maps(replicates, path.values, held, levels)
-    return sensors.changed(where or {}, scan.phases, chips), maps
+    return sensors.changed({}, scan.phases, chips), maps
 
 
 def without_fit(path: ModelPath) -> Evaluation:

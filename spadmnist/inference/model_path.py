@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from . import held_out
-from .candidates import Candidate
-from .coordinates import Key
+from .candidates import Candidate, with_values
+from .coordinates import Coordinate, Key
 from .error_budget import HeldMaps, Rung, physical_errors
 from .evaluation import BlockCheck, Evaluation, block_checks, failing, mean_misfit
 from .gauss_newton import Fit
 from .joint_fit import fit_all
+from .models import Model
 from .phases import evaluate_start
-from .random_pixels import PixelsHit, pixels_hit
+from .random_pixels import PixelsHit, of_pixels, pixels_hit
 from .replicates import Cell, Replicates
 from .results import Step, title
 from .scan import Scan
 from .signature import template_of
 from .trial import Trial
+
+_ASIDE = 0.01  # of a coordinate: a move that shows whether it changes the model
 
 
 @dataclass
@@ -43,6 +46,40 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
+    # (pixels,) bool by effect: those that it has hit, of effects that the model has in exactly these
+    located: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def free(self) -> tuple[Coordinate, ...]:
+        """The coordinates of all steps that change the model: how many pixels are hit does not where it is known."""
+        every = tuple(d for step in self.steps for d in step.coordinates)
+        if not self.located:
+            return every
+
+        def model(coordinate: Coordinate, by: float) -> dict[Key, Any]:
+            at = coordinate.coordinate(float(self.values[coordinate.key]))
+            values = {**self.values, coordinate.key: coordinate.value(at + by)}
+            return {**values, **self.where(values)}
+
+        def moves(coordinate: Coordinate) -> bool:
+            ends = [model(coordinate, by) for by in (-_ASIDE, _ASIDE)]
+            return any(not np.array_equal(ends[0][key], ends[1][key]) for key in ends[0])
+
+        return tuple(filter(moves, every))
+
+    def where(self, values: Mapping[Key, Any]) -> dict[Key, Any]:
+        """The values under which effects are in the pixels that they have hit, SI; none where these are not known.
+
+        Args:
+            values: of the model, SI.
+        """
+        sensor = with_values(self.replicates.start, values) if self.located else None
+        hits = self.located.items()
+        return {k: x for effect, hit in hits if sensor for k, x in of_pixels(sensor, effect, hit).items()}
+
+    def model_at(self, evaluation: Evaluation, values: Mapping[Key, Any]) -> Model:
+        """The model of an evaluation with some values changed, SI."""
+        return evaluation.sensors.changed({**values, **self.where({**self.values, **values})})
 
     @property
     def held_out(self) -> dict[Cell, np.ndarray]:
@@ -67,12 +104,12 @@ class ModelPath:
         """A copy of all that a step changes, for `back_to`."""
         own = (self.evaluation, dict(self.values), list(self.steps), list(self.ladder), self.fit)
         fitted = [(step, dict(step.values), step.map) for step in self.steps]  # a fit writes into the steps
-        return (*own, list(self.scan.accepted), dict(self.scan.phases), fitted)
+        return (*own, list(self.scan.accepted), dict(self.scan.phases), fitted, dict(self.located))
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """Restore the state that `kept` returned."""
         self.evaluation, self.values, self.steps, self.ladder, self.fit = kept[:5]
-        self.scan.accepted, self.scan.phases, fitted = kept[5:]
+        self.scan.accepted, self.scan.phases, fitted, self.located = kept[5:]
         for step, values, map_ in fitted:
             step.values, step.map = values, map_
 
@@ -112,13 +149,17 @@ class ModelPath:
 
     def pixels_hit(self, step: Step) -> PixelsHit | None:
         """The pixels of the chip that a step's effect has hit; None where that is not known."""
+        effect = step.candidate.effect
+        if effect in self.located:
+            sensor, hit = with_values(self.replicates.start, self.values), self.located[effect]
+            return PixelsHit(hit, of_pixels(sensor, effect, hit))
 
         def made() -> PixelsHit | None:
             with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
-                return pixels_hit(self.replicates, self.evaluation, self.values, step.candidate.effect)
+                return pixels_hit(self.replicates, self.evaluation, self.values, effect)
             return None
 
-        return self.evaluation.once(("pixels hit", step.candidate.effect), made) if step.chips else None
+        return self.evaluation.once(("pixels hit", effect), made) if step.chips else None
 
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from .. import golden
 from ..errors import UNABLE, why
@@ -393,7 +394,10 @@ def _or_confused(path: ModelPath, notes: Notes) -> str:
     if near:
         verdict = "confused"
         with _or_as_before(path, "advice"):
-            notes.advice += experiment_design.between(path.scan, path.evaluation, *near[-1])
+            known, other = near[-1]
+            if path.located and other.sensors is not None:  # it was tried with the pixels of other chips
+                other = replace(other, sensors=other.sensors.changed(path.where(path.values)))
+            notes.advice += experiment_design.between(path.scan, path.evaluation, known, other)
     for step in path.steps:
         unlisted = mimicked(step)
         if unlisted is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -11,7 +13,7 @@ from scipy import stats
 
 from .. import golden
 from ..effects import Effect
-from ..errors import InputError, did_you_mean
+from ..errors import UNABLE, InputError, did_you_mean
 from ..measurement import Measurement
 from ..sensor import Sensor
 from ..workers import Executor, executor
@@ -94,8 +96,6 @@ def fit_named(
             _by_simulation(path, wanted)
         else:
             _by_likelihood(path, wanted, exact)
-        if fit_where_hit(path):
-            path.last_rung()
         scale_errors(path)
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
@@ -142,7 +142,10 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[s
     elif path.fit is not None:
         free, matrix = tuple(coordinate.key for coordinate in path.fit.coordinates), path.fit.covariance
         spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        correlations = matrix / np.outer(spread, spread)
+        held = tuple(d.key for step in path.steps for d in step.coordinates if d.key not in free)
+        correlations = np.eye(len(free) + len(held))  # what keeps the value of an earlier fit is taken as independent
+        correlations[: len(free), : len(free)] = matrix / np.outer(spread, spread)
+        free += held
     results = {
         (s.candidate.effect, name): v for s in path.steps if not s.candidate.carrier for name, v in s.values.items()
     }
@@ -195,13 +198,16 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             _kept(path, candidate)
             continue
         accept(path, best, math.sqrt(max(best.evidence, 0.0)))
+    with contextlib.suppress(*UNABLE):  # the fit by other chips stands
+        if fit_where_hit(path):
+            path.last_rung()
     ends: dict[Key, tuple[float, float]] = {}
-    coordinates = tuple(d for step in path.steps for d in step.coordinates)
+    coordinates = path.free
     if coordinates:
         replicates.say("intervals")
         # the values of the evaluation, one step away from the fitted ones
         here = {d.key: path.evaluation.values.get(d.key, path.values[d.key]) for d in coordinates}
-        sensors, few = path.evaluation.sensors.changed, 2 * FEW
+        sensors, few = functools.partial(path.model_at, path.evaluation), 2 * FEW
         fit = gauss_newton_step(replicates, path.evaluation, coordinates, here, sensors, few, edge_errors(path))
         if isinstance(fit, Fit):
             fit = replace(fit, point=point_of(coordinates, path.values))

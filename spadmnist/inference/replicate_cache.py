@@ -7,6 +7,7 @@ damaged, is simulated again. The oldest entries are removed when there are too m
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -114,12 +115,12 @@ def unpacked(data: bytes) -> CaptureReplicates | None:
         facts, arrays, at = from_json(head), {}, 0
         for name, (kind, shape) in facts["arrays"].items():
             number = math.prod(shape)
-            arrays[name] = np.frombuffer(rest, kind, number, at).reshape(shape)
+            arrays[name] = np.frombuffer(rest, np.dtype(kind), number, at).reshape(shape).copy()
             at += arrays[name].nbytes
         laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts["laws"].items()}
-        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64) for statistic in laws}
+        values = {statistic: arrays[f"values/{statistic}"].astype(np.float64, copy=False) for statistic in laws}
         return CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
         return None
 
 
@@ -146,10 +147,13 @@ def _intact(data: bytes) -> tuple[bytes, memoryview]:
 
 
 def _make_room(folder: Path) -> None:
-    entries = sorted(folder.glob("*.*"), key=lambda path: path.stat().st_mtime, reverse=True)
+    facts = {}
+    for path in folder.glob("[!.]*"):  # those of earlier programs, too, and none that is being written
+        with contextlib.suppress(FileNotFoundError):
+            facts[path] = path.stat()
     total = 0
-    for path in entries:
-        total += path.stat().st_size
+    for path in sorted(facts, key=lambda path: facts[path].st_mtime, reverse=True):
+        total += facts[path].st_size
         if total > _MOST_BYTES:
             path.unlink(missing_ok=True)
 

@@ -69,7 +69,7 @@ def _poisson_score_of_one(count: float, mean: float, share: float) -> float:
 
 
 def wilson_hilferty(count: Any, mean: Any) -> Any:
-    """Score of a count of Poisson law, a number or an array, for means that are not small."""
+    """Score of a count of Poisson law with its share added, a number or an array, for means that are not small."""
     return 3.0 * np.sqrt(count) * (1.0 - 1.0 / (9.0 * count) - np.cbrt(mean / count))
 
 
@@ -235,7 +235,10 @@ def pooled_score(number: float, law: Pairs, share: float) -> float:
     mean, variance, third = (float(part) for part in law)
     if mean < _SPARSE and third <= 1.2 * variance:
         return _poisson_score_of_one(max(0.0, float(round(number))), mean, share)
-    score = float(_cube_root_score(number + share - 0.5, mean, variance, third)) if variance > 0 else 0.0
+    above = number + share - 0.5
+    if third == 0:
+        return (above - mean) / math.sqrt(variance) if variance > 0 else 0.0
+    score = float(_cube_root_score(above, mean, variance, third)) if variance > 0 else 0.0
     if mean >= _SPARSE:
         return score
     shape, scale = 4.0 * variance**3 / third**2, 2.0 * variance / third

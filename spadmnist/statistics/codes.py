@@ -141,7 +141,7 @@ def _folds(recording: Recording) -> dict[int, np.ndarray]:
                 _remainders(found.stamps, density)
         _fold(folded, _STEPS)
         known = recording._kept["code folds"] = {
-            part: folded[first : first + part] for _, _, first, part in _STEPS.tolist() if part in _FOLDS
+            part: folded[first : first + part].copy() for _, _, first, part in _STEPS.tolist() if part in _FOLDS
         }
     return known  # type: ignore[return-value]
 
