@@ -22,7 +22,7 @@ def value_of(text: str) -> Any:
 
 
 def problems(text: str) -> tuple[str, ...]:
-    """What is wrong with a text: one line each, found in less than a second."""
+    """What is wrong with a text: one line each, found in less than three seconds."""
     with within(3), pytest.raises(ConfigError) as caught:
         document.parse(text, "f.yaml")
     assert caught.value.problems and all(p.startswith("f.yaml") and "\n" not in p for p in caught.value.problems)
