@@ -173,3 +173,14 @@ def test_shares_are_a_function_of_what_they_are_for() -> None:
     assert abs(np.corrcoef(found, changed)[0, 1]) < 5 / math.sqrt(found.size)
     # the same counts in other pixels are another recording
     assert not np.array_equal(scores.shares(counts[::-1], 100), scores.shares(counts, 100))
+
+
+@pytest.mark.parametrize("mean", [0.05, 0.3, 2.0, 40.0])
+def test_scores_of_few_share_less_than_their_counts(mean: float) -> None:
+    """Of few counts a part of the score is chance. Drawn correlations scatter by 0.003; the law is good to 0.005."""
+    rng = np.random.default_rng(5)
+    one, two = rng.poisson(mean, (2, 100_000)).astype(float)
+    z = [scores.poisson_score(n, m, rng.random(n.size)) for n, m in ((one, mean), (one + two, 2 * mean))]
+    counted = [scores.Pairs(*(np.asarray(m) for _ in range(3))) for m in (mean, 2 * mean)]
+    first, shared = scores.nested(counted)
+    assert first == 0 and shared == pytest.approx(np.corrcoef(z)[0, 1], abs=0.02)
