@@ -181,7 +181,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_answer(lab, few, tmp_path
     whole = diagnose(*made, quick=True, jobs=1)
     with pytest.raises(Stopped):
         diagnose(*made, quick=True, jobs=1, keep=stop, journal=Journal(folder))
-    entries = sorted(folder.glob("*.npz"))
+    entries = sorted(folder.glob("*.replicates"))
     held = sum(path.stat().st_size for path in entries)
     assert len(entries) > 10 and Journal(folder).bytes == held
     entries[0].write_bytes(entries[0].read_bytes()[:-1] + b"x")
