@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -11,11 +12,13 @@ from tinylab import bench_of, change_of, quiet
 
 import spadmnist
 from spadmnist import config, measurement, twin
-from spadmnist.errors import UNABLE
+from spadmnist.errors import UNABLE, SpadError
 from spadmnist.inference import random_pixels
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.comparison import comparison_with
 from spadmnist.inference.evaluation import block_checks, evaluate, failing
+from spadmnist.inference.intervals import fit_where_hit
+from spadmnist.inference.model_path import ModelPath, accept
 from spadmnist.inference.models import Model
 from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
@@ -132,6 +135,32 @@ def test_what_blinks_is_fitted_by_its_own_scatter(tmp_path: Path, monkeypatch: p
     assert seen is not None and np.array_equal(seen.hit, hit_in_truth(tmp_path))
     assert comparison_with(replicates, {**found.values, **seen.values}).verdict == "adequate"
     assert comparison_with(replicates, found.values).verdict == "fails"  # other pixels blink
+
+    # in these pixels its numbers are known better; and none is taken that is worse, or that cannot be simulated
+    path = ModelPath(replicates, look, evaluation, {}, [], [])
+    (step,) = accept(path, found, 100.0)
+    values, kept, far = dict(path.values), dict(step.values), path.evaluation
+
+    def fails(path: ModelPath) -> None:
+        path.values, path.evaluation = {}, wrong
+
+    def breaks(path: ModelPath) -> None:
+        path.values = {}
+        raise SpadError("not today")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("spadmnist.inference.intervals.fit_all", fails)
+        assert not fit_where_hit(path)
+        patch.setattr("spadmnist.inference.intervals.fit_all", breaks)
+        with pytest.raises(SpadError, match="not today"):
+            fit_where_hit(path)
+    assert (path.values, step.values, path.evaluation, path.located) == (values, kept, far, {})
+    assert fit_where_hit(path) and np.array_equal(path.located[NAME], seen.hit)
+    assert {d.parameter for d in path.free} == {"amplitude", "rate_on", "rate_off"}
+    widths = [math.log(v.high / v.low) for v in (kept["amplitude"], step.values["amplitude"])]  # type: ignore[operator]
+    # five standard errors
+    assert abs(math.log(step.values["amplitude"].value / 5000)) < 5 / 3.92 * widths[1] < 5 / 3.92 * 0.9 * widths[0]
+    assert not failing(block_checks(replicates, path.evaluation, path.evaluation.residuals))
 
 
 @pytest.mark.slow

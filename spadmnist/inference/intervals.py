@@ -90,7 +90,7 @@ def fit_where_hit(path: ModelPath) -> bool:
     if not hits or any(candidate.carrier for candidate in path.scan.accepted):
         return False
     path.replicates.say("fitting in the pixels that were hit")
-    before, failed = path.kept(), {block.cell: path.evaluation.square(block.cell) for block in path.failed}
+    before, failed = path.kept(), {block.cell: block.p for block in path.failed}
     try:
         path.located = hits
         free = path.free
@@ -99,7 +99,7 @@ def fit_where_hit(path: ModelPath) -> bool:
     except UNABLE:
         path.back_to(before)
         raise
-    if any(path.evaluation.square(block.cell) > failed.get(block.cell, 0.0) for block in path.failed):
+    if any(block.p < failed.get(block.cell, 1.0) for block in path.failed):
         path.back_to(before)
         return False
     return True
