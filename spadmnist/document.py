@@ -29,6 +29,16 @@ class _Loader(yaml.SafeLoader):
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # PyYAML's name
+        """Refuse a bracket too deep as it is met: of nested brackets the time grows with the square."""
+        if self.flow_level > _DEEPEST:
+            raise _TooDeepError(self.get_mark().line + 1)
+        super().fetch_flow_collection_start(TokenClass)
+
+
+class _TooDeepError(Exception):
+    """Brackets are nested too deeply; its argument is the line."""
+
 
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
@@ -115,6 +125,8 @@ def _compose(text: str, name: str) -> Any:
         raise ConfigError([f"{name}{line}: is not well-formed YAML: {_without_text(error)}"]) from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError([f"{name}: is not well-formed YAML: {' '.join(str(error).split())}"]) from None
+    except _TooDeepError as error:
+        raise ConfigError([f"{name}:{error.args[0]}: is nested more than {_DEEPEST} deep"]) from None
     except RecursionError:
         raise ConfigError([f"{name}: is nested too deeply"]) from None
 

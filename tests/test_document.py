@@ -22,8 +22,8 @@ def value_of(text: str) -> Any:
 
 
 def problems(text: str) -> tuple[str, ...]:
-    """What is wrong with a text: one line each, found in less than three seconds."""
-    with within(3), pytest.raises(ConfigError) as caught:
+    """What is wrong with a text: one line each, found in less than a second."""
+    with within(1), pytest.raises(ConfigError) as caught:
         document.parse(text, "f.yaml")
     assert caught.value.problems and all(p.startswith("f.yaml") and "\n" not in p for p in caught.value.problems)
     return caught.value.problems
@@ -202,7 +202,7 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 
 def unreadable(path: Path) -> str:
-    with within(3), pytest.raises((InputError, ConfigError)) as caught:
+    with within(1), pytest.raises((InputError, ConfigError)) as caught:
         document.read(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     return str(caught.value)

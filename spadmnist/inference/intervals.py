@@ -77,11 +77,15 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
 
 
 def fit_where_hit(path: ModelPath) -> bool:
-    """Fit effects that hit pixels at random in the pixels that they have hit; whether that fit was taken.
+    """Fit the model once more, with effects that hit pixels at random in the pixels that they have hit.
 
-    In replicates of other chips other pixels are hit, and their scatter hides what the pixels of this chip tell. A
-    coordinate that says how many pixels are hit keeps its value. Beside a map of pixels, which takes up the excess of
-    those that are hit, nothing is done. A fit by which more fails than before is not taken.
+    Replicates of other chips have the effect in other pixels. Their scatter hides what the pixels of this chip show. A
+    coordinate that changes nothing here, the share of the pixels, keeps its value and its interval. A model with a map
+    of pixels is left as it is: the map has taken up the excess of these pixels. The fit is not taken where a check
+    fails that passed before, or fails more clearly.
+
+    Returns:
+        Whether the fit was taken.
 
     Raises:
         SpadError: where the model cannot be simulated; the path is as it was.
@@ -142,7 +146,7 @@ def open_ends(path: ModelPath) -> None:
     for step in path.steps:
         for coordinate in step.coordinates:
             if coordinate not in free:
-                continue  # it changes nothing here
+                continue  # it does not change the model, so that no end of its range is excluded
             v = step.values[coordinate.parameter]
             if coordinate in step.candidate.shapes and v.low is not None and v.high is not None and not v.method:
                 tests += [

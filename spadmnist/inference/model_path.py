@@ -25,7 +25,9 @@ from .scan import Scan
 from .signature import template_of
 from .trial import Trial
 
-_ASIDE = 0.01  # of a coordinate: a move that shows whether it changes the model
+# of a coordinate (a logarithm, mostly): a move by which it is decided whether the coordinate changes the model. Any
+# that is not rounded off does
+_ASIDE = 0.01
 
 
 @dataclass
@@ -46,12 +48,15 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
-    # (pixels,) bool by effect: those that it has hit, of effects that the model has in exactly these
+    # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
     located: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def free(self) -> tuple[Coordinate, ...]:
-        """The coordinates of all steps that change the model: how many pixels are hit does not where it is known."""
+        """The coordinates of all steps that change the model.
+
+        The share of the pixels that an effect hits does not, where it is known which ones it has hit.
+        """
         every = tuple(d for step in self.steps for d in step.coordinates)
         if not self.located:
             return every

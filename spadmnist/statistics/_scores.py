@@ -204,6 +204,7 @@ def gamma_score(number: np.ndarray | float, law: Pairs) -> np.ndarray:
 
 
 def _cube_root_score(number: Any, mean: Any, variance: Any, third: Any) -> Any:
+    """`gamma_score` of a number or an array, where variance and third cumulant are more than 0."""
     shape = 4.0 * variance**3 / third**2
     ratio = 1.0 + (number - mean) * third / (2.0 * variance**2)
     return 3.0 * np.sqrt(shape) * (np.cbrt(ratio) - 1.0 + 1.0 / (9.0 * shape))
