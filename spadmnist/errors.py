@@ -30,7 +30,13 @@ class UnknownName(KeyError):
 
 
 class EffectError(SpadError):
-    """An effect's own code failed, or returned what no effect may return."""
+    """An effect's own code failed, or returned what no effect may return.
+
+    Attributes:
+        plugin: name of the effect or the statistic, where it is known.
+    """
+
+    plugin: str = ""
 
 
 # What says of a model that it cannot be simulated: of a candidate, then, that it is none.

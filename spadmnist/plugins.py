@@ -714,9 +714,17 @@ def load_carried(files: Iterable[Carried]) -> None:
 
 
 def blame(cls: type[Plugin], error: BaseException) -> EffectError:
-    """An error that a plug-in's own code raised, as a sentence with the plug-in, its file and the line."""
-    place = _place(error, Path(source_file(cls)))
-    return EffectError(f"{place}: the {cls.registry.kind} {cls.name} failed: {_what(error)}")
+    """An error that a plug-in's own code raised, as a sentence with the plug-in, its file and the line.
+
+    By a ValueError an effect of the package refuses the user's values: then it is its sentence, without a file.
+    """
+    which = f"the {cls.registry.kind} {cls.name}"
+    if is_built_in(cls) and isinstance(error, ValueError) and str(error):
+        blamed = EffectError(f"{which}: {error}")
+    else:
+        blamed = EffectError(f"{_place(error, Path(source_file(cls)))}: {which} failed: {_what(error)}")
+    blamed.plugin = cls.name
+    return blamed
 
 
 @contextlib.contextmanager

@@ -325,6 +325,18 @@ def test_a_cascade_without_end_is_refused(tmp_path: Path, probability: str) -> N
     config.read_sensor(tmp_path / "paper.yaml")
 
 
+@pytest.mark.parametrize(
+    ("effect", "value"), [("readout_loss: {queue: 2.5}", "not 2.5"), ("short_gate: {fraction: 0}", "more than 0")]
+)
+def test_what_an_effect_refuses_is_said_at_its_line_without_a_place_in_the_program(
+    tmp_path: Path, effect: str, value: str
+) -> None:
+    said = refused(tmp_path, more=f"    {effect}\n")
+    name = effect.partition(":")[0]
+    assert f"sensor.yaml:9: sensor.effects.{name}: the effect {name}: " in said and value in said
+    assert ".py" not in said and "Error" not in said
+
+
 def test_a_map_is_compared_before_it_is_read(tmp_path: Path) -> None:
     """10^12 entries are declared, and the file is as long as that, with nothing in it."""
     with open(tmp_path / "map.npy", "wb") as file:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from .. import document, plugins, reconstruct, units
 from ..document import Path_
 from ..effects import Conditions, Effect, in_order
-from ..errors import ConfigError, InputError, SpadError, did_you_mean
+from ..errors import ConfigError, EffectError, InputError, SpadError, did_you_mean
 from ..events import MOST_PIXELS, Layout
 from ..experiment import Level
 from ..positions import read_positions
@@ -250,7 +250,8 @@ class _Reader(Reader):
             made = sensor.resolved()
             self.check_cascade(made, path)
         except SpadError as error:  # of an effect that looks at what it was given, as its chip is made
-            self.say((*path, "effects"), str(error))
+            named = error.plugin if isinstance(error, EffectError) else ""
+            self.say((*path, "effects", *([named] if named else [])), str(error))
         return made if len(self.problems) == before else None
 
     def check_cascade(self, sensor: Sensor, path: Path_) -> None:

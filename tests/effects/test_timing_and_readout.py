@@ -465,7 +465,7 @@ def test_codes_drawn_for_a_chip() -> None:
 def test_a_chip_that_cannot_be(effects: list[Effect], says: str) -> None:
     with pytest.raises((EffectError, InputError), match=says) as caught:
         sensor(2, *effects)
-    assert f"{effects[0].name}.py" in str(caught.value)
+    assert f"the effect {effects[0].name}: " in str(caught.value) and ".py" not in str(caught.value)
 
 
 # ---- the gate ---------------------------------------------------------------------------------------------
