@@ -101,6 +101,8 @@ def histogram_is(
         if probability.sum() > 1 - 1e-12 or top > 1_000_000:
             break
         top *= 2
+    if not np.all(probability >= 0) or not probability.sum() < 1 + 1e-9:
+        raise ValueError(f"{what}: these are no probabilities; their sum is {probability.sum():.6g}")
     probability[-1] += max(0.0, 1 - probability.sum())
     observed = np.bincount(x, minlength=probability.size).astype(float)
     expected = probability * x.size
@@ -108,7 +110,7 @@ def histogram_is(
     observed, expected = _fold(observed, bins), _fold(expected, bins)
     freedom = expected.size - 1
     if freedom == 0:
-        return _judge(1.0, alpha, what, "one bin", "one bin")
+        raise ValueError(f"{what}: the law has all values in one bin, so that nothing is tested")
     deviance = 2 * float(_xlogy(observed, observed / expected).sum())
     williams = 1 + (float((x.size / expected).sum()) - 1) / (6 * x.size * freedom)
     p = float(stats.chi2.sf(deviance / williams, freedom))
@@ -215,7 +217,7 @@ def _judge(p: float, alpha: float, what: str, observed: str, expected: str) -> f
 
 
 def _two_tails(lower: float, upper: float) -> float:
-    return min(1.0, 2 * float(min(lower, upper)))
+    return float(np.minimum(1.0, 2 * np.minimum(lower, upper)))  # a NaN stays one, and `_judge` refuses it
 
 
 def _sample(values: ArrayLike, least: int) -> NDArray[np.float64]:

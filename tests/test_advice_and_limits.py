@@ -16,11 +16,11 @@ from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.conclusion import Notes, verdict_of
 from spadmnist.inference.coordinates import Key
-from spadmnist.inference.elimination import drop_mimics, drop_needless, in_vain
+from spadmnist.inference.elimination import drop_needless, drop_unexplaining, no_step_explains
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.experiment_design import _apart, between
-from spadmnist.inference.map_trials import unseen_maps
+from spadmnist.inference.map_trials import random_map_trials
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.replicates import TOTALS, Replicates
@@ -191,16 +191,16 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
         step.template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
     monkeypatch.setattr("spadmnist.inference.elimination.fit_all", lambda path, fit=None: None)
     assert path.failed
-    drop_mimics(path, start, True)
+    drop_unexplaining(path, start, True)
     assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
     # what is left is kept if it explains nearly all, whatever its own cells have
     foul = with_residuals(end, {"neighbours": 5.0})
     path.evaluation = foul
-    drop_mimics(path, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}), True)
+    drop_unexplaining(path, with_residuals(end, {"neighbours": 10.0, "intervals": 100.0}), True)
     assert names(path) == ["add crosstalk"]
     # and nothing is left of steps that made all of it worse
     path.evaluation = with_residuals(end, {"intervals": 30.0})
-    drop_mimics(path, start, True)
+    drop_unexplaining(path, start, True)
     assert not path.steps and not path.values and path.evaluation is start
 
 
@@ -210,15 +210,15 @@ def test_two_steps_that_only_look_alike_are_the_last(lab):
     start = with_residuals(path.evaluation, {"neighbours": 10.0, "intervals": 10.0})
     end = with_residuals(path.evaluation, {"neighbours": 9.0, "intervals": 9.0})
     for candidate, values in (("add crosstalk", {CROSSTALK: 0.03}), ("add afterpulsing", {PROBABILITY: 0.05})):
-        assert not in_vain(path, True)
+        assert not no_step_explains(path, True)
         taken(path, candidate, values, fitted=False)
         path.evaluation = end
         path.steps[-1].before = dict(start.residuals)
         name = "neighbours" if candidate == "add crosstalk" else "intervals"
         path.steps[-1].template = {c: np.full(len(z), float(c[1] == name)) for c, z in end.residuals.items()}
-    assert path.failed and in_vain(path, True)
+    assert path.failed and no_step_explains(path, True)
     path.evaluation = with_residuals(path.evaluation, {"intervals": 9.0})
-    assert path.failed and not in_vain(path, True)
+    assert path.failed and not no_step_explains(path, True)
 
 
 @pytest.mark.parametrize("totals", [True, False])
@@ -235,7 +235,7 @@ def test_totals_that_the_set_up_explains_take_no_step_away(lab, totals):
     path.evaluation.residuals[TOTALS][:] = 20.0
     path.scan.phases = {("flat", ("flicker", "phase")): 1.0}
     assert path.failed
-    drop_mimics(path, start, totals)
+    drop_unexplaining(path, start, totals)
     assert names(path) == ([] if totals else ["add crosstalk"])
     assert path.scan.phases == ({} if totals else {("flat", ("flicker", "phase")): 1.0})
 
@@ -332,7 +332,7 @@ def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, t
     path.evaluation = replace(path.evaluation, residuals=seen)
     one = given(path, name, values, fitted=True)
     one.evidence = evidence_of(path.replicates, path.evaluation, one)
-    found = unseen_maps(path.scan, path.evaluation, {}, one)
+    found = random_map_trials(path.scan, path.evaluation, {}, one)
     assert [t.candidate.effect for t in found if t.candidate.name == "per_pixel dead_time.duration"] == alike
     assert one.evidence > 100 and all(t.evidence > one.evidence - tie(one.evidence) for t in found)
 

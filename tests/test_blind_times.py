@@ -123,7 +123,7 @@ def test_how_wide_the_edges_of_pixels_lie_is_in_its_interval(spread: float, jitt
     assert found.high - found.low < 0.35 * spread + 0.006
     own = float(np.mean(np.log(unlike(spread) / DEAD)))
     assert abs(found.middle - own) < 1.5e-3 + 0.3 * tick / DEAD
-    assert (found.gain > 10) == (spread > 0)
+    assert (found.likelihood_ratio > 10) == (spread > 0)
 
 
 def test_a_few_odd_pixels_are_not_the_width_of_all() -> None:

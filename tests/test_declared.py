@@ -235,7 +235,7 @@ def test_a_map_is_fitted_by_the_statistic_that_a_user_declares(tmp_path) -> None
     replicates, depth = waves(tmp_path)
     evaluation, look = evaluate(replicates, {}), quiet(replicates)
     (one,) = [t for t in look.again(evaluation, {}, []) if t.candidate.carrier == DEPTH]
-    assert one.chance is not None and one.chance < 1e-6 and one.maps is not None
+    assert one.p_value is not None and one.p_value < 1e-6 and one.maps is not None
     early, late = Statistic.registry.find("halves_of_pixels")().halves(replicates.recording("lit"))
     error = np.sqrt((1 - depth**2) / (early + late)) / depth  # of a logarithm, by the binomial law
     apart = (one.maps[DEPTH].raw - np.log(depth / 0.2)) / error
@@ -256,7 +256,7 @@ def test_a_map_is_fitted_by_the_statistic_that_a_user_declares(tmp_path) -> None
         ("halves_of_pixel", RIGHT, "informed_by names no statistic that is loaded, 'halves_of_pixel'; there are"),
         ("pixel_fano", RIGHT, "the statistic pixel_fano defines no unit_likelihood"),
         ("halves_of_pixels", f"({RIGHT}).T", r"unit_likelihood must be \(36, \d+\) without nan, not \(\d+, 36\)"),
-        ("halves_of_pixels", f"0 * ({RIGHT})", "tells depth of fewer than two pixels"),
+        ("halves_of_pixels", f"0 * ({RIGHT})", "informs depth of fewer than two pixels"),
         ("halves_of_pixels", "1 / 0", r"wave\.py:\d+: the statistic halves_of_pixels failed: ZeroDivisionError"),
     ],
 )

@@ -96,14 +96,14 @@ def test_a_dead_time_is_fitted_and_a_map_found(tmp_path, made):
         levels = light_levels_of(replicates, evaluation)
         found = fit_maps(replicates, {}, [candidate], levels)[candidate.carrier]
         assert np.corrcoef(found.estimate, np.log(map_))[0, 1] > 0.95
-        assert summary(found)["sigma"] == pytest.approx(0.1, rel=0.35)
+        assert summary(found)["sigma"] == pytest.approx(float(np.std(np.log(map_))), rel=0.1)
         length = next(c for c in candidates(sensor) if c.name == "set dead_time.duration")
         values = {("dead_time", "duration"): 55e-9}
         fit = gauss_newton(
             replicates, evaluation, length.coordinates, values, lambda v: Model.same(with_values(sensor, v))
         )
     value, low, high = fit.interval(0)
-    assert abs(value - 60e-9) < max(2e-9, high - low)
+    assert high - low < 2e-9 and abs(value - 60e-9) < 1.3 * (high - low)  # five standard errors
 
 
 def test_what_cannot_be_fitted_is_told(tmp_path, made):
@@ -410,7 +410,7 @@ def test_lazy_pixels_have_an_interval():
     one = PixelMap(("detection", "relative"), 1.0, np.arange(400), pulled, error, logs, error, 0.01)
     told = map_values(one)["low_ratio"]
     assert told.low < 0.5 < told.high
-    assert (told.high - told.low) / 2 == pytest.approx(1.96 * 0.5 * 0.1 / 4, rel=0.5)
+    assert (told.high - told.low) / 2 == pytest.approx(1.96 * told.value * np.std(logs[:16], ddof=1) / 4, rel=1e-3)
     assert told.value == pytest.approx(np.exp(logs[:16]).mean() / np.exp(np.median(logs)), rel=2e-3)
     logs[:16] = pulled[:16] = 0.0
     assert map_values(one)["low_ratio"].low is None
@@ -426,7 +426,7 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after(monkeypatch):
     closed_form(monkeypatch, lambda a: 5 + a + rng.standard_normal(30) * (1 + 3 * len(asked)), asked)
     evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, {})
     gauss_newton(None, evaluation, [coordinate], {coordinate.key: 0.0}, lambda v: v, rounds=8)
-    assert sum(n > 1 for n in asked) <= 4 < 16
+    assert 1 <= sum(n > 1 for n in asked) <= 4
 
 
 def test_what_cannot_be_fitted_is_told_with_what_can(made):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bz2
-import contextlib
 import gzip
 import hashlib
 import http.server
@@ -749,11 +748,14 @@ def test_of_a_damaged_picture_nothing_but_the_sentence_is_said(
 ) -> None:
     whole = as_tiff(GREY)
     (tmp_path / "f").mkdir()
+    refusals = 0
     for size in range(8, len(whole), 7):  # Pillow warns of tags that lie beyond the end
         (tmp_path / "f" / "bad.tif").write_bytes(whole[:size])
-        with contextlib.suppress(InputError):
+        try:
             load_folder(tmp_path / "f")
-    assert not recwarn.list
+        except InputError:
+            refusals += 1
+    assert refusals >= 5 and not recwarn.list
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ class Broken:
     """Sensors that have an effect cannot be simulated from some moment on. armed: is it now?"""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, effect: str, error: BaseException, armed: bool):
-        self.armed, self.raised = armed, 0
+        self.armed, self.raised, self.entered = armed, 0, False
         usual = Sensor.expose
 
         def expose(sensor: Sensor, *given: Any, **named: Any) -> Any:
@@ -57,7 +57,7 @@ class Broken:
         usual: Callable[..., Any] = getattr(place, name)
 
         def there(*given: Any, **named: Any) -> Any:
-            self.armed = True
+            self.armed = self.entered = True
             try:
                 return usual(*given, **named)
             finally:
@@ -137,6 +137,7 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
     )
     found = diagnose(sensor, data, quick=True, max_steps=1, jobs=1)
     told = [e for e in found.untried if e["effect"] == "afterpulsing"]
+    assert broken.entered
     if stage not in ("taking out", "likelihood", "intervals", "limits"):  # which may need no recording of it
         assert broken.raised
     assert bool(told) == bool(broken.raised)

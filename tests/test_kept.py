@@ -58,7 +58,7 @@ def same_bytes(root: Path, manifest: dict[str, Any]) -> None:
         return
     make(root / "config.yaml", root.parent / "anew")
     anew = json.loads((root.parent / "anew" / "manifest.json").read_text())
-    outcome, why = said_of_files(files_of(anew), files_of(manifest), HERE, manifest["versions"])
+    outcome, why = said_of_files(files_of(anew), files_of(manifest), HERE, manifest["versions"], "zarr")
     if outcome == "skip":
         pytest.skip(f"kept.zip: {why}")
 

@@ -179,3 +179,20 @@ def test_too_few_values_are_refused() -> None:
             call([1, 2, 3], np.arange(1000))
     with pytest.raises(ValueError, match="whole numbers"):
         laws.same_histogram(np.full(100, 0.5), np.ones(100))
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda: laws.poisson_mean(5, math.nan),
+        lambda: laws.share_is(3, 10, 1.4),
+        lambda: laws.share_is(3, 10, -0.2),
+        lambda: laws.same_poisson(5, math.nan, 5, 1.0),
+        lambda: laws.histogram_is(np.arange(20), lambda k: np.full(k.shape, 0.5)),
+        lambda: laws.histogram_is(np.arange(20), lambda k: np.full(k.shape, math.nan)),
+        lambda: laws.histogram_is(np.zeros(20), lambda k: (k == 3).astype(float)),
+    ],
+)
+def test_what_is_no_law_passes_nothing(asked: Callable[[], float]) -> None:
+    with np.errstate(invalid="ignore"), pytest.raises((AssertionError, ValueError)):
+        asked()

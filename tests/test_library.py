@@ -179,7 +179,7 @@ def test_a_measurement_of_arrays_needs_captures() -> None:
 def test_a_sensor_shows_itself_and_changes() -> None:
     one = sensor(name="lab\x1b[2J")
     assert "lab\\x1b[2J: 3 x 5 pixels of 25 um^2, fill factor 0.5, rules: device" in repr(one)
-    assert "dark         dark_counts  rate         2 kHz" in " ".join(repr(one).split(" ")) or "2 kHz" in repr(one)
+    assert "dark dark_counts rate 2 kHz" in " ".join(repr(one).split())
     assert "\x1b" not in repr(one) + one._repr_html_()
     more = one.with_effect(sp.effects.Crosstalk(probability=0.01)).with_values({"dark_counts.rate": 250.0})
     assert more.effect("crosstalk").probability == 0.01 and more.effect("dark_counts").rate == 250.0

@@ -40,10 +40,10 @@ def test_a_gradient_is_a_gradient_and_no_pattern_of_rows(slope: float, spread: f
     """However clear it is, and where pixels differ as well: evidence of a fixed seed, beside 0 within a few."""
     rng = np.random.default_rng(8)
     found = told(rng, 1 + slope * DOWN, spread)
-    assert found["gradient"].beside > 20 and found["gradient"].beside > found["rows"].beside + 5
-    assert found["columns"].beside < 6
+    assert found["gradient"].given_pixels > 20 and found["gradient"].given_pixels > found["rows"].given_pixels + 5
+    assert found["columns"].given_pixels < 6
     found = told(rng, 1 + slope * rng.standard_normal(SIDE)[ROWS] / 3, spread)
-    assert found["rows"].beside > 12 and found["rows"].beside > found["gradient"].beside + 5
+    assert found["rows"].given_pixels > 12 and found["rows"].given_pixels > found["gradient"].given_pixels + 5
 
 
 def test_what_chance_has_of_patterns_has_no_evidence() -> None:
@@ -51,7 +51,7 @@ def test_what_chance_has_of_patterns_has_no_evidence() -> None:
     rng = np.random.default_rng(5)
     found = [told(rng, np.ones(N), 0.05) for _ in range(100)]
     for name in PATTERNS:
-        evidence = np.array([one[name].beside for one in found])
+        evidence = np.array([one[name].given_pixels for one in found])
         assert evidence.max() < 12 and np.mean(evidence) < 0, name
         # over pixels that are all alike it has some of what differs, and far less than pixels that differ
         alone, pixels = (np.array([getattr(one[name], of) for one in found]) for of in ("alone", "pixels"))
@@ -78,7 +78,7 @@ def test_what_is_no_pattern_has_no_evidence() -> None:
     y, error = np.arange(8.0), np.ones(8)
     none = {"each": np.arange(8), "one": np.zeros(8, int), "even": np.ones((8, 2)), "many": np.eye(8)[:, 1:]}
     found = evidence_of_patterns(y, error, {**none, "two": np.arange(8) % 2})
-    assert all(found[name] is NO_PATTERN for name in none) and math.isfinite(found["two"].beside)
+    assert all(found[name] is NO_PATTERN for name in none) and math.isfinite(found["two"].given_pixels)
     assert evidence_of_patterns(y[:2], error[:2], {"two": np.arange(2)}) == {"two": NO_PATTERN}
 
 
@@ -89,11 +89,13 @@ def test_the_unit_of_a_shape_does_not_matter() -> None:
     units = np.array([1e8, 1e-8, 1.0])
     shapes = {"as it is": GRADIENT, "scaled": GRADIENT * units, "twice": np.hstack([GRADIENT, 3 * GRADIENT])}
     found = evidence_of_patterns(y, error, shapes)
-    assert found["as it is"].beside > 100
+    assert found["as it is"].given_pixels > 100
     for name in shapes:
-        assert found[name].beside == pytest.approx(found["as it is"].beside, abs=1e-3), name
+        assert found[name].given_pixels == pytest.approx(found["as it is"].given_pixels, abs=1e-3), name
     y[3], error[3] = 1e9, math.inf
-    assert evidence_of_patterns(y, error, shapes)["scaled"].beside == pytest.approx(found["scaled"].beside, rel=0.05)
+    assert evidence_of_patterns(y, error, shapes)["scaled"].given_pixels == pytest.approx(
+        found["scaled"].given_pixels, rel=0.05
+    )
 
 
 @pytest.mark.parametrize("shape", [(1, 4), (2, 2), (2, 3), (3, 3)])
@@ -103,7 +105,7 @@ def test_few_pixels_are_no_gradient_by_chance(shape: tuple[int, int]) -> None:
     down, along = (x.ravel() / 4 for x in np.indices(shape))
     gradient = np.stack([along, down, along**2 + down**2], axis=1)
     values = 1 + 0.05 * rng.standard_normal((200, down.size))
-    found = [evidence_of_patterns(y, np.full(y.size, NOISE), {"it": gradient})["it"].beside for y in values]
+    found = [evidence_of_patterns(y, np.full(y.size, NOISE), {"it": gradient})["it"].given_pixels for y in values]
     assert sum(one >= 12 for one in found) <= 4
 
 
@@ -112,7 +114,7 @@ def test_a_pattern_of_few_counts_is_not_cut_off() -> None:
     rng = np.random.default_rng(4)
     counts = rng.poisson(np.where(ROWS % 4 == 0, 1.5, 0.2)).astype(float)
     found = evidence_of_patterns(counts, np.full(N, math.sqrt(counts.mean())), {"rows": ROWS})
-    assert found["rows"].beside > 12
+    assert found["rows"].given_pixels > 12
 
 
 def test_what_a_scene_takes_from_residuals_is_beyond_what_it_leaves() -> None:
@@ -126,11 +128,11 @@ def test_what_a_scene_takes_from_residuals_is_beyond_what_it_leaves() -> None:
         z = rng.standard_normal((2, 200)) + slopes * 0.3 * rng.standard_normal(200)
         wide = np.linalg.inv(np.eye(2) + 0.09 * slopes.T[:, :, None] * slopes.T[:, None, :])
         times = np.einsum("cp,pcd,dp", shape, wide, z) / np.einsum("cp,pcd,dp", shape, wide, shape)
-        evidence = evidence_of_scene(z, z - times * shape, known, 0.3, 1).beside
+        evidence = evidence_of_scene(z, z - times * shape, known, 0.3, 1).given_pixels
         chances.append(stats.f.sf(evidence + 2, 1, 399))
     # by Kolmogorov's law, below 2.7 / sqrt(400) but for once in a million times
     assert np.max(np.abs(np.sort(chances) - (np.arange(400) + 0.5) / 400)) < 2.7 / 20
     odd = np.where(np.arange(200) < 2, 500.0, 0.0)
     z = rng.standard_normal((2, 200)) + slopes * 0.3 * rng.standard_normal(200)
-    assert evidence_of_scene(z + 0.3 * shape + odd, z + odd, known, 0.3, 1).beside > 12
+    assert evidence_of_scene(z + 0.3 * shape + odd, z + odd, known, 0.3, 1).given_pixels > 12
     assert evidence_of_scene(np.ones((1, 2)), np.ones((1, 2)), np.ones((1, 2)), 0.3, 2) is NO_PATTERN

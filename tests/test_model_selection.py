@@ -149,7 +149,7 @@ def test_beside_chance_a_map_pays_for_its_numbers(lab):
     candidate = change_of(replicates, "per_pixel dark_counts.rate")
     maps = {("dark_counts", "rate"): map_}
     evaluation = evaluate(replicates, {})
-    told = Trial(candidate, {}, Signature({}, {}, {}), squares, 1.0, maps=maps, chance=1e-9)
+    told = Trial(candidate, {}, Signature({}, {}, {}), squares, 1.0, maps=maps, p_value=1e-9)
     found = evidence_of(replicates, evaluation, told)
     assert found == pytest.approx(max(squares - map_.price, 6.1**2), rel=0.01) and found < squares
     # the squares hardly show small differences of many pixels
@@ -396,7 +396,7 @@ def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
         one.there = there  # type: ignore[assignment]
         assert explains_its_signature(replicates, evaluation, one) == good
     assert explains_its_signature(replicates, evaluation, replace(one, there=None)) and explains_its_signature(
-        replicates, evaluation, replace(one, chance=0.1)
+        replicates, evaluation, replace(one, p_value=0.1)
     )
     # where few recordings show nothing of it beyond chance, all that they show is looked at
     monkeypatch.setattr(

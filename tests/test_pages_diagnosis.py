@@ -177,7 +177,8 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
     verdict = spoken(full_page[: full_page.index("<h2>")])
     assert "Partly explained: crosstalk and detection.pdp per pixel and dead_time.paralyzable" in verdict
     assert (
-        "but not all. What remains: 12 pixels within 1 ns, in dark: 31 clusters, 0 expected (multiplicity)." in verdict
+        "explain a part of the deviations. What remains: 12 pixels within 1 ns, in dark: 31 clusters, 0 expected "
+        "(multiplicity)." in verdict
     )
     assert "The misfit on held-out data fell from 61.2 to 1.04" in verdict
     for words in ("below 1.2 in 95 of 100", "lab tr against monday", "sensor.yaml", "12,345", "Next: "):

@@ -12,7 +12,7 @@ from spadmnist.inference.candidates import with_values
 from spadmnist.inference.evaluation import evaluate, square
 from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.model_path import begin
-from spadmnist.inference.phases import Swing, choose_side, simulate_phases
+from spadmnist.inference.phases import PeriodicSignature, choose_phase, simulate_phases
 from spadmnist.inference.signature import Signature, residuals_at
 from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
@@ -32,7 +32,7 @@ def literal(x: float, p: float) -> np.ndarray:
 def test_phases_all_round_tell_every_phase_and_strength(strength: float) -> None:
     cell = "flat", "trend"
     turned = [Signature({cell: literal(1.0, p)}, {cell: 0.8}, {"flat": 2 * math.sin(p)}) for p in EIGHT]
-    swing = Swing.of(turned, EIGHT)
+    swing = PeriodicSignature.of(turned, EIGHT)
     for p in (0.0, 1.1, 4.0):
         signature = swing.at({"flat": p}).at(strength)
         assert signature.shifts[cell] == pytest.approx(literal(strength, p), abs=1e-12)
@@ -43,7 +43,7 @@ def test_phases_all_round_tell_every_phase_and_strength(strength: float) -> None
 def test_a_cell_that_some_phases_leave_alone() -> None:
     cell = "flat", "trend"
     turned = [Signature({cell: np.array([max(0.0, math.cos(p))])} if math.cos(p) > 0.1 else {}, {}, {}) for p in EIGHT]
-    found = Swing.of(turned, EIGHT).at({"flat": 0.0}).at(1.0).shifts[cell]
+    found = PeriodicSignature.of(turned, EIGHT).at({"flat": 0.0}).at(1.0).shifts[cell]
     assert 0.8 < found[0] < 1.2
 
 
@@ -59,8 +59,8 @@ def test_strength_and_phase_are_fitted(lab, amplitude: float, seed: int) -> None
     candidate = change_of(replicates, "add flicker")
     values = {AMPLITUDE: 0.06 if amplitude > 0.2 else 0.24, FREQUENCY: 100.0}
     swing = simulate_phases(replicates, evaluation, [PHASE], values, 6)
-    assert isinstance(swing, Swing)
-    gain, times, phases = swing.suited(replicates, evaluation)
+    assert isinstance(swing, PeriodicSignature)
+    gain, times, phases = swing.best_fit(replicates, evaluation)
     one = Trial(candidate, values, swing.at(phases), gain, times, phases={(id, PHASE): p for id, p in phases.items()})
     found = fit_trial(replicates, evaluation, one)
     error = math.sqrt(2 / replicates.seen["flat"].total)
@@ -80,11 +80,11 @@ def test_strength_and_phase_are_fitted(lab, amplitude: float, seed: int) -> None
 
 def test_the_other_phase_with_the_same_total() -> None:
     """Of sin(p) it is pi - p; where it is the largest there is no other."""
-    swing = Swing({}, {}, {"flat": np.array([0.0, 1.0, 0.0, 0.0, 0.0])})
+    swing = PeriodicSignature({}, {}, {"flat": np.array([0.0, 1.0, 0.0, 0.0, 0.0])})
     for phase in (0.5, 2.0, 3.5, 5.9):
-        apart = (swing.mirrored("flat", phase, 0.3) - (math.pi - phase)) % (2 * math.pi)
+        apart = (swing.mirror_phase("flat", phase, 0.3) - (math.pi - phase)) % (2 * math.pi)
         assert min(apart, 2 * math.pi - apart) < 2 * math.pi / 360
-    assert swing.mirrored("flat", math.pi / 2, 0.3) == math.pi / 2
+    assert swing.mirror_phase("flat", math.pi / 2, 0.3) == math.pi / 2
 
 
 @pytest.mark.parametrize("phase", [0.3, math.pi - 0.3])
@@ -97,12 +97,14 @@ def test_a_capture_shorter_than_a_swing_rises_or_falls(lab, monkeypatch, phase: 
     evaluation = evaluate(replicates, {})
     right, wrong = {"dark": 0.0, "flat": phase}, {"dark": 0.0, "flat": math.pi - phase}
     for first, other in ((right, wrong), (wrong, right)):
-        assert choose_side(replicates, evaluation, [PHASE], values, first, other) == right
-    assert choose_side(replicates, evaluation, [PHASE], values, right, right) == right
+        assert choose_phase(replicates, evaluation, [PHASE], values, first, other) == right
+    assert choose_phase(replicates, evaluation, [PHASE], values, right, right) == right
     # and where the sensor is known to swing so, whichever is found first; the mean phase is that of the middle
     known = bench_of((with_values(sensor, values), measured))
     swept = 2 * math.pi * 5.0 * 0.02
     for first in (phase, (math.pi - phase - swept) % (2 * math.pi)):
-        monkeypatch.setattr(Swing, "suited", lambda *a, first=first: (0.0, 1.0, {"dark": 0.0, "flat": first}))
+        monkeypatch.setattr(
+            PeriodicSignature, "best_fit", lambda *a, first=first: (0.0, 1.0, {"dark": 0.0, "flat": first})
+        )
         off = (begin(known).scan.phases["flat", PHASE] - phase + math.pi) % (2 * math.pi) - math.pi
         assert abs(off) < 0.2

@@ -175,6 +175,6 @@ def test_what_blinks_is_named_and_not_a_map_of_it(tmp_path: Path) -> None:
     # in the pixels of this chip the numbers are fitted once more; their share keeps its interval
     assert found.steps[0].values["fraction"].high < 0.2
     hit = hit_in_truth(tmp_path)
-    assert found.steps[0].where == f"seen in {hit.sum()} of 256 pixels, which the sensor file has"
+    assert found.steps[0].where == f"detected in {hit.sum()} of 256 pixels, which the sensor file contains"
     assert found.steps[0].where in " ".join(str(found).split())
     assert spadmnist.compare(found.model, data).verdict == "adequate"

@@ -82,12 +82,15 @@ def test_a_shift_is_told_by_a_few_recordings(name: str) -> None:
 
 @pytest.mark.parametrize("few", [2, 4])
 def test_what_is_another_in_every_recording_is_no_shift(few: int) -> None:
-    """Light that swings at random, three times as much as chance does: no two recordings have the same trend."""
+    """Light that swings at random, three times as much as chance does: no two recordings have the same trend.
+
+    Of 40 such sets 3 and none have a shift; of two replicates a twelfth may have one.
+    """
     rng = np.random.default_rng(3)
     base = rng.standard_normal((RECORDINGS, 32))
     null = learnt("normal", base, 1000 + rng.standard_normal(RECORDINGS))
     values = [base[:few] + 3 * rng.standard_normal((few, 32)) for _ in range(40)]
-    assert sum(bool(shift_of(null, each, base, few).any()) for each in values) <= 8
+    assert sum(bool(shift_of(null, each, base, few).any()) for each in values) <= {2: 6, 4: 2}[few]
     assert shift_of(null, base[:few] + 3 * rng.standard_normal(32), base, few).all()
 
 

@@ -23,7 +23,7 @@ from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.models import Model
 from spadmnist.inference.reduction import halves_of
 from spadmnist.inference.signature import Signature, signatures
-from spadmnist.inference.time_blocks import _same_places, _slopes, measure
+from spadmnist.inference.time_blocks import _jacobian_of_halves, _same_places, measure
 from spadmnist.inference.trial import Trial
 from spadmnist.recording import COMMON_PERIOD, Capture, Light, Recording
 from spadmnist.statistics import Summary
@@ -146,14 +146,14 @@ def test_a_number_of_one_capture_is_judged_by_its_other_half(lab) -> None:
     statistic = "pixel_map"
     cells = len(replicates.seen["flat"].summaries[statistic].values)
     whole = np.linspace(1.0, 2.0, cells)[:, None]
-    found = _slopes(replicates, half, {("flat", statistic): whole, ("dark", statistic): whole}, {"flat"})
+    found = _jacobian_of_halves(replicates, half, {("flat", statistic): whole, ("dark", statistic): whole}, {"flat"})
     odd, even = ((name, statistic) for name in halves_of("flat"))
     assert found.keys() == {odd, even}
     for cell in (odd, even):
         share = half.seen[cell[0]].total / replicates.seen["flat"].total
         assert found[cell] == pytest.approx(whole * math.sqrt(share), rel=1e-12)
     spectrum = np.ones((len(replicates.seen["flat"].summaries["spectrum"].values), 1))
-    other = _slopes(replicates, half, {("flat", "spectrum"): spectrum}, {"flat"})
+    other = _jacobian_of_halves(replicates, half, {("flat", "spectrum"): spectrum}, {"flat"})
     assert len(other) == 2 and not any(x.any() for x in other.values())  # it has other frequencies
     first, second = found[odd][:, 0], found[even][:, 0]
     back = 2 * float(first @ first) / float(second @ second)
@@ -188,7 +188,7 @@ def mapped(tmp_path: Path) -> tuple[ModelPath, Rung]:
     data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
     path = begin(bench_of((sensor, data), 32))
     candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
-    accept(path, Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, chance=1e-9), 1.0)
+    accept(path, Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, p_value=1e-9), 1.0)
     return path, path.ladder[-1]
 
 

@@ -138,11 +138,11 @@ def test_a_pattern_that_is_first_gives_way_to_one_that_says_more_with_fewer_numb
     other = Trial(change_of(replicates, "add crosstalk"), {}, NOTHING, 1000.0, 1.0)
     assert patterns_first(look, evaluation, [other, rows, map_]) == [other, rows, map_]
     # a little of rows is none where the map itself is far beyond chance: a few odd pixels
-    told[rows.candidate.name], map_.chance = PatternEvidence(8.0, 8.0, 0.0), 6e-10
+    told[rows.candidate.name], map_.p_value = PatternEvidence(8.0, 8.0, 0.0), 6e-10
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [map_]
-    map_.chance = 1e-4  # a map that rows make has no more evidence than they
+    map_.p_value = 1e-4  # a map that rows make has no more evidence than they
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [rows, map_]
-    told[rows.candidate.name], map_.chance = PatternEvidence(18.0, 18.0, 0.0), 1e-30  # pixels that differ, and rows
+    told[rows.candidate.name], map_.p_value = PatternEvidence(18.0, 18.0, 0.0), 1e-30  # pixels that differ, and rows
     assert patterns_first(look, evaluation, [rows, gradient, map_]) == [rows, map_]
 
 

@@ -17,7 +17,7 @@ _MOST_THREADS = 64  # of numpy's linear algebra, and again of scipy's, as they a
 
 
 def is_alone(error: BaseException | None) -> bool:
-    """Did the system refuse a thread (which Python tells by words alone) or a process? Then what follows fails, too."""
+    """Whether the system refused a thread (which Python reports by its message alone) or a process."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.ENOMEM) and error.filename is None:
             return True

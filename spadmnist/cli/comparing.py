@@ -111,9 +111,9 @@ def diagnose(
 ) -> None:
     """Find the effects of MEASUREMENT that the model SENSOR lacks, and add them.
 
-    Tried are every registered effect, those of --plugin files included, every listed parameter at another value, and
-    every per-pixel parameter as a map. The answer so far is written after each step, so that Ctrl-C keeps it; with -o
-    what was simulated is kept as well, and the same command goes on from there to the same answer.
+    It tries every registered effect, those of --plugin files included, every listed parameter at another value, and
+    every per-pixel parameter as a map. The answer so far is written after each step, so that Ctrl-C keeps it. With -o
+    the simulations are kept as well: the same command then goes on from there, to the same answer.
 
     \b
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
@@ -245,7 +245,7 @@ def _check_answer(file: Path | None) -> None:
             head = there.read(_HEAD)
         if head and b'"format": "spadmnist-' not in head:
             raise InputError(
-                f"--json {file}: is there already and no answer of this program; it is left alone: name another file"
+                f"--json {file}: exists, and is no answer of this program; it is left alone: name another file"
             )
 
 

@@ -1,4 +1,4 @@
-"""The other candidates of a step, with the misfit that each leaves; those that cannot be told from it are confused."""
+"""The other candidates of a step, with the misfit that each leaves; those within a tie of it are called confused."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, on
     if one.evaluation is not None:  # by its own scatter
         judged, left = one.evaluation, one.evaluation.residuals
     failed = failing(block_checks(replicates, judged, left))
-    # by the likelihood ratio of their wide cells a few odd pixels may gain little
-    most, own = best.evidence, max(one.evidence, one.fall) if one.chips and judged is not evaluation else one.evidence
-    near = most - own < tie(most) or (at_end(best) and own > _ALMOST * most)
+    # the evidence for a few odd pixels may be small, because the model with them has wide cells
+    most, this = best.evidence, max(one.evidence, one.fall) if one.chips and judged is not evaluation else one.evidence
+    near = most - this < tie(most) or (at_end(best) and this > _ALMOST * most)
     return {
         "change": one.candidate.kind,
         "effect": one.candidate.effect,

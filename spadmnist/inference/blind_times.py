@@ -16,20 +16,20 @@ from scipy import optimize, special
 
 from .. import kernels
 from ..recording import Recording
+from .levels import FALL_95
 
 # of the dead time, in ticks, and in s: the delay after the shortest interval beyond which no blur is left and other
 # intervals are as dense as at the edge
 _BEHIND, _TICKS, _BLURRED = 0.1, 10.0, 1e-9
 _LONG = 3.0  # times that delay: the width of the window in which later intervals are counted
-_USUAL = 4.0  # intervals: the weight of the array's own density in that of a pixel
+_PRIOR_INTERVALS = 4.0  # intervals: the weight of the array's own density in that of a pixel
 _FINE, _ROUGH = 257, 40  # grid points in the middle range, where most edges lie, and in each of the two outer ranges
 _MOST = (0.02, 0.98)  # quantiles of the pixels between which the middle range lies
 _LEAST, _HIGHEST = 0.05, 20.0  # of the listed dead time: no edge is looked for below and above
 _NEARLY = 0.2  # of the listed dead time: the mean delay of a shortest interval below which it informs the edge
 _FAR = 6.0  # times the blur: the largest delay of the edge after the shortest interval
 _OTHERS = 0.001  # share of pixels of any dead time in the prior: a larger one would hold the tails of the normal part
-# number of widths that are tried; the fall of twice the log-likelihood at the ends of a 95 % interval
-_WIDTHS, _FALL = 60, 3.84
+_WIDTHS = 60  # number of widths that are tried
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,11 @@ class ShortestIntervals:
         scale = 1 / np.sqrt(np.maximum(number, 1.0))
         design = np.stack([number, number.astype(np.float64) ** 2], axis=1)
         typical = np.maximum(design @ optimize.nnls(design * scale[:, None], soon * scale)[0], 1e-12)
-        return cls(found, np.where(number > 0, (soon + _USUAL) / (1 + _USUAL / typical) / reach, 0.0), tick)
+        return cls(
+            found, np.where(number > 0, (soon + _PRIOR_INTERVALS) / (1 + _PRIOR_INTERVALS / typical) / reach, 0.0), tick
+        )
 
-    def tells(self, listed: float) -> np.ndarray:
+    def informs(self, listed: float) -> np.ndarray:
         """Whether a pixel's shortest interval informs its edge, (pixels,) bool.
 
         Args:
@@ -106,7 +108,7 @@ def likelihoods(
     """
     least = np.min([c.intervals for c in captures], axis=0)
     density = np.sum([c.density for c in captures], axis=0)
-    informed = np.any([c.tells(listed) for c in captures], axis=0)
+    informed = np.any([c.informs(listed) for c in captures], axis=0)
     if informed.sum() < 2:
         return None
     tick = max(c.tick for c in captures)
@@ -117,7 +119,7 @@ def likelihoods(
     ends = np.clip([early.min(), np.quantile(early, _MOST[0]), np.quantile(late, _MOST[1]), late.max()], *bounds)
     first, low, high, last = np.log(ends / listed).tolist()
     grid = np.linspace(low, max(high, low + 1e-3), _FINE)
-    # the blur covers the grid, so that no edge lies between two points unseen
+    # the blur covers the grid, so that no edge is missed between two points
     width = math.hypot(width, listed * math.exp(high) * (grid[1] - grid[0]) / 2)
     before, after = np.linspace(first, low, _ROUGH + 1)[:-1], np.linspace(grid[-1], last, _ROUGH + 1)[1:]
     grid = np.concatenate([before[before < low], grid, after[after > grid[-1]]])
@@ -167,7 +169,7 @@ class Width:
     Attributes:
         sigma: its standard deviation; low, high: the 95 % interval by profile likelihood.
         middle: its mean.
-        gain: twice the log-likelihood ratio over pixels that are all alike.
+        likelihood_ratio: twice the log-likelihood ratio to equal dead times.
         prior: (grid,) the law itself.
     """
 
@@ -175,7 +177,7 @@ class Width:
     low: float
     high: float
     middle: float
-    gain: float
+    likelihood_ratio: float
     prior: np.ndarray
 
 
@@ -194,7 +196,7 @@ def width_of(grid: np.ndarray, likely: np.ndarray) -> Width:
     fine = np.geomspace(sigmas[max(best - 1, 0)], sigmas[min(best + 1, _WIDTHS - 1)], 9)
     found = max((*_at_best(grid, likely, float(s), float(tops[best, 1])), float(s)) for s in fine)
     top, middle, sigma = found
-    wanted = top - _FALL / 2
+    wanted = top - FALL_95 / 2
     inside = np.flatnonzero(tops[:, 0] > wanted)
     low, high = (int(inside[0]), int(inside[-1])) if inside.size else (best, best)
 
@@ -206,5 +208,5 @@ def width_of(grid: np.ndarray, likely: np.ndarray) -> Width:
         return float(sigmas[k] * (sigmas[j] / sigmas[k]) ** min(max(share, 0.0), 1.0))
 
     ends = min(between(low, low - 1), sigma), max(between(high, high + 1), sigma)
-    gain = max(2 * (top - float(tops[0, 0])), 0.0)
-    return Width(sigma, *ends, middle, gain, _law(grid, sigma, middle))
+    likelihood_ratio = max(2 * (top - float(tops[0, 0])), 0.0)
+    return Width(sigma, *ends, middle, likelihood_ratio, _law(grid, sigma, middle))

@@ -19,6 +19,7 @@ from ..recording import Capture
 # frames, per bit that is drawn without its events (of those that are rarer, 0 or 1), per pixel of a frame, and per
 # recording
 _STAMP, _IN_FRAMES, _DRAWN_BIT, _PIXEL_FRAME, _RECORDING = 1.5e-7, 5e-8, 1e-8, 1e-9, 2e-3
+# a budget in min or h, which the units of sensor files do not have; their length, s
 _LONG, _LONG_UNITS = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(min|h)\s*", re.ASCII), {"min": 60.0, "h": 3600.0}
 _SLOW = 3.0  # times the budget, after which the clock ends a run
 _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis

@@ -24,7 +24,7 @@ from .coordinates import Coordinate, Key, Values, coordinate_of, is_edge
 
 _SHAPES = 4  # the largest number of values of a shape within its search range
 _MOST = 6  # the largest number of templates per strength of one candidate
-_TURNED = 1.02  # factor on a parameter, to see what follows it
+_TURNED = 1.02  # factor on a parameter, to test whether the dead times follow it
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,12 @@ class Candidate:
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
+        """The free coordinates: strengths, then shapes."""
         return self.strengths + self.shapes
 
     @property
     def name(self) -> str:
+        """Kind, effect and parameter as text, such as "set dead_time.duration"; unique among the candidates."""
         return f"{self.kind} {self.effect}" + (f".{self.parameter}" if self.parameter else "")
 
 
@@ -202,7 +204,7 @@ def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[C
         )
 
 
-def maps_beside(sensor: Sensor, start: Sensor) -> list[Key]:
+def maps_added(sensor: Sensor, start: Sensor) -> list[Key]:
     """The parameters of a sensor whose values are maps that `start` lacks."""
     return [
         (effect.name, name)

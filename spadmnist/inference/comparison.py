@@ -30,7 +30,7 @@ from .candidates import with_values
 from .coordinates import Key, Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
-from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
+from .levels import FALSE_ALARM, LEAST_P, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .models import Model
 from .null_distribution import Judgement
@@ -39,7 +39,6 @@ from .replicates import REPLICATES, TOTALS, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
-_LEAST_P = 1e-300  # a p-value is never 0
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,7 @@ class Comparison:
 
 def _deviation(check: Check) -> Deviation:
     """A check as its group needs it; of a total the excess is that of its p-value."""
-    beyond = check.excess or float(stats.norm.isf(max(check.p_value, _LEAST_P) / 2)) ** 2
+    beyond = check.excess or float(stats.norm.isf(max(check.p_value, LEAST_P) / 2)) ** 2
     worst, residuals, at = 0, np.zeros(0), None
     if check.judgement is not None and check.summary is not None:
         worst, residuals, axis = check.judgement.worst, check.judgement.residuals, check.summary.axis
@@ -231,7 +230,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
                 measured, expected = float(summary.values[judged.worst]), float(judged.expected[judged.worst])
                 text, relative = summary.size(judged.worst, measured, expected)
                 misfit, where = of_cells.get((id, name), judged.misfit), summary.where(judged.worst)
-                p = max(judged.p_value, _LEAST_P)
+                p = max(judged.p_value, LEAST_P)
                 beyond = excess(summary, judged.expected, judged.residuals)
                 checks.append(
                     Check(name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged)
@@ -245,7 +244,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
             f"{replicates.measurement.source}: nothing here can be compared: of no capture are light and detections "
             "known. State the light (irradiance or illuminance) of a capture, or name the file of one"
         )
-    checks = _verdicts([replace(c, p_value=max(c.p_value, _LEAST_P)) for c in checks], tolerance)
+    checks = _verdicts([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
     return Comparison(
         sensor.name,
@@ -360,7 +359,7 @@ def light_of(
             pull**2,
             float(2 * stats.norm.sf(abs(pull))),
             "all lit captures",
-            f"light {100 * math.expm1(own):+.2f} % of what is stated, uncertain by {100 * common:.2f} %",
+            f"light {100 * math.expm1(own):+.2f} % relative to the stated level, known to {100 * common:.2f} %",
             math.expm1(own),
         )
     ]
@@ -467,6 +466,6 @@ def table(comparison: Comparison) -> str:
     for n in comparison.nuisances:
         where = n.capture or "all lit captures"
         interval = f"95 % interval {n.low:.4f} to {n.high:.4f}"
-        text_of_light = f"{n.name} of {where}: {n.value:.4f} of what is stated ({interval}), pull {n.pull:+.1f}"
+        text_of_light = f"{n.name} of {where}: {n.value:.4f} times the stated level ({interval}), pull {n.pull:+.1f}"
         lines += textwrap.wrap(text_of_light, 100)
     return "\n".join(lines)

@@ -40,6 +40,7 @@ class Coordinate:
 
     @property
     def key(self) -> Key:
+        """(effect, parameter)."""
         return self.effect, self.parameter
 
     @property
@@ -49,6 +50,7 @@ class Coordinate:
 
     @property
     def log(self) -> bool:
+        """Whether the coordinate is the log of the value."""
         return self.low > 0
 
     @property

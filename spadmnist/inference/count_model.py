@@ -17,12 +17,18 @@ from .replicates import Replicates
 
 
 class CountModel:
-    """The expected detections of each pixel in one capture, for maps.
+    """The expected detections of each pixel in one capture, by closed forms, for maps.
 
-    Of first stamps, they are those in the time that the pixel waited.
+    In a capture of first stamps, they are the detections in the time before the first stamps.
     """
 
     def __init__(self, replicates: Replicates, id: str, level: float):
+        """The model of a capture.
+
+        Args:
+            id: of the capture.
+            level: photons/s on a pixel; in the dark a factor on the rates.
+        """
         self.seen, self.id, self.level = replicates.seen[id], id, level
         self.conditions = self.seen.capture.conditions
         self.waited = self.seen.waited
@@ -98,7 +104,7 @@ def expected_counts(replicates: Replicates, id: str, evaluation: Any, values: Ma
         values: by (effect, parameter), SI.
     """
     return CountModel(replicates, id, evaluation.rates[id].level).expected(
-        with_values(evaluation.sensors.usual(id), values)
+        with_values(evaluation.sensors.mean_sensor(id), values)
     )
 
 

@@ -21,11 +21,11 @@ from ..measurement import Measurement
 from ..sensor import Sensor
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
+from .levels import LEAST_P
 from .light_levels import closed_form, level_for
 from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
-from .score_test import LEAST_P
 
 _SURE = 1e-3  # p-value below which a misfit is significant
 _WIDER = 1.1  # factor by which afterpulses and the errors of a map may raise the misfit
@@ -61,7 +61,7 @@ def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: C
     information = map_models.information(replicates, {candidate.carrier: map_.values()}, candidate, levels)
     whole = np.maximum(np.sum(list(information.values()), axis=0), 1e-12)
     if float(np.mean(np.sum([information[id] for id in dark], axis=0) / whole)) < 1 - _LIT:
-        return "light in which it shows, too"
+        return "lit captures inform the map as well"
     return _answer(replicates, measurement, candidate, map_, dark)
 
 

@@ -8,9 +8,9 @@ same deviation as a failing check of a statistic that it pools, in the same capt
 Checks of one statistic in several captures show one deviation where they look at the same place.
 
 A group is named by its most specific check (`Statistic.specific`) of those that have that share of the largest excess;
-a sum only if it has that share of what it is a sum of. Ties go to the larger physical size. What the rule cannot know:
-two effects that are seen in the same cells are one group, and a faint effect in a statistic that a strong one moves is
-seen only when the strong one is in the model.
+a sum only if it has that share of what it is a sum of. Ties go to the larger physical size. Limits of the rule: two
+effects that move the same cells are one group, and a faint effect in a statistic that a strong one moves is detected
+only when the strong one is in the model.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from ..errors import SpadError
 from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
 from .gauss_newton import Fit, gauss_newton
 from .joint_fit import fit_all, without_fit
-from .levels import LEAST_FALL, LEAST_GAIN, OWN_CELLS
+from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of
 from .models import Model
 from .replicates import FEW, TOTALS, Cell
@@ -19,10 +19,10 @@ from .results import Step, title
 from .signature import residuals_at, signatures
 from .trial_fits import fit_trial
 
-_MOSTLY = 0.95  # of the excess misfit: a step that explains as much is no look-alike, whatever its law leaves
-_CHANCE = 3.0  # standard deviations of a mean square: as much is left by noise
-_VAIN = 2  # look-alike steps, after which further ones are of no use
-_NEEDLESS = 9.0  # in chi square: a step whose loss costs less is dropped
+_MOSTLY = 0.95  # of the excess misfit: a step that explains as much is kept, whatever is left in its own cells
+_NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
+_VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
+_NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
 
 
 def drop_needless(path: ModelPath) -> None:
@@ -116,7 +116,7 @@ def _fit_from_templates(path: ModelPath) -> None:
             path.back_to(before)
 
 
-def drop_mimics(path: ModelPath, start: Evaluation, totals: bool) -> None:
+def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:
     """Drop the steps that only resemble what is there, where something remains.
 
     A step is judged by its own cells, see `left_in_own_cells`; signatures in other cells do not matter.
@@ -144,20 +144,20 @@ def drop_mimics(path: ModelPath, start: Evaluation, totals: bool) -> None:
         known = set().union(*(keys_of(s.candidate, path) for s in kept))
         path.values = {k: v for k, v in path.values.items() if k in known}
         listed = {effect.name for effect in path.replicates.start.effects}
-        swinging = listed | {candidate.effect for candidate in path.scan.accepted}
-        path.scan.phases = {at: p for at, p in path.scan.phases.items() if at[1][0] in swinging}
+        periodic = listed | {candidate.effect for candidate in path.scan.accepted}
+        path.scan.phases = {at: p for at, p in path.scan.phases.items() if at[1][0] in periodic}
         if kept:
             fit_all(path)
-            path.rung("without what only looks alike")
+            path.rung("without steps that explain too little")
         else:
             path.evaluation, path.fit = start, None
 
 
-def in_vain(path: ModelPath, totals: bool) -> bool:
+def no_step_explains(path: ModelPath, totals: bool) -> bool:
     """Whether several steps only resemble what is there, so that no effect here is the right one.
 
     Args:
-        totals: see `drop_mimics`.
+        totals: see `drop_unexplaining`.
     """
     left = [left_in_own_cells(step, path.held_out, totals) for step in path.steps]
     return len(left) >= _VAIN and bool(path.failed) and all(1 <= x < math.inf for x in left)
@@ -188,9 +188,9 @@ def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: 
         return math.inf
     fell = before**2 - now**2
     # of totals alone, any effect may be the cause
-    if fell[shapes].sum() < LEAST_GAIN or score[shapes].sum() < 0.5 * score.sum():
+    if fell[shapes].sum() < LEAST_EVIDENCE or score[shapes].sum() < 0.5 * score.sum():
         return math.inf
     order = np.argsort(-score, kind="stable")
     own = order[: int(np.searchsorted(np.cumsum(score[order]), OWN_CELLS * score.sum())) + 1]
     left, excess = float(np.mean(now[own] ** 2)) - 1, float(np.mean(before[own] ** 2)) - 1
-    return left / max((1 - LEAST_FALL) * excess, _CHANCE * math.sqrt(2 / len(own)))
+    return left / max((1 - LEAST_FALL) * excess, _NOISE * math.sqrt(2 / len(own)))

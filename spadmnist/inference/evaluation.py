@@ -26,7 +26,7 @@ from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joi
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
 _PIECES = 4  # tasks of one capture: the number of workers that share it
-_SEEN = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
+_MOVED = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
 _WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts
 _OTHER_SCATTER = 3.0  # standard errors of that log: a cell beyond has another scatter; 3 of 1000 do so by chance
 _NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
@@ -82,8 +82,13 @@ class Evaluation:
         simulated = (self.rates[id] for id in self.made)
         return any(far_wider(r.scatter, 1 / math.sqrt(max(r.expected(r.level), 1.0))) for r in simulated)
 
-    def usual(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
-        """The expectation of a statistic for this total of detections, see `Null.expected`."""
+    def expected(self, cell: Cell, total: float) -> tuple[np.ndarray, float]:
+        """((cells,) expectation of a statistic for this total, its relative variance), once; see `Null.expected`.
+
+        Args:
+            cell: (capture, statistic).
+            total: detections of the capture.
+        """
         return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
 
     def square(self, cell: Cell) -> float:
@@ -143,7 +148,7 @@ def _evaluate(
     centres = _centres(replicates, sensors)
     for id, seen in replicates.seen.items():
         if seen.counts is None:
-            evaluation.rates[id], evaluation.factors[id] = of_mean(sensors.usual(id), seen.capture, seen.total, n)
+            evaluation.rates[id], evaluation.factors[id] = of_mean(sensors.mean_sensor(id), seen.capture, seen.total, n)
             continue
         centre, stated, expected, half = centres[id]
         factors = np.exp(half * spread)
@@ -200,11 +205,11 @@ def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
     one, every expectation would be extrapolated to the measured total.
     """
     out = {
-        id: central_level(replicates, sensors.usual(id), seen)
+        id: central_level(replicates, sensors.mean_sensor(id), seen)
         for id, seen in replicates.seen.items()
         if seen.counts is not None
     }
-    some = [id for id in out if not all(effect.states_mean for effect in sensors.usual(id).effects)]
+    some = [id for id in out if not all(effect.states_mean for effect in sensors.mean_sensor(id).effects)]
     numbers = np.arange(FEW, dtype=np.uint64)
     pilots = replicates.simulate([(sensors, id, np.full(FEW, out[id][0]), numbers) for id in some]) if some else []
     for id, made in zip(some, pilots, strict=True):
@@ -258,11 +263,11 @@ def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Ma
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
         wider = np.broadcast_to(wider, z.shape)
         error = null.law.error_of_scatter(z.size, min(len(null.own), len(new.own)))
-        moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _SEEN)
+        moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _MOVED)
         other_scatter = np.abs(wider) > _OTHER_SCATTER * error
         # a cell that never varies has no scatter: the log of its ratio is bounded
-        gain = fall - 2 * np.clip(wider, -_WIDEST, _WIDEST)
-        out += float(np.sum(gain[moved | other_scatter]))
+        evidence = fall - 2 * np.clip(wider, -_WIDEST, _WIDEST)
+        out += float(np.sum(evidence[moved | other_scatter]))
     if evaluation.space is None or other.space is None or evaluation.space[0] != other.space[0]:
         return out  # of other totals the scatters are not compared
     return out + 2 * (_log_precision(*other.space[1:3]) - _log_precision(*evaluation.space[1:3]))
@@ -347,7 +352,7 @@ def block_checks(
                 BlockCheck(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)
             ]
             continue
-        p, worst = evaluation.nulls[cell].chance(z)
+        p, worst = evaluation.nulls[cell].p_value(z)
         out.append(BlockCheck(cell, p, worst, float(z[worst])))
     out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))

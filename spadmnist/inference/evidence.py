@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from ..statistics import Statistic
 from . import held_out
 from .evaluation import Evaluation, evaluate, log_likelihood_ratio
-from .levels import PROMISING
+from .levels import OPTIMISM_OF_A_PARAMETER, PROMISING
 from .replicates import TOTALS, Replicates
 from .score_test import sigmas_of
 from .signature import Signature, template_of
@@ -24,7 +24,6 @@ from .trial import Trial
 # fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
 _FITTED, _NEAR = 3, 0.4
 _MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
-_EACH = 2.0  # in chi square: the optimism of one fitted parameter (Akaike, IEEE Trans. Autom. Control 19 (1974) 716)
 
 
 def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> float:
@@ -46,22 +45,22 @@ def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> f
 
 
 def _evidence_of_map(one: Trial) -> float:
-    """The fall of the squares less the price of the values, or the square of what its own test says in sigma."""
+    """The fall of the squares less the price of the values, or the squared significance of its own test, the larger."""
     assert one.maps is not None
     # maps of earlier steps are left out
     price = sum(one.maps[c.carrier].price for c in one.candidates if c.carrier in one.maps)
     # the squares hardly show small differences of many pixels; those of edges they do
-    own = 0.0 if one.chance is None or one.candidate.blinds else sigmas_of(one.chance) ** 2
+    own = 0.0 if one.p_value is None or one.candidate.blinds else sigmas_of(one.p_value) ** 2
     return max(one.fall - price, own)
 
 
 def optimism(one: Trial) -> float:
-    """The optimism of a fitted trial, in chi square: what the fit gains on the data that it was fitted to."""
-    phases = _EACH * len(one.phases)
+    """The optimism of a fitted trial, in chi square: the part of the fall that is due to the fit to the same data."""
+    phases = OPTIMISM_OF_A_PARAMETER * len(one.phases)
     if one.fit is None or one.residuals is None:
         return phases
-    if one.fluctuates:  # each capture has drawn another light, so that leaving it out tells nothing of the fit
-        return phases + _EACH * len(one.fit.coordinates)
+    if one.fluctuates:  # the light of each capture is another draw: leaving a capture out does not test the fit
+        return phases + OPTIMISM_OF_A_PARAMETER * len(one.fit.coordinates)
     return phases + held_out.optimism(one.fit.residuals, one.fit)
 
 
@@ -76,9 +75,9 @@ def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
 def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
     """The trials that may be best when they are fitted; at least one, if there is any.
 
-    The squares that random odd pixels predict are those of a model that scatters more, so that they crowd nobody out.
-    With them a map of the pixels is fitted as well, though its small differences are hardly visible here; with a map
-    random odd pixels are, though no strength suits each pixel.
+    The fall that random odd pixels predict is that of a model with more scatter: it excludes no other trial. Together
+    with them a map of the pixels is fitted, although its small differences hardly lower the squares; together with a
+    map, random odd pixels are, although no single strength fits each pixel.
 
     Args:
         second: the trials of the second look, by the fall of the squares; a pattern may be first.
@@ -101,11 +100,10 @@ def best_of(
     pattern: Trial | None = None,
     margin: Callable[[float], float] = lambda merit: 0.0,
 ) -> Trial:
-    """The fitted trial with the most merit; a pattern that has evidence beside a map comes before all others.
+    """The fitted trial with the most merit; a pattern with evidence given a map of the pixels precedes all others.
 
-    Pixels that differ in addition to a pattern make a map of them the better model, and not the better name. Of equals
-    a map of pixels is the best. It is the best of a tie with random odd pixels, too: it says which pixels differ and
-    not why.
+    Where pixels differ in addition to a pattern, a map fits better than the pattern, but does not name the cause. Of
+    equals a map of pixels is taken, and also in a tie with random odd pixels: it states which pixels differ, not why.
 
     Args:
         merit: the evidence; or what falls with the p-value, where no check fails.

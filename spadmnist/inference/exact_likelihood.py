@@ -21,11 +21,11 @@ from ..recording import Capture, Recording
 from ..sensor import Sensor
 from .candidates import Candidate, templates, with_values
 from .coordinates import Coordinate, Key
+from .levels import FALL_95
 from .light_levels import closed_form, level_for
 from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 
-FALL = 3.84  # of twice the log-likelihood, at the ends of a 95 % interval
 EDGE_FALL = 5.99  # the same for an edge sharper than the intervals are dense: its law is exponential, not normal
 _FAR = 100.0  # of the log-likelihood: a start that is lower than the maximum by more is dropped
 _HIGHER = 0.05  # of the log-likelihood: a value that is higher by more shows that a maximum is none
@@ -43,14 +43,14 @@ class MaximumLikelihood:
 
     Attributes:
         values, intervals: by (effect, parameter), SI.
-        gains: twice the log-likelihood ratio of each change.
+        likelihood_ratios: twice the log-likelihood ratio of each change.
         free: the fitted parameters.
         correlations: (n, n) of these, by the curvature at the maximum.
     """
 
     values: dict[Key, float]
     intervals: dict[Key, tuple[float, float]]
-    gains: list[float]
+    likelihood_ratios: list[float]
     free: tuple[Key, ...]
     correlations: np.ndarray
 
@@ -153,9 +153,9 @@ class Likelihood:
             u: (n,) coordinates.
         """
         if not self.edges[i]:
-            return FALL
+            return FALL_95
         dead = self.sensor_at(u).dead_times
-        return FALL if sum(law.near_edge(dead, self.blur) for law in self.laws) > DENSE else EDGE_FALL
+        return FALL_95 if sum(law.near_edge(dead, self.blur) for law in self.laws) > DENSE else EDGE_FALL
 
     def __call__(self, u: np.ndarray) -> float:
         sensor = self.sensor_at(u)
@@ -284,7 +284,7 @@ def _maximum(
 
     function.begin(placed({**given, **(start or {})}))
     if mapped and not function.own:
-        return "maps beside what changes the rates"
+        return "maps together with parameters that change the rates"
     top = None
     if start is not None:
         u, scales = placed({**given, **start}), {**widths, **(errors or {})}
@@ -302,7 +302,7 @@ def _maximum(
     for _ in range(3):
         profiles = [
             [profile_end(function, top, i, sign, function.fall(i, top.u), ends) for sign in (-1, 1)]
-            if top.tells[i]
+            if top.informed[i]
             else list(map(float, ends[:, i]))
             for i in range(len(coordinates))
         ]
@@ -314,7 +314,7 @@ def _maximum(
     best, u = top.value, top.u
     intervals = {d.key: d.interval(*profile) for d, profile in zip(coordinates, profiles, strict=True)}
     found = {d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}
-    gains = []
+    likelihood_ratios = []
     for candidate in candidates:
         # the others stay
         own = {*dict(candidate.fixed), *(d.key for d in candidate.coordinates)}
@@ -322,7 +322,9 @@ def _maximum(
         without = Likelihood(sensor, data, (), rest)
         without.begin(np.zeros(0))
         without.own = function.own
-        gains.append(2 * (best - without(np.zeros(0))))
+        likelihood_ratios.append(2 * (best - without(np.zeros(0))))
     inverse = np.linalg.inv(top.curved)
     spread = np.sqrt(np.diag(inverse))
-    return MaximumLikelihood({**fixed, **found}, intervals, gains, tuple(found), inverse / np.outer(spread, spread))
+    return MaximumLikelihood(
+        {**fixed, **found}, intervals, likelihood_ratios, tuple(found), inverse / np.outer(spread, spread)
+    )

@@ -44,7 +44,7 @@ def between(scan: Scan, evaluation: Evaluation, found: Candidate, other: Trial) 
     assert other.sensors is not None
     residuals = other.residuals or {}
     now = math.sqrt(max(square(residuals) - square(evaluation.residuals), 0.0))
-    replicates.say("which capture would tell")
+    replicates.say("the capture that would separate the two explanations")
     best: tuple[float, str] | None = None
     for words, capture, like in _menu(replicates, evaluation):
         z = _apart(replicates, evaluation, other.sensors, capture, like)
@@ -52,10 +52,10 @@ def between(scan: Scan, evaluation: Evaluation, found: Candidate, other: Trial) 
             best = z, words
     if best is None:
         return []
-    return [_told(best[1], [found.effect, other.candidate.effect], now, math.hypot(now, best[0]))]
+    return [_advice(best[1], [found.effect, other.candidate.effect], now, math.hypot(now, best[0]))]
 
 
-def _told(words: str, separates: Sequence[str], now: float, then: float) -> dict[str, Any]:
+def _advice(words: str, separates: Sequence[str], now: float, then: float) -> dict[str, Any]:
     return {
         "capture": words,
         "separates": list(separates),
@@ -115,7 +115,7 @@ def _apart(replicates: Replicates, known: Evaluation, other: Model, capture: Cap
     capture = replace(capture, id=f"{capture.id} again")
 
     def there(sensors: Model) -> Model:
-        typical = (lambda id: sensors.usual(like)) if sensors.typical else None
+        typical = (lambda id: sensors.mean_sensor(like)) if sensors.typical else None
         return Model(lambda id, number: sensors.of(like, number), sensors.one, sensors.alike, typical)
 
     first, second = there(known.sensors), there(other)
@@ -158,19 +158,19 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
         level = 1.0 if capture.light.dark else twin.photons_at(capture, replicates.start.layout) or 1.0
         plain_, changed = (
             closed_form(InTheDark.of(s) if capture.light.dark else s, capture)(level)
-            for s in (sensor, other.sensors.usual(model.id))
+            for s in (sensor, other.sensors.mean_sensor(model.id))
         )
         apart = abs(math.log(changed / plain_) - expected)
         z = apart / math.sqrt(1 / plain_ + capture.light.own_uncertainty**2 + 1e-6)
         if best is None or z > best[0]:
             best = z, words
     assert best is not None
-    return [_told(best[1], [setup.factors[0].quantity, other.candidate.effect], now, math.hypot(now, best[0]))]
+    return [_advice(best[1], [setup.factors[0].quantity, other.candidate.effect], now, math.hypot(now, best[0]))]
 
 
 def on_mimic(step: Step, other: Mimic) -> dict[str, Any]:
     """The capture that separates a finding from its mimic, at least as clearly as it was found."""
-    return _told(other.capture, [step.candidate.effect, other.what], 0.0, step.significance)
+    return _advice(other.capture, [step.candidate.effect, other.what], 0.0, step.significance)
 
 
 def on_brightest(
@@ -183,7 +183,7 @@ def on_brightest(
     then = 0.5 * abs(float(setup.logs[0])) / level_error(replicates, evaluation, entry["capture"])
     what = _seen_in(replicates.seen[entry["capture"]].capture)
     words = f"{what} half as bright as {entry['capture']}, its light measured anew"
-    return _told(words, [entry["quantity"], NONLINEARITY], 0.0, then)
+    return _advice(words, [entry["quantity"], NONLINEARITY], 0.0, then)
 
 
 def _dark(conditions: Conditions) -> Conditions:
@@ -219,4 +219,4 @@ def on_setup(
     words = f"the light of {id} with a different {name} of {units.show(other, 's', 3)}"
     # a light factor stays the same; a wrong exposure has another weight
     then = log * abs(1 - own / other) / level_error(replicates, evaluation, id)
-    return [_told(words, ["light", "exposure"], 0.0, then)]
+    return [_advice(words, ["light", "exposure"], 0.0, then)]

@@ -14,15 +14,15 @@ from ..statistics import Statistic
 from . import comparison
 from .deviations import Deviation, deviations, excess
 from .evaluation import BlockCheck, Evaluation, block_checks, failing
+from .levels import LEAST_P
 from .light_levels import LEAST_ELASTICITY, totals_space
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
-_LEAST_P = 1e-300  # a p-value is never 0
 _PICTURES, _CAPTURES = 6, 4  # deviations that have pictures, and captures of each, at most
 _MOVED = 9.0  # sum of squares of a signature in a check, in variances, above which the step moves it
 _ENTRIES = 20  # checks that are listed as unexplained, at most
-_TOLD_APART = 4.0  # standard deviations of a signature in statistics where the mimic has none: with more it is excluded
+_SEPARATED = 4.0  # standard deviations of a signature in statistics where the mimic has none: with more it is excluded
 _REGISTRY = Statistic.registry
 
 
@@ -32,7 +32,7 @@ def mimicked(step: Step) -> Mimic | None:
     if other is None:
         return None
     apart = [t for (_, name), t in step.template.items() if name in _REGISTRY and _among(name) != other.among]
-    return other if sum(float(t @ t) for t in apart) < _TOLD_APART**2 else None
+    return other if sum(float(t @ t) for t in apart) < _SEPARATED**2 else None
 
 
 def _among(name: str) -> str:
@@ -58,7 +58,7 @@ def remainder(
     for number, members in enumerate(groups, 1):
         for i in members:
             one, size = seen[i]
-            significance = max(abs(failed[i].z), float(stats.norm.isf(max(failed[i].p, _LEAST_P) / 2)))
+            significance = max(abs(failed[i].z), float(stats.norm.isf(max(failed[i].p, LEAST_P) / 2)))
             entry = {"statistic": one.statistic, "capture": one.capture, "significance": plain(significance)}
             out.append(entry | {"where": one.where, "size": size, "deviation": number})
     return out[:_ENTRIES]
@@ -75,7 +75,7 @@ def _failed(
         return Deviation("rate", which, block.z**2, 0, "all pixels", 0.0, np.zeros(0)), ""
     seen = replicates.seen[id]
     summary, z = seen.summaries[name], residuals.get(block.cell, np.zeros(0))
-    expected, _ = evaluation.usual(block.cell, seen.total)
+    expected, _ = evaluation.expected(block.cell, seen.total)
     text, relative = summary.size(block.worst, float(summary.values[block.worst]), float(expected[block.worst]))
     at = None if summary.axis is None or summary.shape is not None else float(summary.axis[block.worst])
     beyond = excess(summary, expected, z) if z.size else block.z**2
@@ -83,10 +83,14 @@ def _failed(
 
 
 def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:
-    """The deviations of the first model, as they were and as they are: each by the check that names it.
+    """The failing checks of the stated model under that model and under the last one, for figures.
 
-    Of each group of failing checks (`deviations`), the clearest first: that check, and the others of its statistic in
-    other captures.
+    Of each group of failing checks (`deviations`), the clearest first: the check that names the group, and the checks
+    of the same statistic in other captures.
+
+    Args:
+        start, last: the evaluations of the stated model and of the last one.
+        steps: the steps between them.
     """
     blocks = block_checks(replicates, start, start.residuals)
     failed = [b for b in failing(blocks) if b.cell[0] and b.cell in last.nulls and not start.nulls[b.cell].law.exact]

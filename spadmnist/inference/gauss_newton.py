@@ -11,14 +11,15 @@ import numpy as np
 
 from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
+from .levels import FALL_95
 from .models import Model
 from .replicates import FEW, Cell, Replicates
 from .signature import residuals_at, signatures
 
 _ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian
 _CLOSE = 0.02  # the least such step
-_TOLD_ASIDE = (0.1, 0.7)  # (least, most) of that step for a column that is known but for its size
-_TOLD_SIZE = 2.5  # the largest factor on the size of a known column
+_KNOWN_ASIDE = (0.1, 0.7)  # (least, most) of that step for a column that is known but for its size
+_KNOWN_SIZE = 2.5  # the largest factor on the size of a known column
 _SAME = 0.35  # of a logarithm, or of the search range: how far a Jacobian holds
 # of the root of the fall so far: a smaller promised fall ends the fit; it is far less than what separates two
 # candidates
@@ -290,7 +291,7 @@ def _jacobian(
     h = np.minimum(h, np.maximum(8 * near, _CLOSE))
     columns = {i: _stacked_column(evaluation, known[d.key], keys) for i, d in enumerate(coordinates) if d.key in known}
     for i, slope in columns.items():  # so far that the shift is visible
-        h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_TOLD_ASIDE) * (h[i] / _ASIDE)
+        h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_KNOWN_ASIDE) * (h[i] / _ASIDE)
     points = _points_aside(coordinates, u, h)
     values_there = [{d.key: d.value(float(x)) for d, x in zip(coordinates, p, strict=True)} for p in points]
     ends: list[np.ndarray | str] = [np.zeros(0)] * len(points)
@@ -306,7 +307,7 @@ def _jacobian(
     jacobian = _differences(ends, points, cells)
     for i, slope in columns.items():
         size = float(jacobian[:, i] @ slope) / max(float(slope @ slope), 1e-12)
-        jacobian[:, i] = slope * np.clip(size, 1 / _TOLD_SIZE, _TOLD_SIZE)
+        jacobian[:, i] = slope * np.clip(size, 1 / _KNOWN_SIZE, _KNOWN_SIZE)
     return jacobian
 
 
@@ -343,7 +344,7 @@ def profile_intervals(
     naive, n = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10), len(fit.coordinates)
     informed = [i for i in range(n) if np.isfinite(fit.covariance[i, i]) and naive[i, i] > 0]
     ends = [(i, side) for i in informed for side in (-1, 1)]
-    goal = np.array([3.84 * fit.covariance[i, i] / naive[i, i] for i, _ in ends])
+    goal = np.array([FALL_95 * fit.covariance[i, i] / naive[i, i] for i, _ in ends])
 
     def at(i: int, u: float) -> Model:
         point = fit.point + naive[:, i] / naive[i, i] * (u - fit.point[i])
@@ -360,7 +361,7 @@ def profile_intervals(
         ]
         return np.array([float(one @ one) for one in z])
 
-    reach = np.array([math.sqrt(3.84 * fit.covariance[i, i]) for i, _ in ends])
+    reach = np.array([math.sqrt(FALL_95 * fit.covariance[i, i]) for i, _ in ends])
     least = squares([sensors_of({d.key: d.value(float(x)) for d, x in zip(fit.coordinates, fit.point, strict=True)})])
     for _ in range(2):
         u = [within(i, fit.point[i] + side * h) for (i, side), h in zip(ends, reach, strict=True)]

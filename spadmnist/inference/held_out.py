@@ -11,7 +11,7 @@ from .gauss_newton import Fit
 from .replicates import TOTALS, Cell
 
 # least share of the information on a coordinate in the other captures, for a capture to be left out of the fit
-_TOLD_BY_OTHERS = 0.3
+_INFORMED_BY_OTHERS = 0.3
 
 
 def captures_needed(residuals: Mapping[Cell, np.ndarray], jacobian: Mapping[Cell, np.ndarray]) -> set[str]:
@@ -32,7 +32,7 @@ def captures_needed(residuals: Mapping[Cell, np.ndarray], jacobian: Mapping[Cell
     for id in {key[0] for key in keys} - {""}:
         own = sum(part for key, part in parts.items() if key[0] == id)
         share = np.linalg.eigvalsh(root.T @ own @ root)  # of the information on each direction
-        if share.size and 1 - float(share.max()) < _TOLD_BY_OTHERS:
+        if share.size and 1 - float(share.max()) < _INFORMED_BY_OTHERS:
             out.add(id)
     return out
 

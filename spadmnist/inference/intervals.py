@@ -1,4 +1,4 @@
-"""The last values of a diagnosis and their intervals: by the likelihood of the data, scaled by what is left."""
+"""The final values of a diagnosis and their intervals: by the exact likelihood, errors scaled by the misfit left."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ from .signature import residuals_at, signatures
 if TYPE_CHECKING:
     from .model_path import ModelPath
 
-_AGAIN = 4  # further fits of all coordinates at the model with the step
-_SAME = 0.35  # of a coordinate: how far a Jacobian holds
+_AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
+_SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
 _WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
@@ -128,8 +128,8 @@ def _noise_of_square(evaluation: Evaluation) -> float:
     """
     keys = [k for k in evaluation.residuals if k in evaluation.replicate_residuals]
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
-    along = own @ stacked(evaluation.residuals, keys)
-    return 2 * math.sqrt(2 / len(own)) * float(np.std(along))
+    projection = own @ stacked(evaluation.residuals, keys)
+    return 2 * math.sqrt(2 / len(own)) * float(np.std(projection))
 
 
 def _recordings(evaluation: Evaluation) -> int:
@@ -184,9 +184,9 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
 
 
 def _of_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_maps.PixelMap]) -> np.ndarray:
-    """The variances of a light pattern's coordinates by the differences of the pixels, (coordinates,).
+    """The variances of a light pattern's coordinates that random differences of the pixels cause, (coordinates,).
 
-    Random differences of the pixels have a gradient by chance, which is confused with one of the light.
+    Random differences of the pixels have an accidental gradient, which is degenerate with a gradient of the light.
     """
     replicates, one = path.replicates, path.evaluation.sensors.one
     lights = [c for c in path.scan.accepted if c.carrier in maps and pixel_maps.acts_on_light(one, c)]

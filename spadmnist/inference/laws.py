@@ -126,8 +126,12 @@ class Law:
         """Which cells are counts of so many events that they are nearly normal, (cells,) bool."""
         return np.zeros(len(expected), bool)
 
-    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, chance: float) -> np.ndarray:
-        """Which shifts, of `few` replicates, the small counts of a cell could not make with this chance, (cells,)."""
+    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, p: float) -> np.ndarray:
+        """Which shifts, of `few` replicates, are significant against the noise of small counts, (cells,) bool.
+
+        Args:
+            p: familywise p-value.
+        """
         return np.ones(len(shift), bool)
 
 
@@ -216,11 +220,11 @@ class Poisson(Scaled):
         """By the number of independent events, which is that of the bursts."""
         return np.asarray(expected >= _EVENTS * max(factor, 1.0) ** 2)
 
-    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, chance: float) -> np.ndarray:
+    def resolved(self, shift: np.ndarray, expected: np.ndarray, few: int, n: int, p: float) -> np.ndarray:
         """All where there are some counts; a count or two in cells that are mostly empty is no shift."""
         counts = few * np.maximum(expected, self.least(n))
         score = poisson_scores(np.maximum(counts + few * shift, 0.0), counts) / math.sqrt(1 + few / n)
-        return np.asarray((counts > _FEW) | (np.abs(score) > -stats.norm.ppf(chance / len(shift))))
+        return np.asarray((counts > _FEW) | (np.abs(score) > -stats.norm.ppf(p / len(shift))))
 
 
 class Exponential(Scaled):

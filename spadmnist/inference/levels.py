@@ -1,4 +1,9 @@
-"""Levels of decisions: what each decides, its unit, and its price in false alarms."""
+"""Levels of decisions: what each decides, its unit, and its price in false alarms.
+
+In this package a constant that names no source and no measurement is a rule of thumb. Right models, open cases and
+sealed ones (`scripts/frozen.py`, `scripts/challenge.py`) say whether all of them together are right; none was fitted by
+itself.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,13 @@ FALSE_ALARM = 0.01  # probability that the whole comparison fails a model that i
 SHARES = {"light": 0.25, "rate": 0.25}  # shares of the allowed false alarms, by kind of check
 SHARE_OF_TOTALS = sum(SHARES.values())  # of the allowed false alarms: the light and the totals together
 SHARE_OF_STATISTICS = 1 - SHARE_OF_TOTALS  # of the allowed false alarms: all statistics together
-LEAST_GAIN = 12.0  # in chi square: the least evidence for a step that is accepted
-COST_OF_A_NUMBER = 9.0  # in chi square: the least gain of each further free parameter
+LEAST_EVIDENCE = 12.0  # in chi square: the least evidence for a step that is accepted
+# of twice the log-likelihood, at the ends of a 95 % interval: that quantile of chi square with one degree of freedom
+FALL_95 = 3.84
+# in chi square: the optimism of one fitted parameter (Akaike, IEEE Trans. Autom. Control 19 (1974) 716)
+OPTIMISM_OF_A_PARAMETER = 2.0
+LEAST_P = 1e-300  # a p-value is never 0
+COST_OF_A_PARAMETER = 9.0  # in chi square: the least fall for each further free parameter
 PROMISING = 25.0  # in chi square: the least fall of the squares of a candidate that is looked at more closely
 OWN_CELLS = 0.9  # of the expected score of a step: its own cells carry it; `formats` has it
 LEAST_FALL = 0.7  # of the excess misfit in its own cells: the least fall that a step explains; `formats` has it

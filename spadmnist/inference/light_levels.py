@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
 SPREAD = 3.0  # standard deviations of the stated level: half the range over which the light of the replicates varies
 LEAST_SPREAD = 0.01  # of a logarithm: the least half range of the light of the replicates
-# of a logarithm: the noise of a level beyond which it counts, and the most that it counts
-_MUCH, _MOST_CHANCE = 0.05, 0.7
+# of a logarithm, 4 standard deviations of the counts: beyond the first they extend the range of the replicates; the
+# second is the most that they count
+_MUCH, _MOST_NOISE = 0.05, 0.7
 _DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
 _CLOSED = 5e-4  # relative error of the closed forms, at most
 LEAST_ELASTICITY = 0.01  # the least elasticity of a total that informs the light level
@@ -144,11 +145,11 @@ def levels_about(
     centre = level_for(expected, total, stated)
     half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
     if stated is not None:
-        chance = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_CHANCE)
-        if total == 0 or abs(math.log(centre / stated)) < half + chance:
+        noise = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_NOISE)
+        if total == 0 or abs(math.log(centre / stated)) < half + noise:
             # the same replicates then serve every measurement of this model; where detections are few, their range
             # reaches the data
-            return stated, half + chance if chance > _MUCH else half
+            return stated, half + noise if noise > _MUCH else half
     return centre, half
 
 

@@ -25,12 +25,12 @@ from .count_model import CountModel
 from .pixel_maps import (
     CODES,
     GRID,
+    INFORMED,
     LEAST_WIDTH,
     MOST,
     ODD,
     ROUNDS,
     TAILS,
-    TELLING,
     TURNS,
     WIDE,
     PixelMap,
@@ -170,13 +170,13 @@ class _Fitted:
         square = float(np.mean(weight * (self.logs - median_of(self.logs)) ** 2 + self.variance))
         self.sigma = min(max(math.sqrt(square), _WIDTHS[0]), _WIDTHS[1])
         noise = float(np.median(self.raw_variance))
-        if noise < TELLING**2:
+        if noise < INFORMED**2:
             # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
             width = 1.4826 * median_of(np.abs(self.raw - median_of(self.raw)))
             self.sigma = math.sqrt(max(width**2 - noise, LEAST_WIDTH**2))
         apart = self.logs - self.middle
         odd = outside_bulk(apart, self.sigma**2 + self.variance)
-        if noise >= TELLING**2:
+        if noise >= INFORMED**2:
             self.sigma = self._width_of_few(normal, score, apart, odd)
         self.precision = np.where(
             odd,
@@ -277,7 +277,7 @@ def fit_maps(
     for i, one in enumerate(fitted):
         assert one.candidate.carrier is not None
         map_ = one.map(one.of_light and scene)
-        if not one.of_light and float(np.median(one.raw_variance)) >= TELLING**2:
+        if not one.of_light and float(np.median(one.raw_variance)) >= INFORMED**2:
 
             def at(log: float, i: int = i) -> Sensor:
                 return model([np.full(o.logs.size, log) if j == i else o.logs for j, o in enumerate(fitted)])
@@ -365,7 +365,7 @@ def _of_few_counts(map_: PixelMap, lines: Sequence[CountModel], model: Callable[
     )
     weights = _by_their_law(np.exp(logs - logs.max(axis=1, keepdims=True)))
     mean, error = mean_of(weights, grid)
-    informed = map_.raw_error < TELLING
+    informed = map_.raw_error < INFORMED
     estimate, error = np.where(informed, map_.estimate, mean), np.where(informed, map_.error, error)
     return replace(map_, estimate=estimate, error=error, likely=(grid, weights))
 
@@ -467,10 +467,10 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     captures = [s.shortest for id, s in replicates.seen.items() if s.shortest is not None and (not use or id in use)]
     blur = blur_of(start)
     if blur is None or any(hasattr(e, "sensitivity") for e in start.at("dead_time")):
-        raise SpadError("how long each pixel is blind is not told where stamps or the recovery blur it by other laws")
+        raise SpadError("dead times by pixel are not estimated where stamps or the recovery blur them by other laws")
     found = blind_times.likelihoods(captures, blur, base) if captures and base > 0 else None
     if found is None:
-        raise SpadError("no capture has intervals short enough to tell how long each pixel is blind")
+        raise SpadError("no capture has intervals short enough to estimate the dead time of each pixel")
     grid, likely = found
     width = blind_times.width_of(grid, likely)
     weights = likely * width.prior.astype(np.float32)

@@ -44,7 +44,7 @@ def information(
         )
         shortest = {id: seen.shortest for id, seen in replicates.seen.items()}
         return {
-            id: np.zeros(pixels) if s is None else np.where(s.tells(base), base * s.density, 0.0) ** 2
+            id: np.zeros(pixels) if s is None else np.where(s.informs(base), base * s.density, 0.0) ** 2
             for id, s in shortest.items()
         }
     effect = with_values(replicates.start, values).effect(candidate.carrier[0])
@@ -86,7 +86,7 @@ def captures_needed(
 
 
 def models_with_maps(
-    replicates: Replicates, values: Values, wanted: Sequence[Candidate], levels: dict[str, float], unseen: bool = True
+    replicates: Replicates, values: Values, wanted: Sequence[Candidate], levels: dict[str, float], left_out: bool = True
 ) -> tuple[Model, dict[Key, PixelMap], dict[Key, Any]]:
     """(model with maps, the maps fitted to all captures, the values with these maps).
 
@@ -96,14 +96,14 @@ def models_with_maps(
     Args:
         wanted: candidates with a carrier.
         levels: light level by capture.
-        unseen: each capture is left out; otherwise all have the same maps.
+        left_out: the maps of each capture are fitted without it; otherwise all captures have the same maps.
     """
     whole = fit_maps(replicates, values, wanted, levels)
     final = {**values, **{key: m.values() for key, m in whole.items()}}
     needed = captures_needed(replicates, final, wanted, levels)
     maps: dict[str, dict[Key, PixelMap]] = {}
     for id, seen in replicates.seen.items():
-        if seen.counts is None or id in needed or not unseen or len(replicates.seen) < 2:
+        if seen.counts is None or id in needed or not left_out or len(replicates.seen) < 2:
             maps[id] = whole
         else:
             others = [i for i in replicates.seen if i != id]

@@ -17,7 +17,7 @@ from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
 from .evidence import evidence_of
-from .levels import LEAST_GAIN
+from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
 from .replicates import Replicates
@@ -33,11 +33,12 @@ MAKING_A_MAP = "making a map"  # the stage at which a map may fail
 LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS = 1e-3, 0.05
 # of a logarithm: widths of the pixels' differences that counts do not show
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)
-_TOLD = 50.0  # information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
-# in chi square: the least evidence for a pattern that says as much as the map (p of 8e-4 with one number)
+# information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
+_INFORMED = 50.0
+# in chi square: the least evidence for a pattern that says as much as the map (one-sided p of 8e-4 with one number)
 _LITTLE = 8.0
 _LIKE = 0.4  # cosine of two signatures: below it they are not alike
-# the least width of a map that is tried, and its least mean square relative to its noise
+# the least width of a map that is tried, of a logarithm, and its least mean square relative to its noise
 _LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05
 
 
@@ -75,26 +76,24 @@ def map_trials_of(
         if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
             continue
         sensors = sensors.changed({}, scan.phases)
-        chance = min(p_of_map(scan.replicates, evaluation, c, values, levels) for c in group)
-        if chance > least:
+        p = min(p_of_map(scan.replicates, evaluation, c, values, levels) for c in group)
+        if p > least:
             continue
         nothing = Signature({}, {}, {})
-        out.append(
-            Trial(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), chance=chance)
-        )
+        out.append(Trial(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), p_value=p))
     return out
 
 
 def candidate_maps(scan: Scan, evaluation: Evaluation) -> list[Candidate]:
     """Every map that may be tried: of no parameter that an earlier step fits as one number."""
     fit = {coordinate.key for candidate in scan.accepted for coordinate in candidate.coordinates}
-    return [c for c in scan._beside(evaluation.sensors.one) if c.carrier and c.carrier not in fit]
+    return [c for c in scan.candidates(evaluation.sensors.one) if c.carrier and c.carrier not in fit]
 
 
 def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> list[Trial]:
-    """The trials, a pattern first where it has evidence beside pixels that differ; patterns without it are dropped.
+    """The trials, a pattern first where it has evidence given the differences of the pixels; other patterns dropped.
 
-    A few random odd pixels may lie in a row, if seldom: no pattern. One that says as much as the map stays, too.
+    A few random odd pixels may lie in one row by accident. A pattern with as much evidence as the map is kept as well.
     """
     maps = [
         t
@@ -117,12 +116,12 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
             else:
                 shapes[one.candidate.name] = _shapes(evaluation.sensors.one, one.candidate)
     evidence |= pixel_maps.evidence_of_patterns(free, shapes)
-    chance = maps[0].chance  # odd pixels, which the mixed model cuts off, are in it
+    p = maps[0].p_value  # odd pixels, which the mixed model cuts off, are in it
 
     def is_real(e: PatternEvidence) -> bool:
-        own = math.inf if chance is None else max(sigmas_of(chance) ** 2, e.pixels)
+        own = math.inf if p is None else max(sigmas_of(p) ** 2, e.pixels)
         as_much = own < math.inf and e.alone > own - tie(own)
-        return e.beside >= LEAST_GAIN or (as_much and e.alone >= _LITTLE)
+        return e.given_pixels >= LEAST_EVIDENCE or (as_much and e.alone >= _LITTLE)
 
     real = [t for t in patterns if is_real(evidence.get(t.candidate.name, NO_PATTERN))]
     rest = [t for t in tried if not is_pattern(t) or any(t is one for one in real)]
@@ -132,7 +131,7 @@ def patterns_first(scan: Scan, evaluation: Evaluation, tried: list[Trial]) -> li
     of_pixels = most.maps is not None and most.candidate.per == "pixel"
     scenes = any(of_scene(t) for t in patterns)
     if real and (most in maps or most in real or (scenes and of_pixels)):
-        first = max(real, key=lambda t: evidence[t.candidate.name].beside)
+        first = max(real, key=lambda t: evidence[t.candidate.name].given_pixels)
         rest.remove(first)
         rest.insert(0, first)
     return rest
@@ -173,12 +172,12 @@ def _evidence_of_scene(
     return evidence_of_scene(z, left, known, free.sigma, len(one.candidate.coordinates))
 
 
-def unseen_maps(
+def random_map_trials(
     scan: Scan, evaluation: Evaluation, values: dict[Key, Any], like: Trial, faint: bool = False
 ) -> list[Trial]:
-    """Trials of random maps: maps that no pixel's counts inform, but whose signature is that of a candidate.
+    """Trials of random maps that the counts of single pixels do not inform, with the signature of a candidate.
 
-    The pixels of every replicate are drawn anew. A trial is returned if it is a tie with `like`.
+    The pixels of every replicate are drawn anew. A trial is returned if its evidence is a tie with that of `like`.
 
     Args:
         values: the values of the model, SI.
@@ -187,7 +186,7 @@ def unseen_maps(
     """
     levels = count_model.light_levels_of(scan.replicates, evaluation)
     out = []
-    for candidate in scan._beside(evaluation.sensors.one):
+    for candidate in scan.candidates(evaluation.sensors.one):
         if candidate.per != "pixel" or candidate.carrier is None or candidate.effect == like.candidate.effect:
             continue
         information: Any = None
@@ -196,7 +195,7 @@ def unseen_maps(
         if information is None:
             continue
         # the intervals inform each dead time, but jitter may be what scatters them
-        if float(np.median(information)) > _TOLD and not candidate.blinds:
+        if float(np.median(information)) > _INFORMED and not candidate.blinds:
             continue
         best: Trial | None = None
         about, sigmas = 0.0, np.array(_SIGMAS)
@@ -215,7 +214,7 @@ def unseen_maps(
                 residuals = residuals_at(scan.replicates, evaluation, signature)
                 fall = square(evaluation.residuals) - square(residuals)
                 one = Trial(candidate, {}, signature, fall, 1.0, sensors, residuals=residuals)
-                one = scan._marked(evaluation, one) if faint else one
+                one = scan._with_score(evaluation, one) if faint else one
                 if best is None or one.fall > best.fall:
                     best, about = one, float(sigma)
             if best is None or best.fall < like.evidence / 2:
@@ -249,4 +248,4 @@ def _with_random_map(sensors: Model, candidate: Candidate, sigma: float) -> Mode
         draws = np.exp(sigma * rng.standard_normal(sensor.layout.pixels))
         return with_values(sensor, {(effect, parameter): values * draws})
 
-    return Model(of, sensors.one, alike=False, typical=sensors.usual)
+    return Model(of, sensors.one, alike=False, typical=sensors.mean_sensor)

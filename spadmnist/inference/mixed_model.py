@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
+from .levels import OPTIMISM_OF_A_PARAMETER
+
 _FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off: odd pixels make no pattern
-_EACH = 2.0  # in chi square: the price of a parameter
 _LEAST = 1e-3  # of the noise: the least standard deviation of a random effect, which is none
 _STARTS = (0.1, 1.0)  # of the spread of all values: standard deviations of a group at which a search starts
 _ROUNDING = 1e-9  # relative: smaller differences of a shape are those of rounding
@@ -32,12 +33,12 @@ class PatternEvidence:
     """The evidence for a pattern, in chi square.
 
     Attributes:
-        beside: where pixels differ at random: of both, over these alone.
-        alone: over pixels that are all alike.
-        pixels: for pixels that differ at random, over pixels that are all alike.
+        given_pixels: of pattern and random differences of the pixels, relative to these differences alone.
+        alone: of the pattern, relative to equal pixels.
+        pixels: of random differences of the pixels, relative to equal pixels.
     """
 
-    beside: float
+    given_pixels: float
     alone: float
     pixels: float
 
@@ -86,10 +87,11 @@ def evidence_of_patterns(
         if number == 0 or free < 1:
             out[name] = NO_PATTERN
             continue
-        price = _EACH * number * y.size / free  # Hurvich and Tsai, Biometrika 76 (1989) 297: of few pixels
+        # of few pixels: Hurvich and Tsai, Biometrika 76 (1989) 297
+        price = OPTIMISM_OF_A_PARAMETER * number * y.size / free
         alone, both = (_most_likely(y, noise, design, groups, pixels) for pixels in (False, True))
         out[name] = PatternEvidence(
-            2 * (both - differ) - price, 2 * (alone - nothing) - price, 2 * (differ - nothing) - _EACH
+            2 * (both - differ) - price, 2 * (alone - nothing) - price, 2 * (differ - nothing) - OPTIMISM_OF_A_PARAMETER
         )
     return out
 
@@ -128,14 +130,14 @@ def evidence_of_scene(
     z, left = (np.clip(x, middle - far, middle + far) for x in (z, left))
     square = max(float(left @ left), 1e-30)
     fall = (float(z @ z) - square) / (square / (z.size - parameters))
-    return PatternEvidence(fall - _EACH * parameters, -math.inf, 0.0)
+    return PatternEvidence(fall - OPTIMISM_OF_A_PARAMETER * parameters, -math.inf, 0.0)
 
 
 def _whitened(z: np.ndarray, sensitivity: np.ndarray, sigma: float) -> np.ndarray:
     """(captures, pixels) residuals of unit variance, independent although each pixel differs by `sigma`."""
     square = (sensitivity**2).sum(axis=0)
-    along = (sensitivity * z).sum(axis=0) / np.maximum(square, 1e-300)
-    return np.asarray(z - sensitivity * along * (1 - 1 / np.sqrt(1 + sigma**2 * square)))
+    projection = (sensitivity * z).sum(axis=0) / np.maximum(square, 1e-300)
+    return np.asarray(z - sensitivity * projection * (1 - 1 / np.sqrt(1 + sigma**2 * square)))
 
 
 def _most_likely(

@@ -24,15 +24,15 @@ from .budget import FITS, STEPS, Budget, OutOfBudget, clock
 from .candidates import Candidate
 from .comparison import Comparison, comparison_of, comparison_with
 from .conclusion import Limits, Notes, answer, left_over, not_done, outside, rival_step, so_far, too_short, verdict_of
-from .elimination import drop_mimics, drop_needless, in_vain, left_in_own_cells
+from .elimination import drop_needless, drop_unexplaining, left_in_own_cells, no_step_explains
 from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
 from .evidence import best_of, evidence_of, judge_maps_by_odd_pixels, worth_fitting
 from .findings import mimicked
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .journal import Journal
-from .levels import FALSE_ALARM, LEAST_GAIN
-from .map_trials import patterns_first, unseen_maps
+from .levels import FALSE_ALARM, LEAST_EVIDENCE
+from .map_trials import patterns_first, random_map_trials
 from .model_path import ModelPath, accept, begin
 from .replicates import REPLICATES, TOTALS, Replicates
 from .results import Diagnosis, title
@@ -42,11 +42,12 @@ from .trial_fits import fit_trial
 
 MAX_STEPS = 12  # of one diagnosis, by default
 _QUICK = 32  # replicates of each capture in a quick diagnosis
-# p-value of a signature that is followed where no check fails; it is below the false-alarm rate of the checks
-_TRACE = 4e-3
+# p-value of a signature that is followed where no check fails. It is below the false-alarm rate of the checks; at 3e-3
+# with fewer replicates one of 16 right models was called crosstalk
+_P_SCORE = 4e-3
 _MAYBE, _CLOSER = 100.0, REPLICATES  # times that p-value: worth more replicates; their number
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
-_LATER_TRACE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed
+_P_LATER_SCORE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed
 
 
 def diagnose(
@@ -106,15 +107,15 @@ def _diagnosed(
     path = begin(replicates)
     start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
-    while len(path.steps) < max_steps and not in_vain(path, not notes.explained) and _possible(path, notes):
+    while len(path.steps) < max_steps and not no_step_explains(path, not notes.explained) and _possible(path, notes):
         if path.steps:
             keep(so_far(path, start, notes))
     replicates.budget.until = FITS
     if path.steps:
-        with _or_as_before(path, "taking out what is needless"):
+        with _or_as_before(path, "dropping the steps that are no longer needed"):
             drop_needless(path)
-        with _or_as_before(path, "taking out what only looks alike"):
-            drop_mimics(path, start, not notes.explained)
+        with _or_as_before(path, "dropping the steps that explain too little of their own cells"):
+            drop_unexplaining(path, start, not notes.explained)
     if path.steps and not short:
         with _or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
@@ -146,7 +147,7 @@ def _diagnosed(
     limits: Limits = ([], [], [])
     replicates.budget.until = 1.0
     if verdict == "adequate" or (verdict == "explained" and not quick):
-        replicates.say("what would have been seen")
+        replicates.say("upper limits of the effects that were not found")
         with _or_as_before(path, "the upper limits"):
             if notes.looked is not path.evaluation:  # the last step was the last one allowed, or its values have moved
                 notes.tried = path.scan.scan(path.evaluation, everywhere=True, known=notes.tried)
@@ -222,10 +223,10 @@ def _another(path: ModelPath, notes: Notes) -> bool:
         failed = path.failed
     if not failed:
         # no check fails: a score test along each signature
-        replicates.say(f"step {number}: no check fails; looking for the trace of every candidate")
+        replicates.say(f"step {number}: no check fails; a score test of every candidate")
         notes.tried = scan.scan(path.evaluation, everywhere=True, known=notes.tried)
         before = notes.looked = path.evaluation
-        largest_p = _LATER_TRACE if path.steps else _TRACE
+        largest_p = _P_LATER_SCORE if path.steps else _P_SCORE
         if _stands_out(path, notes.tried, largest_p):
             closer = path.evaluation
             if closer is not before:  # more replicates may show lines that few did not
@@ -317,14 +318,14 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
         fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
         if not fitted:
             return False
-    pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_GAIN) else None
+    pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_EVIDENCE) else None
     if faint:
         best = best_of(fitted, lambda t: -judged[id(t)][1], pattern)
     else:
         best = best_of(fitted, lambda t: t.evidence, pattern, tie)
     significance, p = judged[id(best)]
     # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
-    if p > least or (best.evidence < LEAST_GAIN and not faint):
+    if p > least or (best.evidence < LEAST_EVIDENCE and not faint):
         if faint or not _few(path):
             return False
         path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
@@ -333,9 +334,9 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     with _needed(path, best.candidates, "fitting all numbers together"):
         new = accept(path, best, significance)
     if best.maps is None and not best.phases:
-        with _or_as_before(path, "looking for what looks alike"):
-            unseen = unseen_maps(scan, before, path.values, best, faint)
-            second = second + unseen
+        with _or_as_before(path, "trying random maps with the same signature"):
+            random_maps = random_map_trials(scan, before, path.values, best, faint)
+            second = second + random_maps
     new[0].alternatives = alternatives(scan, before, best, second)
     named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
     if notes.placebo is None:
@@ -380,7 +381,7 @@ def _few(path: ModelPath) -> bool:
 
 def _closer(path: ModelPath) -> Evaluation:
     """The evaluation of the model with more replicates."""
-    path.replicates.say("a closer look at what may be there")
+    path.replicates.say(f"more replicates of the model: {_CLOSER} of each capture")
     return evaluate(path.replicates, path.evaluation.values, path.evaluation.sensors, _CLOSER, path.evaluation)
 
 
@@ -414,13 +415,13 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     cost = likely[0].cost if likely else float(evaluation.residuals[TOTALS] @ evaluation.residuals[TOTALS])
     others = setups.rivals(path.scan, evaluation, cost)
     own = others[0].cost(evaluation) if others else math.inf
-    if not likely or own < cost - setups.ALIKE:
+    if not likely or own < cost - setups.TIE:
         return False  # the sensor explains it better
-    near = [e for e in likely if e.cost < cost + setups.ALIKE and len(e.factors) == len(likely[0].factors)]
+    near = [e for e in likely if e.cost < cost + setups.TIE and len(e.factors) == len(likely[0].factors)]
     found = setups.entries(replicates, evaluation, near)
     if not found:
         return False
-    if own < cost + setups.ALIKE:
+    if own < cost + setups.TIE:
         found = [{**entry, "confused": True} for entry in found]
         notes.rival = others[0]
         with path.scan.if_possible(others[0].candidate, "advice", wholly=False):

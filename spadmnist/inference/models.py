@@ -34,7 +34,7 @@ class Model:
     alike: bool = True
     typical: Callable[[str], Sensor] | None = None
 
-    def usual(self, capture: str) -> Sensor:
+    def mean_sensor(self, capture: str) -> Sensor:
         """The sensor whose closed forms hold in the mean over the replicates of a capture."""
         return self.typical(capture) if self.typical else self.of(capture, 0)
 
@@ -76,14 +76,14 @@ class Model:
             return with_values(on_chip(sensor, number + 1) if chips else sensor, own(capture))
 
         def usual(capture: str) -> Sensor:
-            return with_values(self.usual(capture), own(capture))
+            return with_values(self.mean_sensor(capture), own(capture))
 
         typical = functools.lru_cache(maxsize=64)(usual)
         known = typical if self.typical or chips else None
         return Model(of, with_values(self.one, values), self.alike and not chips, known)
 
 
-def swinging(sensor: Sensor) -> list[Key]:
+def phase_parameters(sensor: Sensor) -> list[Key]:
     """The parameters of a sensor that are phases."""
     return [(e.name, name) for e in sensor.effects for name, p in e.parameters.items() if p.kind == "phase"]
 

@@ -27,11 +27,12 @@ from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
 from .joint_fit import edge_errors, fit_all
+from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .replicates import FEW, REPLICATES, Replicates
 from .results import Diagnosis, Step, Value, title
 from .scan import of_other_shapes
-from .score_test import LEAST_P, p_of_map
+from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of
 from .trial import Trial
 from .trial_fits import fit_trial
@@ -80,7 +81,7 @@ def fit_named(
             if not isinstance(answer, str):
                 say("by the counts in the dark alone; compare checks the new model in all other statistics")
                 return answer
-            say(f"not by counts in the dark alone, for there is {answer}")
+            say(f"not by the counts of dark captures alone: {answer}")
         replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)
         path = begin(replicates)
         start, wrong = path.evaluation, bool(path.failed)
@@ -161,12 +162,12 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[s
 def _by_likelihood(path: ModelPath, wanted: Sequence[Candidate], exact: MaximumLikelihood) -> None:
     """Add steps with the maximum-likelihood values; their misfit is that of a simulation."""
     replicates, before = path.replicates, path.evaluation
-    for candidate, gain in zip(wanted, exact.gains, strict=True):
+    for candidate, likelihood_ratio in zip(wanted, exact.likelihood_ratios, strict=True):
         intervals = {d.key: exact.intervals[d.key] for d in candidate.coordinates}
         own = {**dict(candidate.fixed), **{key: exact.values[key] for key in intervals}}
         signature = signature_of_totals(replicates, before, before.sensors.changed(own))
-        change = material(Trial(candidate, own, signature, gain, 1.0))
-        step = Step(candidate, {}, 0.0, math.sqrt(max(gain, 0.0)), change, intervals=intervals)
+        change = material(Trial(candidate, own, signature, likelihood_ratio, 1.0))
+        step = Step(candidate, {}, 0.0, math.sqrt(max(likelihood_ratio, 0.0)), change, intervals=intervals)
         step.template, step.before = template_of(replicates, before, signature), dict(before.residuals)
         path.steps.append(step)
     path.scan.accepted += wanted
@@ -189,7 +190,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
                 path.values,
                 count_model.light_levels_of(replicates, path.evaluation),
             )
-            best = Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, chance=p)
+            best = Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, p_value=p)
             accept(path, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
             continue
         best = fit_trial(replicates, path.evaluation, _started(path, candidate), 5)
@@ -226,7 +227,7 @@ def _kept(path: ModelPath, candidate: Candidate) -> None:
     values: dict[str, Value] = {}
     for (effect, name), _ in candidate.fixed:
         values[name] = Value(float(getattr(path.replicates.start.effect(effect), name)), None, None)
-    path.steps.append(Step(candidate, values, path.misfit, 0.0, "mean rate +0.00%"))
+    path.steps.append(Step(candidate, values, path.misfit, 0.0, "mean rate +0.00 %"))
     path.rung(f"{title(candidate)} as it was", path.steps[-1:])
 
 
@@ -264,7 +265,7 @@ def _named(
 
 
 def _why_not(kind: str, effect: str, parameter: str | None, listed: bool) -> str:
-    """Why a parameter of a listed effect is no candidate, as far as its declaration tells."""
+    """Why a parameter of a listed effect is no candidate, as far as its declaration states."""
     declared = Effect.registry.find(effect).parameters.get(parameter or "") if listed else None
     if declared is None:
         return ""

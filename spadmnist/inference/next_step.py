@@ -14,8 +14,8 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
     """What follows a comparison. sensor, measurement: as the command named them, quoted for a shell."""
     if found.verdict == "adequate":
         return (
-            f"spadmnist diagnose {sensor} {measurement} says how much of each effect could be there unseen; a "
-            "brighter, a darker or a longer capture tests the model further."
+            f"spadmnist diagnose {sensor} {measurement} gives a 95 % upper limit on each effect; a brighter, a darker "
+            "or a longer capture tests the model further."
         )
     return f"spadmnist diagnose {sensor} {measurement} -o next finds what the model lacks."
 

@@ -96,11 +96,11 @@ class Null:
             p = 1e-12 if wrong.any() else 1.0
             return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
         z = self.residuals(values, expected, leverage)
-        p, worst = self.chance(z)
+        p, worst = self.p_value(z)
         mean = max(float(self.own.mean()), 0.05)
         return Judgement(p, float(np.mean(z**2)) / mean, z, expected, spread, worst)
 
-    def chance(self, z: np.ndarray) -> tuple[float, int]:
+    def p_value(self, z: np.ndarray) -> tuple[float, int]:
         """(p-value of residuals, the cell of the largest one).
 
         The p-value is twice the smaller of that of the sum of squares and that of the largest residual.

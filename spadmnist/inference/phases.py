@@ -12,7 +12,7 @@ import numpy as np
 from .coordinates import Key
 from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
-from .models import swinging
+from .models import phase_parameters
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, residuals_at, residuals_shifted, signatures
 
@@ -29,7 +29,7 @@ _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step between two phases: the finer
 
 
 @dataclass(frozen=True)
-class Swing:
+class PeriodicSignature:
     """The signature of a periodic effect, to second order in its strength x, at the phase p.
 
             x (a cos p + b sin p) + x^2 (c + d cos 2p + e sin 2p)
@@ -45,7 +45,7 @@ class Swing:
     logs: dict[str, np.ndarray]
 
     @staticmethod
-    def of(turned: Sequence[Signature], phases: Sequence[float]) -> Swing:
+    def of(turned: Sequence[Signature], phases: Sequence[float]) -> PeriodicSignature:
         """The fit to signatures of strength 1 at some phases.
 
         Args:
@@ -59,7 +59,7 @@ class Swing:
             shifts[cell] = solve @ np.stack([m.shifts.get(cell, np.zeros(size)) for m in turned])
         noise = {cell: float(np.mean([m.noise.get(cell, 0.0) for m in turned])) / len(turned) for cell in shifts}
         logs = {id: solve @ np.array([m.logs.get(id, 0.0) for m in turned]) for id in turned[0].logs}
-        return Swing(shifts, noise, logs)
+        return PeriodicSignature(shifts, noise, logs)
 
     def at(self, phases: Mapping[str, float]) -> Signature:
         """The signature with a phase in each capture: its odd and its even part."""
@@ -72,7 +72,7 @@ class Swing:
             odd.logs[id], even.logs[id] = float(waves[:2] @ log[:2]), float(waves[2:] @ log[2:])
         return Signature(odd.shifts, odd.noise, odd.logs, even=even)
 
-    def mirrored(self, id: str, phase: float, times: float) -> float:
+    def mirror_phase(self, id: str, phase: float, times: float) -> float:
         """The other phase at which a capture has the same total, or the same phase if there is none.
 
         The rate falls there where it rose.
@@ -82,7 +82,7 @@ class Swing:
         crossed = np.flatnonzero(np.diff(np.sign(more - more[0])[1:-1])) + 1
         return float(every[crossed[0]]) % (2 * math.pi) if len(crossed) else phase
 
-    def suited(
+    def best_fit(
         self, replicates: Replicates, evaluation: Evaluation, times: Sequence[float] = TIMES
     ) -> tuple[float, float, dict[str, float]]:
         """(fall of the squares in chi square, strength, phase of each capture) of the best fit to the data.
@@ -103,7 +103,7 @@ class Swing:
 
 def simulate_phases(
     replicates: Replicates, evaluation: Evaluation, keys: Sequence[Key], values: Mapping[Key, Any], few: int
-) -> Swing | str:
+) -> PeriodicSignature | str:
     """The signature of a periodic effect at any phase, or the reason why it cannot be simulated.
 
     Args:
@@ -118,10 +118,10 @@ def simulate_phases(
     made = [m for m in found if not isinstance(m, str)]
     if len(made) < len(found):
         return next(m for m in found if isinstance(m, str))
-    return Swing.of(made, turns)
+    return PeriodicSignature.of(made, turns)
 
 
-def choose_side(
+def choose_phase(
     replicates: Replicates,
     evaluation: Evaluation,
     keys: Sequence[Key],
@@ -136,7 +136,7 @@ def choose_side(
 
     Args:
         keys, values: as there.
-        phases, mirrored: rad, by capture; see `Swing.mirrored`.
+        phases, mirrored: rad, by capture; see `PeriodicSignature.mirrored`.
     """
     pairs = [{(id, key): p for id, p in some.items() for key in keys} for some in (phases, mirrored)]
     left = []
@@ -161,7 +161,7 @@ def _waves(x: float, p: float) -> np.ndarray:
 
 
 def _best(
-    swing: Swing,
+    swing: PeriodicSignature,
     replicates: Replicates,
     evaluation: Evaluation,
     times: Sequence[float],
@@ -206,12 +206,12 @@ def _best(
 def evaluate_start(replicates: Replicates) -> tuple[Evaluation, dict[tuple[str, Key], float]]:
     """(evaluation of the stated sensor, fitted phases of its periodic effects by (capture, parameter))."""
     evaluation = evaluate(replicates, {}, remember=True)
-    keys = swinging(replicates.start)
+    keys = phase_parameters(replicates.start)
     swing = simulate_phases(replicates, evaluation, keys, {}, FEW) if keys else ""
     if isinstance(swing, str):
         return evaluation, {}
-    *_, found = swing.suited(replicates, evaluation, [1.0])
-    mirrored = {id: swing.mirrored(id, p, 1.0) for id, p in found.items()}
-    found = choose_side(replicates, evaluation, keys, {}, found, mirrored)
+    *_, found = swing.best_fit(replicates, evaluation, [1.0])
+    mirrored = {id: swing.mirror_phase(id, p, 1.0) for id, p in found.items()}
+    found = choose_phase(replicates, evaluation, keys, {}, found, mirrored)
     phases = {(id, key): p for id, p in found.items() for key in keys}
     return evaluate(replicates, {}, evaluation.sensors.changed({}, phases)), phases

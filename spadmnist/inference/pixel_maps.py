@@ -17,16 +17,16 @@ from .coordinates import Key
 from .mixed_model import PatternEvidence
 from .results import Value
 
-TAILS = 3.0  # degrees of freedom of the prior
+TAILS = 3.0  # degrees of freedom of the prior, a Student t
 # of the information on a map, in the mean over its pixels: a capture with a larger share is needed to fit it
 ALONE = 0.6
 # of a logarithm: the noise of an estimate below which a pixel is informed by itself; the least width of the prior
-TELLING, LEAST_WIDTH = 0.2, 1e-3
+INFORMED, LEAST_WIDTH = 0.2, 1e-3
 # relative standard error of the variance of many pixels by the median of their distances, times the root of their
-# number
+# number: twice that of the width, 1.166 for a normal law
 _DOUBT = 2.34
 TURNS = 16  # iterations of a fit of maps
-MOST = 10.0  # of a logarithm: the most that a value deviates
+MOST = 10.0  # of a logarithm: the most that a value deviates from that of the array
 # standard deviations beyond which a pixel is odd; of a logarithm, the width of the prior of odd pixels
 ODD, WIDE = 3.5, 2.0
 CODES = "codes"  # the statistic of the codes
@@ -65,7 +65,7 @@ class PixelMap:
     low: float = 0.0
     high: float = math.inf
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) posterior weights
-    certain: float = TELLING  # raw_error below which a value is the estimate, whatever the others are
+    certain: float = INFORMED  # raw_error below which a value is the estimate, whatever the others are
     width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
     of_scene: bool = False  # no light falls on some pixels, and nothing says how much of it they detect
 
@@ -134,7 +134,7 @@ class PixelMap:
         """
         noise = np.minimum(self.raw_error**2, MOST)
         typical = float(np.median(noise))
-        if typical >= TELLING**2:
+        if typical >= INFORMED**2:
             return np.ones(noise.size)  # these have a law of their own
         doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + typical)
         other = max(self.sigma**2 + draw * doubt, min(LEAST_WIDTH, self.sigma) ** 2)
@@ -215,7 +215,7 @@ def low_ratio(map_: PixelMap) -> tuple[float, float]:
     if not low.any():
         return 1.0, math.inf
     # pixels that are informed by themselves: the prior pulls an estimate to the others
-    informed = map_.raw_error < TELLING
+    informed = map_.raw_error < INFORMED
     logs = np.where(informed, map_.raw, map_.estimate)[low] - median_of(map_.estimate)
     own = float(np.mean(np.where(informed, map_.raw_error, map_.error)[low] ** 2))
     apart = float(np.var(logs, ddof=1)) if low.sum() > 1 else 0.0

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-_NOTHING = 1e-5  # of the function: with a smaller change it does not depend on a coordinate
+_NOTHING = 1e-5  # of the log-likelihood: with a smaller change it does not depend on a coordinate
 _TINY = 1e-9  # of a coordinate: no distance
 
 
@@ -96,14 +96,14 @@ class Maximum:
         value: of the function; u: (n,) where it is.
         jacobian: (n,) gradient of the function.
         curved: (n, n) minus the second derivatives.
-        tells: (n,) bool, whether the function depends on the coordinate.
+        informed: (n,) bool, whether the function depends on the coordinate.
     """
 
     value: float
     u: np.ndarray
     jacobian: np.ndarray
     curved: np.ndarray
-    tells: np.ndarray
+    informed: np.ndarray
 
     @property
     def spreads(self) -> np.ndarray:
@@ -122,7 +122,7 @@ def _parabola(
     """
     n = len(u)
     units = np.eye(n)
-    gradient, curved, tells = np.zeros(n), np.eye(n), np.ones(n, bool)
+    gradient, curved, informed = np.zeros(n), np.eye(n), np.ones(n, bool)
     seen = []
     for i in range(n):
 
@@ -137,8 +137,8 @@ def _parabola(
                 x, fall, _ = crossing(functools.partial(fallen, sign), 0.5, first, room, 0.5)
                 points.append((sign * x, fall))
                 first = x if fall > _NOTHING else first
-        tells[i] = any(abs(fall) > _NOTHING for _, fall in points)
-        if not tells[i]:
+        informed[i] = any(abs(fall) > _NOTHING for _, fall in points)
+        if not informed[i]:
             seen.append((0.0, 0.0))
             continue
         if len(points) == 1:
@@ -148,14 +148,14 @@ def _parabola(
         gradient[i] = half * a - at_a / a
         curved[i, i] = 2 * half if half > 0 else 1 / max(abs(a), abs(b)) ** 2
         seen.append(min(points, key=lambda p: abs(p[1] - 0.5)))
-    for i, j in itertools.combinations(np.flatnonzero(tells).tolist(), 2):
+    for i, j in itertools.combinations(np.flatnonzero(informed).tolist(), 2):
         (x, at_x), (y, at_y) = seen[i], seen[j]
         both = value - function(u + x * units[i] + y * units[j])
         curved[i, j] = curved[j, i] = (both - at_x - at_y) / (x * y)
     # positive definite, although the coordinates may be strongly correlated
     root = np.sqrt(np.diag(curved))
     sizes, axes = np.linalg.eigh(curved / np.outer(root, root))
-    return Maximum(value, u, gradient, (axes * np.maximum(sizes, 0.01)) @ axes.T * np.outer(root, root), tells)
+    return Maximum(value, u, gradient, (axes * np.maximum(sizes, 0.01)) @ axes.T * np.outer(root, root), informed)
 
 
 def _move(gradient: np.ndarray, curved: np.ndarray, free: np.ndarray, u: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -191,7 +191,7 @@ def maximum(
     value = function(u)
     for _ in range(8):
         top = _parabola(function, u, value, scales, ends)
-        some = top.tells
+        some = top.informed
         move = _move(top.jacobian, top.curved, some, u, ends)
         if 0.5 * top.jacobian @ move > most:
             return None
@@ -240,7 +240,7 @@ def profile_end(
         ends: (2, n) bounds.
     """
     u, curved = top.u, top.curved
-    others = top.tells & (np.arange(len(u)) != i)
+    others = top.informed & (np.arange(len(u)) != i)
     steps = 0.4 * np.minimum(top.spreads, ends[1] - ends[0])
     # how the others follow, so far as is known
     ridge = -np.linalg.solve(curved[np.ix_(others, others)], curved[others, i])

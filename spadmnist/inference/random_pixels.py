@@ -1,9 +1,9 @@
 """Effects that hit pixels at random: fits by the likelihood with their own scatter, and which pixels were hit.
 
-Which pixels such an effect hits is chance. In units of the scatter of the model without it, the residuals of those that
-the data's chip has are far larger than all others, at any strength and any time constant, so that their squares say
-nothing of these. In units of the scatter that the effect brings with it they are ordinary. So its shape is chosen by
-the quasi-likelihood ratio, and its coordinates are fitted by Gauss-Newton steps from evaluations of the model with the
+Such an effect hits pixels at random. In units of the scatter of the model without it, the pixels that it has hit in the
+data have by far the largest residuals, whatever its strength and time constant. Their squares do not inform these two.
+In units of the scatter of the model with the effect these residuals are ordinary. Its shape is therefore chosen by the
+quasi-likelihood ratio, and its coordinates are fitted by Gauss-Newton steps from evaluations of the model with the
 effect (iteratively reweighted least squares).
 Source: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 9.
 """
@@ -34,7 +34,7 @@ _OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: few,
 _TURNS = 6  # steps at most; from the nearest of the shapes four were enough for dark counts that blink
 _VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise
 _PROMISED = 5.0  # in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian
-_CHANCE = 0.5  # pixels that are taken as hit by chance, in the mean over all: less than one
+_FALSE_HITS = 0.5  # expected number of pixels in the array that are taken as hit although they are not
 _ENOUGH = 0.1  # of what a hit adds in the mean: the least excess of a pixel that is taken as hit
 _MOST = 0.4  # share of the pixels: with more of them hit, the median of all is no longer that of the others
 _LEVEL = 10.0  # detections of most pixels, from which on their median gives the level and their scatter
@@ -133,9 +133,9 @@ class PixelsHit:
 
 
 def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, effect: str) -> PixelsHit | None:
-    """The pixels whose counts show an effect that hits pixels at random; None where they do not tell which ones.
+    """The pixels whose counts show an effect that hits pixels at random; None where the counts do not identify them.
 
-    The median of the pixels gives the level of a capture, which the pixels that are hit by chance in a model do not.
+    The median of the pixels gives the level of a capture: pixels that are hit at random hardly move it.
 
     Args:
         evaluation: of the model with the effect.
@@ -167,8 +167,8 @@ def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, e
         more = counts - low > _ENOUGH * (high - low)
         p = np.minimum(p, np.where(more, len(counted) * line.p_of_more(counts, low, wider), 1.0))
         of_a_hit = np.minimum(of_a_hit, len(counted) * line.p_of_more(high, low, wider))
-    hit = p < _CHANCE / pixels
-    if float(np.median(of_a_hit)) > _CHANCE / pixels or not 0 < float(np.mean(hit)) < _MOST:
+    hit = p < _FALSE_HITS / pixels
+    if float(np.median(of_a_hit)) > _FALSE_HITS / pixels or not 0 < float(np.mean(hit)) < _MOST:
         return None
     return PixelsHit(hit, of_pixels(sensor, effect, hit))
 

@@ -23,7 +23,7 @@ from ..streams import Streams
 from ..workers import Executor
 from . import memory
 from .budget import Budget, work_of
-from .candidates import Candidate, candidates, maps_beside
+from .candidates import Candidate, candidates, maps_added
 from .models import InTheDark, Model, Packed
 from .reduction import ReducedCapture, halves_of, reduce_with, statistics_for
 
@@ -173,7 +173,7 @@ class Replicates:
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
         self.simulations, self.budget, self.journal = 0, budget or Budget(), journal
-        self._told: set[int] = set()  # numbers of workers that were told of
+        self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:
                 self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
@@ -197,7 +197,7 @@ class Replicates:
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """Every candidate of a sensor that these captures can show."""
         captures = (seen.capture for seen in self.seen.values())
-        return candidates(sensor, captures, maps_beside(sensor, self.start))
+        return candidates(sensor, captures, maps_added(sensor, self.start))
 
     def halves(self, ids: Collection[str]) -> Replicates:
         """Some captures alone, each as two: its blocks of time 1, 3, ... and its blocks 2, 4, ...
@@ -244,8 +244,8 @@ class Replicates:
         """The workers, as many as may make replicates that take so many bytes at the same time."""
         number = memory.workers_at_once(needed, self.workers.threads)
         workers = self.workers.limited(number)
-        if workers.threads < self.workers.threads and workers.threads not in self._told:
-            self._told.add(workers.threads)
+        if workers.threads < self.workers.threads and workers.threads not in self._reported:
+            self._reported.add(workers.threads)
             self.say(
                 f"{workers.threads} of {self.workers.threads} workers are used at a time: a simulated recording of the "
                 f"largest capture takes about {needed / 1e9:.2g} GB of memory"

@@ -70,6 +70,7 @@ class Value:
     method: str = ""
 
     def as_data(self) -> dict[str, Any]:
+        """Value, ends of its interval, unit and method, for JSON."""
         out: dict[str, Any] = {"value": plain(self.value)}
         if self.low is not None and self.high is not None:
             out |= {"low": plain(self.low), "high": plain(self.high)}
@@ -78,7 +79,19 @@ class Value:
 
 @dataclass
 class Step:
-    """An accepted change of the model; see `formats`."""
+    """An accepted change of the model.
+
+    Attributes:
+        misfit: of the model with it, on held-out captures; 1 if the model is right.
+        significance: standard deviations.
+        material: the change of the mean rate, as text.
+        phased: it has a phase in each capture.
+        chips: it affects random pixels, which differ from replicate to replicate.
+        fluctuates: its totals scatter far more than those of the model without it.
+        intervals: 95 % intervals of coordinates that the fit does not hold, by (effect, parameter), SI.
+        template: (cells,) its expected residuals under the model before it, by block.
+        before: (cells,) residuals of the data under the model before it, by block.
+    """
 
     candidate: Candidate
     values: dict[str, Value]
@@ -100,10 +113,10 @@ class Step:
 
     @property
     def where(self) -> str:
-        """In words, in how many pixels an effect that hits them at random is seen; empty for all else."""
+        """In how many pixels an effect that hits pixels at random was detected, as text; "" for all other steps."""
         if self.hit is None:
             return ""
-        return f"seen in {self.hit.sum():,} of {self.hit.size:,} pixels, which the sensor file has"
+        return f"detected in {self.hit.sum():,} of {self.hit.size:,} pixels, which the sensor file contains"
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name} {shown(v)}" for name, v in self.values.items())
@@ -393,7 +406,7 @@ def sentence(found: Diagnosis) -> str:
     if found.verdict == "partly_explained":
         what = remains(found)
         rest = f"What remains: {what}." if what else "Some checks still fail."
-        return f"{fitted} {'is' if len(found.steps) == 1 else 'are'} missing, but not all. {rest}"
+        return f"{fitted} {'explains' if len(found.steps) == 1 else 'explain'} a part of the deviations. {rest}"
     what = f": {remains(found)}" if found.unexplained else ""
     return f"no known effect explains what differs{what}. {mechanism(found.unexplained, found.dark).capitalize()}."
 

@@ -15,12 +15,12 @@ from ..sensor import Sensor
 from .candidates import Candidate, has_random_pixels, templates, with_values
 from .coordinates import Key, is_edge
 from .evaluation import Evaluation, block_checks, failing, square
-from .levels import COST_OF_A_NUMBER, PROMISING
+from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
 from .phases import NEAR, TIMES, simulate_phases
 from .replicates import FEW, Replicates
-from .score_test import LEAST_P, best_direction, sigmas_of
+from .score_test import best_direction, sigmas_of
 from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
 from .spectral_lines import Line, spectral_lines
 from .trial import Trial, frequencies_of, further, is_same, shape_of, stronger, weaker
@@ -29,14 +29,16 @@ from .trial_fits import STRONG
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
 _SCAN = 2  # replicates of each capture for the first look
 _SECOND = 6  # candidates in the second look
-_NEARLY = 0.8  # of the largest fall
+_NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
 _BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
-_FAR_OFF = 0.4  # of the logarithm of a strength
-_SILENT = 6.0  # standard deviations: a signature below it is none
-_LOUD = 300.0  # standard deviations: a signature beyond it says little of a smaller one
+# of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
+_FAR_OFF = 0.4
+_LEAST_SIZE = 6.0  # standard deviations: a signature below it is none
+_SATURATED = 300.0  # standard deviations: a signature beyond it says little of a smaller one
 _STEPS = 3  # how often a weaker or a stronger edge is tried
 _INSTANT = 0.03  # of a frame: shorter times are the same without stamps
-_SWINGS = (1.0, 4.0)  # times the strength at which a periodic candidate is tried: its power grows as the square
+# times the strength at which a periodic candidate is tried: its power grows as the square
+_PERIODIC_STRENGTHS = (1.0, 4.0)
 
 
 class Scan:
@@ -75,7 +77,8 @@ class Scan:
         self._out.add(candidate.name)
         self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why)
 
-    def _beside(self, sensor: Sensor) -> list[Candidate]:
+    def candidates(self, sensor: Sensor) -> list[Candidate]:
+        """The candidates of a sensor without those that are excluded."""
         return [candidate for candidate in self.replicates.candidates(sensor) if candidate.name not in self._out]
 
     @contextlib.contextmanager
@@ -121,7 +124,7 @@ class Scan:
 
     def begun(self, evaluation: Evaluation, candidate: Candidate) -> list[dict[Key, Any]]:
         """The values at which a candidate is tried first, SI; a periodic one at the frequencies of the lines."""
-        tries = self._told_apart(candidate, templates(candidate))
+        tries = self._distinguishable(candidate, templates(candidate))
         narrow = frequencies_of(candidate)
         if len(narrow) != 1:
             return tries
@@ -131,11 +134,12 @@ class Scan:
         ]
         default = float(Effect.registry.find(candidate.effect).parameters[coordinate.parameter].default)
         strengths = [
-            {**tries[0], **{d.key: d.scaled(tries[0][d.key], x) for d in candidate.strengths}} for x in _SWINGS
+            {**tries[0], **{d.key: d.scaled(tries[0][d.key], x) for d in candidate.strengths}}
+            for x in _PERIODIC_STRENGTHS
         ]
         return [{**tried, coordinate.key: f} for f in inside or [default] for tried in strengths]
 
-    def _told_apart(self, candidate: Candidate, tries: Sequence[Mapping[Key, Any]]) -> list[dict[Key, Any]]:
+    def _distinguishable(self, candidate: Candidate, tries: Sequence[Mapping[Key, Any]]) -> list[dict[Key, Any]]:
         """The templates, one of each set that differs only in times far below a frame: the same without stamps."""
         captures = [seen.capture for seen in self.replicates.seen.values()]
         frames = [c.conditions.frame_time if c.modality == "qis" else 0.0 for c in captures]
@@ -180,7 +184,7 @@ class Scan:
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
                 continue
-            fall, times, found = swing.suited(self.replicates, evaluation)
+            fall, times, found = swing.best_fit(self.replicates, evaluation)
             phases = {(id, key): p for id, p in found.items() for key in candidate.phases}
             fall -= 2 * len(phases)
             one = Trial(candidate, tried, swing.at(found), fall, times, phases=phases, seen=set(evaluation.made))
@@ -192,7 +196,7 @@ class Scan:
                     max(f - 1.96 * error, coordinate.low),
                     min(f + 1.96 * error, coordinate.high),
                 )
-                one.chance = line.p if line else None
+                one.p_value = line.p if line else None
             out.append(one)
         return out
 
@@ -231,7 +235,7 @@ class Scan:
                 captures in which they were not simulated are added.
         """
         tries: list[tuple[Candidate, dict[Key, Any]]] = []
-        for candidate in self._beside(evaluation.sensors.one):
+        for candidate in self.candidates(evaluation.sensors.one):
             if candidate.phases and not self.lines(evaluation):
                 continue  # without a line nothing is periodic; and a phase for each capture would explain any totals
             if candidate.strengths or candidate.fixed:
@@ -239,7 +243,7 @@ class Scan:
         if not everywhere and self.only_rates(evaluation):
             out = self._by_totals(evaluation, tries)
         else:
-            some = [] if everywhere else self.telling(evaluation)
+            some = [] if everywhere else self.most_informative(evaluation)
             old = self._completed(
                 evaluation, self._still(evaluation, tries, [t for t in known if t.seen]), some or evaluation.made
             )
@@ -286,21 +290,23 @@ class Scan:
     def _raised(self, evaluation: Evaluation, tried: list[Trial], some: Sequence[str]) -> list[Trial]:
         """The trials, with stronger ones for those without a signature."""
         faint = [
-            t for t in tried if not t.signature.nothing and size_of(self.replicates, evaluation, t.signature) < _SILENT
+            t
+            for t in tried
+            if not t.signature.nothing and size_of(self.replicates, evaluation, t.signature) < _LEAST_SIZE
         ]
-        silent = [(t.candidate, up) for t in faint if (up := stronger(t))]
-        found = self._looked_at(evaluation, silent, some) if silent else []
+        stronger_ones = [(t.candidate, up) for t in faint if (up := stronger(t))]
+        found = self._looked_at(evaluation, stronger_ones, some) if stronger_ones else []
         raised = {(one.candidate.name, shape_of(one)) for one in found}
         # a faint one that the data resemble stays
-        again = [t for t in faint if t.fall < COST_OF_A_NUMBER and (t.candidate.name, shape_of(t)) in raised]
+        again = [t for t in faint if t.fall < COST_OF_A_PARAMETER and (t.candidate.name, shape_of(t)) in raised]
         return [t for t in tried if not any(t is one for one in again)] + found
 
     def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
         """Weaker trials for those whose large signature says little of a smaller one."""
-        loud = self._onward(
-            evaluation, tried, some, weaker, lambda t: size_of(self.replicates, evaluation, t.signature) > _LOUD
+        weaker_trials = self._onward(
+            evaluation, tried, some, weaker, lambda t: size_of(self.replicates, evaluation, t.signature) > _SATURATED
         )
-        return [t for t in loud if size_of(self.replicates, evaluation, t.signature) > _SILENT]
+        return [t for t in weaker_trials if size_of(self.replicates, evaluation, t.signature) > _LEAST_SIZE]
 
     def _further(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
         """Stronger trials for edges whose squares fall further at a larger strength: a blur is not proportional."""
@@ -352,7 +358,7 @@ class Scan:
         for missing, some in groups.items():
             earlier = {id(one): one.signature for one in some}
             for one in self._simulated(evaluation, some, _SCAN, sorted(missing)):
-                one.signature = earlier[id(one)].beside(one.signature, missing)
+                one.signature = earlier[id(one)].completed(one.signature, missing)
                 one.seen = one.seen | missing
                 one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
                 out.append(one)
@@ -363,7 +369,7 @@ class Scan:
         failed = failing(block_checks(self.replicates, evaluation, evaluation.residuals))
         return bool(failed) and all(b.cell[0] == "" for b in failed) and not self.lines(evaluation)
 
-    def telling(self, evaluation: Evaluation) -> list[str]:
+    def most_informative(self, evaluation: Evaluation) -> list[str]:
         """Up to three captures that are most informative: a dark one, and those with the smallest p-values."""
         worst = dict.fromkeys(evaluation.made, 0.0)
         for block in block_checks(self.replicates, evaluation, evaluation.residuals):
@@ -388,7 +394,7 @@ class Scan:
         best: list[Trial] = []
         further: list[Trial] = []
         if faint:
-            tried = sorted((self._marked(evaluation, t) for t in tried), key=lambda t: -t.fall)
+            tried = sorted((self._with_score(evaluation, t) for t in tried), key=lambda t: -t.fall)
         for one in tried:
             if one.fall > 9 and all(b.candidate.name != one.candidate.name for b in best):
                 # of those with nearly the largest fall, the one simulated nearest to its best strength
@@ -438,18 +444,18 @@ class Scan:
                     residuals_at(self.replicates, evaluation, one.signature)
                 )
                 # the squares hardly show small differences of many pixels; those of edges they do
-                if one.chance is not None and not one.candidate.blinds:
-                    one.fall = max(one.fall, sigmas_of(one.chance) ** 2)
-            kept.append(self._marked(evaluation, one) if faint else one)
+                if one.p_value is not None and not one.candidate.blinds:
+                    one.fall = max(one.fall, sigmas_of(one.p_value) ** 2)
+            kept.append(self._with_score(evaluation, one) if faint else one)
         found: dict[int | str, Trial] = {}
         for one in sorted(kept, key=lambda t: -t.fall):
             found.setdefault(id(one) if one.maps else one.candidate.name, one)
         return list(found.values())
 
-    def _marked(self, evaluation: Evaluation, one: Trial) -> Trial:
+    def _with_score(self, evaluation: Evaluation, one: Trial) -> Trial:
         """The trial with the square of its score as the fall."""
-        if one.chance is not None:
-            return replace(one, fall=sigmas_of(one.chance) ** 2)
+        if one.p_value is not None:
+            return replace(one, fall=sigmas_of(one.p_value) ** 2)
         significance, found, times = best_direction(self.replicates, evaluation, one)
         suits = times * found.data / found.size if significance > 0 else one.times
         return replace(one, fall=significance**2, times=one.times if one.fall > 0 and one.times * suits > 0 else suits)

@@ -19,21 +19,21 @@ from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, stacked
+from .levels import LEAST_P
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, signatures, template_of
 from .spectral_lines import Line
 from .statistic_maps import p_of_width
 from .trial import Trial, shape_of
 
-LEAST_P = 1e-300  # a p-value is never 0
 # statistics of the pixels' counts: each by itself, and their distribution
 PIXELS, _LAWS = "pixel_map", ("spread", "tails", "outliers")
 _EDGES = "early_intervals"  # the statistic of the differences between the pixels' dead times
-_BY_CHANCE = 0.25  # of the data's projection on a signature: as much may be the noise of a few replicates
+_NOISE_SHARE = 0.25  # of the data's projection on a signature: as much may be the noise of a few replicates
 _LITTLE = 0.1  # factor on the strength at which the quadratic part is negligible
 _HELD = 0.9  # shrinkage: the weight of the correlation between directions of a candidate, from few replicates
 _SMALL, _FOLDS = 32, 4  # cells of a statistic whose covariance can be estimated, at most; folds of the replicates
-_LEAST_VARIANCE = 0.3  # of a cell
+_LEAST_VARIANCE = 0.3  # the least variance of a cell in the shrunk covariance; a residual has about 1
 # the scatter beyond which the cells of a signature are dependent; the least degrees of freedom then
 _TOGETHER, _FEWEST = 1.25, 3.0
 # safety factor on the variance of independent squares; the ratio to it from which on values are dependent
@@ -82,8 +82,8 @@ def p_of_any(
         for c in replicates.candidates(evaluation.sensors.one)
         if c.carrier
     ]
-    swings = [line.p for line in lines]
-    return min(1.0, 3 * min([p, *swings, *(q * len(maps) for q in maps)]))
+    line_ps = [line.p for line in lines]
+    return min(1.0, 3 * min([p, *line_ps, *(q * len(maps) for q in maps)]))
 
 
 def p_of_best(
@@ -96,9 +96,9 @@ def p_of_best(
         best: one of them.
         large: the misfit is large, so that the evidence may exceed what the linear signature gives.
     """
-    if best.chance is not None:
+    if best.p_value is not None:
         others = sum(c.carrier is not None for c in replicates.candidates(evaluation.sensors.one)) if best.maps else 1
-        return float(stats.norm.isf(max(best.chance, LEAST_P) / 2)), min(1.0, best.chance * max(others, 1))
+        return float(stats.norm.isf(max(best.p_value, LEAST_P) / 2)), min(1.0, best.p_value * max(others, 1))
     directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
     _, own = _p_values(replicates, evaluation, tried if directions else [best, *tried])
     significance, found, _ = best_direction(replicates, evaluation, best)
@@ -115,12 +115,12 @@ def p_of_best(
 
 
 def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: Trial) -> bool:
-    """Whether a fitted candidate moves the model along its own signature.
+    """Whether the shift of the model by a fitted candidate agrees with the score of the data on its signature.
 
-    The projection of the move must lie between 0 and twice the data's score. The signature is that of the trial's
-    strength; at the fitted one, noise may exceed it.
+    The projection of the shift on the signature must lie between 0 and twice the score of the data. The signature is
+    that of the trial's strength; at the fitted strength noise may exceed it.
     """
-    if one.chance is not None or one.there is None:
+    if one.p_value is not None or one.there is None:
         return True
     _, found, times = best_direction(replicates, evaluation, one)
     keys, least = list(evaluation.residuals), 0.0
@@ -133,7 +133,7 @@ def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: 
         (whole,) = signatures(replicates, evaluation, [one.sensors], 2 * FEW, kept="all")
         if not isinstance(whole, str):
             there = stacked(template_of(replicates, evaluation, whole), keys)
-            least = _BY_CHANCE
+            least = _NOISE_SHARE
     fit = found.size * float(template @ there) / max(float(template @ template), 1e-300)
     return abs(fit - found.data) < (1 - least) * abs(found.data)
 
@@ -244,8 +244,8 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
             z = sum_k v_k' P_k z_k / sd(sum_k v_k' P_k z*_k)
 
     z_k, v_k: residuals and template of statistic k; z*: residuals of the replicates, cross-fitted in folds; P_k: the
-    inverse of the shrunk covariance (Schaefer and Strimmer 2005) for 2 to 32 cells, otherwise the identity. All 0
-    where there is no signature.
+    inverse of the shrunk covariance (Schaefer and Strimmer 2005) for 2 to 32 cells, otherwise the identity. Without a
+    signature `size`, `data` and `own` are 0.
     """
     template = template_of(replicates, evaluation, signature)
     keys = [k for k, t in template.items() if t.any()]
@@ -372,19 +372,19 @@ def p_of_map(
             _scores_of_groups(row, sensitivity, groups)
             for row in ([evaluation.residuals[cell] for cell in cells], *rows)
         )
-        chance = p_of_spread(data, np.stack(null)) if data.size else 1.0
+        p = p_of_spread(data, np.stack(null)) if data.size else 1.0
     else:
         count = np.sqrt(np.bincount(groups))
         data = np.bincount(groups, z) / count
         null_data = np.stack([np.bincount(groups, row) / count for row in own])
-        chance = p_of_spread(data, null_data)
+        p = p_of_spread(data, null_data)
     if candidate.per != "pixel":
-        return chance
+        return p
     # with few detections in most pixels, the distribution of the counts is more sensitive than the score of each
     best = max(total_information, key=lambda id: total_information[id])
     laws = [(best, name) for name in _LAWS if (best, name) in evaluation.residuals]
-    others = [evaluation.nulls[cell].chance(evaluation.residuals[cell])[0] for cell in laws]
-    return min(1.0, 2 * min([chance, *(len(laws) * p for p in others)]))
+    others = [evaluation.nulls[cell].p_value(evaluation.residuals[cell])[0] for cell in laws]
+    return min(1.0, 2 * min([p, *(len(laws) * p for p in others)]))
 
 
 def _scores_of_groups(residuals: Sequence[np.ndarray], sensitivity: np.ndarray, groups: np.ndarray) -> np.ndarray:
@@ -424,7 +424,7 @@ def _p_of_blind_times(
     except SpadError:
         return 1.0
     assert width is not None
-    by_edges = float(stats.chi2.sf(width.gain, 1)) / 2 if width.low > 0 else 1.0
+    by_edges = float(stats.chi2.sf(width.likelihood_ratio, 1)) / 2 if width.low > 0 else 1.0
     z = np.concatenate([evaluation.residuals[cell] for cell in cells])
     by_pairs = min(1.0, z.size * float(stats.norm.sf(float(z.max()))))
     return max(by_edges, by_pairs)
@@ -448,9 +448,7 @@ def p_of_spread(data: np.ndarray, null: np.ndarray) -> float:
     p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
     return min(1.0, 2 * min(p_sum, p_cell))
 
-    # --- significance -----------------------------------------------------------------------------------------------
 
-
-def sigmas_of(chance: float) -> float:
+def sigmas_of(p: float) -> float:
     """The two-sided p-value in standard deviations."""
-    return float(stats.norm.isf(max(chance, LEAST_P) / 2))
+    return float(stats.norm.isf(max(p, LEAST_P) / 2))

@@ -19,7 +19,7 @@ from scipy import stats
 from .. import twin
 from .candidates import templates
 from .evaluation import Evaluation, square
-from .levels import COST_OF_A_NUMBER, FALSE_ALARM
+from .levels import COST_OF_A_PARAMETER, FALSE_ALARM
 from .light_levels import totals_space
 from .replicates import TOTALS, Replicates
 from .results import plain
@@ -27,10 +27,10 @@ from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures
 from .trial import Trial
 
-ALIKE = 6.0  # in chi square: explanations nearer than that are a tie
+TIE = 6.0  # in chi square: explanations nearer than that are a tie
 _VERIFIED = 3  # rivals that are simulated
 _MOST = 300.0  # of a logarithm: beyond any light
-_SILENT = 20.0  # detections missing at the end of a capture that stopped early
+_MISSING = 20.0  # detections missing at the end of a capture that stopped early
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,11 @@ class SetupExplanation:
     @property
     def cost(self) -> float:
         """The sum of squares of the residuals, plus the cost of the factors, in chi square."""
-        return float(self.left @ self.left) + COST_OF_A_NUMBER * len(self.factors)
+        return float(self.left @ self.left) + COST_OF_A_PARAMETER * len(self.factors)
 
     @property
     def explains(self) -> bool:
+        """Whether the totals pass with it: their p-value, and each residual within 4 sigma."""
         return self.p > FALSE_ALARM and bool(np.all(np.abs(self.left) < 4))
 
 
@@ -149,7 +150,7 @@ def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[Set
                     factor_of = {"value": value, "low": low, "high": high}
                     confused = len(likely) > 1 or len(names) > 1
                     out.append({"capture": id, "quantity": name, "factor": factor_of, "confused": confused})
-        if number == 0 and one.cost < likely[-1].cost - ALIKE:
+        if number == 0 and one.cost < likely[-1].cost - TIE:
             break
     return out
 
@@ -198,7 +199,7 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
                 sensors = evaluation.sensors.changed(tried)
                 one = Trial(candidate, tried, signature_of_totals(replicates, evaluation, sensors), 0.0, 1.0, sensors)
                 one.fall, one.times = scan.line_search(evaluation, one.signature, one.signed)
-                if one.fall < COST_OF_A_NUMBER:
+                if one.fall < COST_OF_A_PARAMETER:
                     continue
                 one = _fitted(scan, evaluation, one)
                 left = one.residuals[TOTALS] if one.residuals else evaluation.residuals[TOTALS]
@@ -207,7 +208,7 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
         if best is None:
             continue
         remains, fit = best
-        if remains + COST_OF_A_NUMBER < cost + ALIKE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
+        if remains + COST_OF_A_PARAMETER < cost + TIE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
             fit.fall = square(evaluation.residuals) - remains
             out.append(fit)
     out = sorted(out, key=lambda t: t.cost(evaluation))[:_VERIFIED]
@@ -226,7 +227,7 @@ def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature |
     residuals = residuals_at(scan.replicates, evaluation, signature)
     others = {c: z for c, z in residuals.items() if c != TOTALS}
     before = {c: z for c, z in evaluation.residuals.items() if c != TOTALS}
-    return square(others) - square(before) < COST_OF_A_NUMBER + ALIKE
+    return square(others) - square(before) < COST_OF_A_PARAMETER + TIE
 
 
 def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
@@ -279,6 +280,6 @@ def stopped_early(replicates: Replicates) -> dict[str, tuple[float, float]]:
         if seen.last is None or seen.total < 2:
             continue
         share = seen.last * (1 + 1 / seen.total) / seen.capture.conditions.exposure
-        if seen.total * (1 - share) / max(share, 1e-9) > _SILENT:
+        if seen.total * (1 - share) / max(share, 1e-9) > _MISSING:
             out[id] = share, share / seen.total
     return out

@@ -10,8 +10,8 @@ from scipy import stats
 
 from .null_distribution import Null
 
-# p-values: of the noise of a whole block, and of any of its cells by itself; a shift is beyond them
-_CHANCE, _CHANCE_CELL = 1e-4, 4e-8
+# p-values below which a shift is significant: by the mean square of a block, and by one cell (5.5 sigma, two-sided)
+_P_BLOCK, _P_CELL = 1e-4, 4e-8
 _LEAST_LINE = 100.0  # in variances: the least square of a shift in one cell of a spectrum
 
 
@@ -67,7 +67,7 @@ def beyond_noise(
     if mean > noise * by_own or mean > most * by_null:
         return shift
     out = (square > noise * one_by_own) | (square > most * one_by_null)
-    out &= null.law.resolved(shift, expected, few, null.recordings, _CHANCE)
+    out &= null.law.resolved(shift, expected, few, null.recordings, _P_BLOCK)
     return np.where(out, shift, 0.0)
 
 
@@ -81,10 +81,10 @@ def _beyond(cells: int, freedom: int) -> tuple[float, ...]:
     """
     free = max(freedom, 1)
     return (
-        1.2 * float(stats.f.isf(_CHANCE, cells, free)),
-        1.2 * float(stats.chi2.isf(_CHANCE, cells)) / cells,
-        float(stats.f.isf(_CHANCE_CELL, 1, free)),
-        float(stats.chi2.isf(_CHANCE_CELL, 1)),
+        1.2 * float(stats.f.isf(_P_BLOCK, cells, free)),
+        1.2 * float(stats.chi2.isf(_P_BLOCK, cells)) / cells,
+        float(stats.f.isf(_P_CELL, 1, free)),
+        float(stats.chi2.isf(_P_CELL, 1)),
     )
 
 
@@ -100,5 +100,5 @@ def _line_beyond(few: int, recordings: int, cells: int) -> float:
 
     The ratio of the mean of a few exponential powers to that of many follows an F distribution.
     """
-    far = float(stats.f.isf(_CHANCE / cells, 2 * few, 2 * recordings)) - 1
+    far = float(stats.f.isf(_P_BLOCK / cells, 2 * few, 2 * recordings)) - 1
     return max(far**2 / (1 / few + 1 / recordings), _LEAST_LINE)

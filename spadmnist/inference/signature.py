@@ -22,11 +22,11 @@ from .null_distribution import residuals_of
 from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, joined, why_not
 from .shifts import beyond_noise, mean_shift
 
-# times the scatter of the model's totals: the scatter of another model's totals up to which it is the same
-_ALIKE = 1.5
-_CHANCE = 2.3e-4  # one-sided p-value of the deviation of the totals from the closed form
+# factor on the scatter of the model's log totals: up to it, the scatter of another model is taken as the same
+_SAME_SCATTER = 1.5
+_P_TOTALS = 2.3e-4  # one-sided p-value (3.5 sigma) below which totals deviate from the closed form
 _SURE_SQUARE = 30.0  # in variances: the square of a shift that is never noise
-_BESIDE = 9  # neighbouring powers, the median of which holds no line
+_NEIGHBOURS = 9  # neighbouring powers, the median of which holds no line
 _SURELY = 8  # replicates of each capture where the totals of a few deviate from the closed form
 Kept = Literal["sure", "likely", "all"]  # which shifts are kept of what a few replicates show
 
@@ -57,13 +57,13 @@ class Signature:
         even = None if self.even is None else self.even.only(ids)
         return Signature(shifts, noise, self.logs, self.nothing, even)
 
-    def beside(self, other: Signature, ids: Collection[str]) -> Signature:
+    def completed(self, other: Signature, ids: Collection[str]) -> Signature:
         """The signature, completed by that of `other` in captures of which this one has the totals alone."""
         there = other.only(ids)
         logs = {**self.logs, **{id: log for id, log in other.logs.items() if id in ids}}
         even = self.even
         if even is not None or there.even is not None:
-            even = (even or Signature({}, {}, {})).beside(there.even or Signature({}, {}, {}), ids)
+            even = (even or Signature({}, {}, {})).completed(there.even or Signature({}, {}, {}), ids)
         shifts, noise = {**self.shifts, **there.shifts}, {**self.noise, **there.noise}
         return Signature(shifts, noise, logs, self.nothing and other.nothing, even)
 
@@ -106,7 +106,7 @@ class Signature:
         even = Signature(half(up.shifts, down.shifts, 1.0), {}, half(up.logs, down.logs, 1.0))
         odd = half(up.shifts, down.shifts, -1.0)
         for cell in odd.keys() & (powers or {}).keys():
-            typical = ndimage.median_filter(powers[cell], _BESIDE)  # type: ignore[index]  # a line's own has a sign
+            typical = ndimage.median_filter(powers[cell], _NEIGHBOURS)  # type: ignore[index]  # a line's own has a sign
             chance = 2 * typical * np.abs(even.shifts[cell]) / few  # variance of the noise that grows in proportion
             odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
         scatters = up.fluctuates or down.fluctuates
@@ -121,7 +121,7 @@ def signature_of_totals(replicates: Replicates, evaluation: Evaluation, sensors:
     """
     try:
         return Signature(
-            {}, {}, {id: needed_light(replicates, evaluation, sensors.usual(id), id) for id in evaluation.rates}
+            {}, {}, {id: needed_light(replicates, evaluation, sensors.mean_sensor(id), id) for id in evaluation.rates}
         )
     except SpadError:
         raise
@@ -157,7 +157,7 @@ def signatures(
         own = []
         try:
             for id in ids:
-                level = evaluation.rates[id].level * matched_light(replicates, evaluation, sensors.usual(id), id)
+                level = evaluation.rates[id].level * matched_light(replicates, evaluation, sensors.mean_sensor(id), id)
                 own.append((sensors, id, level * evaluation.factors[id][numbers.astype(int)], numbers))
         except UNABLE as error:
             unable[k], own = why_not(error), []
@@ -222,8 +222,8 @@ def _shift_of_totals(
     """The deviation of the log total of each replicate from the closed form, (replicates,)."""
     base, some = evaluation.made[id], made.numbers.astype(int)
     apart = np.log(np.maximum(made.totals, 0.5)) - np.log(np.maximum(base.totals[some], 0.5))
-    if abs(math.log(matched_light(replicates, evaluation, sensors.usual(id), id))) < 1e-12:
-        apart += needed_light(replicates, evaluation, sensors.usual(id), id)  # no other level gave as many
+    if abs(math.log(matched_light(replicates, evaluation, sensors.mean_sensor(id), id))) < 1e-12:
+        apart += needed_light(replicates, evaluation, sensors.mean_sensor(id), id)  # no other level gave as many
     return np.asarray(apart)
 
 
@@ -235,12 +235,12 @@ def _signature(
     logs = {}
     nothing, scattered = True, False
     for id in evaluation.rates.keys() - made.keys():  # a capture that is not simulated: the closed form gives its total
-        logs[id] = needed_light(replicates, evaluation, sensors.usual(id), id)
+        logs[id] = needed_light(replicates, evaluation, sensors.mean_sensor(id), id)
     for id, other in made.items():
         base, some = evaluation.made[id], other.numbers.astype(int)
         assert some[-1] == len(some) - 1  # the first replicates are compared with the first of the model's own
         null_total = evaluation.rates[id]
-        logs[id] = needed_light(replicates, evaluation, sensors.usual(id), id)
+        logs[id] = needed_light(replicates, evaluation, sensors.mean_sensor(id), id)
         apart = _shift_of_totals(replicates, evaluation, sensors, id, other)
         scattered = scattered or far_wider(float(np.std(apart)), null_total.scatter)
         if sensors.typical is None:
@@ -263,7 +263,7 @@ def _signature(
             if kept != "all":
                 # where the replicates share no noise, that of the null distribution is in the shift, too
                 chance = left + 3.0 * (1 - beta) / null.recordings
-                usual_here, _ = evaluation.usual(cell, float(base.totals.mean()))
+                usual_here, _ = evaluation.expected(cell, float(base.totals.mean()))
                 shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
             if shift.any():
                 shifts[cell], noise[cell] = shift, left
@@ -273,7 +273,7 @@ def _signature(
 def odd_and_even(replicates: Replicates, evaluation: Evaluation, up: Signature, down: Signature, few: int) -> Signature:
     """`Signature.both` of a strength and its opposite at this evaluation, from `few` replicates."""
     powers = {
-        cell: evaluation.usual(cell, replicates.seen[cell[0]].total)[0]
+        cell: evaluation.expected(cell, replicates.seen[cell[0]].total)[0]
         for cell, null in evaluation.nulls.items()
         if null.law.spectrum
     }
@@ -301,7 +301,7 @@ def residuals_at(
         if cell not in signature.shifts:
             out[cell] = evaluation.residuals[cell]
             continue
-        unshifted = evaluation.usual(cell, seen.total)
+        unshifted = evaluation.expected(cell, seen.total)
         out[cell] = residuals_of(
             null, values, unshifted, signature.shifts[cell], signature.noise.get(cell, 0.0) * noisy
         )
@@ -324,7 +324,7 @@ def size_of(replicates: Replicates, evaluation: Evaluation, signature: Signature
 def residuals_shifted(replicates: Replicates, evaluation: Evaluation, cell: Cell, shift: np.ndarray) -> np.ndarray:
     """The residuals of the data in one block if its expectation were shifted by `shift` (cells,)."""
     seen = replicates.seen[cell[0]]
-    unshifted = evaluation.usual(cell, seen.total)
+    unshifted = evaluation.expected(cell, seen.total)
     return residuals_of(evaluation.nulls[cell], seen.summaries[cell[1]].values, unshifted, shift, 0.0)
 
 
@@ -342,7 +342,7 @@ def template_of(replicates: Replicates, evaluation: Evaluation, signature: Signa
         if shift is None:
             out[cell] = np.zeros(len(evaluation.residuals[cell]))
             continue
-        expected, _ = evaluation.usual(cell, replicates.seen[cell[0]].total)
+        expected, _ = evaluation.expected(cell, replicates.seen[cell[0]].total)
         out[cell] = null.law.template(shift, expected, null.spread, null.factor)
     return out
 
@@ -360,10 +360,10 @@ def _mean_shift(apart: np.ndarray, scatter: float) -> float:
     """
     n, mean = len(apart), float(np.mean(apart))
     own = float(np.std(apart)) if n > 2 else 0.0
-    if own > _ALIKE * scatter and (n >= _SURELY or far_wider(own, scatter)):
-        likely = float(stats.t.isf(_CHANCE, n - 1)) * own / math.sqrt(n - 1)
+    if own > _SAME_SCATTER * scatter and (n >= _SURELY or far_wider(own, scatter)):
+        likely = float(stats.t.isf(_P_TOTALS, n - 1)) * own / math.sqrt(n - 1)
     else:  # a few that deviate alike by chance lie closer together than others would
-        likely = float(stats.norm.isf(_CHANCE)) * min(own or math.inf, _ALIKE * scatter) / math.sqrt(n)
+        likely = float(stats.norm.isf(_P_TOTALS)) * min(own or math.inf, _SAME_SCATTER * scatter) / math.sqrt(n)
     return mean if abs(mean) > likely else 0.0
 
 

@@ -17,16 +17,18 @@ _CLEAR = 1e-3  # p-value of a line, with the trials factor of all frequencies
 _MOST = 2  # the largest number of lines
 _APART = 2.5  # bins of the shortest capture: the least distance of two lines
 # bins to each side that are averaged; standard deviations beyond which the model has a line of its own
-_BESIDE, _OWN = 12, 3.0
+_NEIGHBOURS, _OWN = 12, 3.0
 # bins to each side that a line leaks into; standard deviations beyond which the bins around are raised
 _NEXT, _RAISED = 2, 3.0
-_AROUND = [d for d in range(-_BESIDE, _BESIDE + 1) if abs(d) > _NEXT]  # bins of the average, relative to the bin
+_AROUND = [
+    d for d in range(-_NEIGHBOURS, _NEIGHBOURS + 1) if abs(d) > _NEXT
+]  # bins of the average, relative to the bin
 _OTHERS = 2  # the largest neighbouring bins, which may be another line, are left out
 _WITHIN, _PLACES = 1.2, 481  # bins to both sides within which the frequency is fitted; grid points
 _STRENGTHS = np.linspace(0.7, 1.1, 17)  # factors on the amplitude in the data, a part of which is noise
 # the least number of periods in the longest capture; with fewer it is a drift, whose powers are those of a line near
 # 0
-_SWINGS = 1.5
+_LEAST_PERIODS = 1.5
 _SIGN = 2.0  # standard deviations of a bin that informs the frequency
 
 
@@ -45,6 +47,7 @@ class Line:
 
     @property
     def p(self) -> float:
+        """The p-value, with the trials factor of all frequencies; at least 1e-300."""
         return math.exp(max(self.log_p, -690.0))
 
 
@@ -112,9 +115,9 @@ def _surprise(null: Null, power: np.ndarray, z: np.ndarray, total: float) -> np.
     there. Where the data are raised all around, a line must exceed that level: a lamp that fluctuates has no line.
     """
     expected, _ = null.expected(total)
-    smooth = ndimage.uniform_filter1d(expected, 2 * _BESIDE + 1, mode="nearest")
+    smooth = ndimage.uniform_filter1d(expected, 2 * _NEIGHBOURS + 1, mode="nearest")
     own = expected > smooth * (1 + _OWN / math.sqrt(null.recordings))
-    many = null.recordings * 2 * _BESIDE
+    many = null.recordings * 2 * _NEIGHBOURS
     ratio = power / np.maximum(smooth, 1e-30)
     level, sure = _around(ratio)
     raised = level > 1 + _RAISED / np.sqrt(sure)
@@ -128,8 +131,10 @@ def _around(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Of n exponential values the i-th smallest has the mean 1/n + 1/(n - 1) + ... of i terms.
     """
-    padded = np.pad(ratio, _BESIDE, constant_values=np.nan)
-    around = np.sort([padded[_BESIDE + d : _BESIDE + d + ratio.size] for d in _AROUND], axis=0)  # nan are sorted last
+    padded = np.pad(ratio, _NEIGHBOURS, constant_values=np.nan)
+    around = np.sort(
+        [padded[_NEIGHBOURS + d : _NEIGHBOURS + d + ratio.size] for d in _AROUND], axis=0
+    )  # nan are sorted last
     number = np.sum(np.isfinite(around), axis=0)
     kept = np.maximum(number - _OTHERS, 1)
     ratios = np.ones(len(_AROUND) + 1)
@@ -160,7 +165,7 @@ def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
         if log_p[k] > math.log(_CLEAR):
             break
         line = _line(group, float(grid[k]), float(log_p[k]))
-        if line.frequency >= _SWINGS * step:
+        if line.frequency >= _LEAST_PERIODS * step:
             out.append(line)
     return out
 

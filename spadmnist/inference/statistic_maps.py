@@ -1,4 +1,4 @@
-"""Maps of a parameter that a statistic tells and the counts do not: its likelihood in each pixel.
+"""Maps of a parameter that a statistic informs and the counts do not: its likelihood in each pixel.
 
 A parameter declares the statistic (`informed_by`), the statistic the likelihood (`unit_likelihood`). All pixels inform
 the law of the values together, as for dead times (`blind_times.width_of`); each then has its posterior under that law.
@@ -24,7 +24,7 @@ from .replicates import Replicates
 # logarithms of the value relative to the array: the grid on which all pixels are looked for, and how many points cover
 # those that are found; a factor of 20 to both sides, 40 points to the width of a typical posterior
 _GRID, _FINE = np.linspace(-3.0, 3.0, 61), 121
-_INFORMED = 0.8  # of the width of the grid: an error below it says something of a pixel
+_INFORMED = 0.8  # of the standard deviation of a flat prior on the grid: a pixel with a smaller error is informed
 _BEYOND = 4.0  # standard errors beyond the outermost pixels that the fine grid covers
 
 
@@ -65,7 +65,7 @@ def p_of_width(map_: PixelMap) -> float:
     """The p-value of a map under the null that all pixels are alike, by the likelihood of their width."""
     assert map_.width is not None
     # a width is no less than nothing: half of the law
-    return float(stats.chi2.sf(map_.width.gain, 1)) / 2 if map_.width.low > 0 else 1.0
+    return float(stats.chi2.sf(map_.width.likelihood_ratio, 1)) / 2 if map_.width.low > 0 else 1.0
 
 
 def information(
@@ -101,11 +101,11 @@ def _likelihoods(
         )
     statistic = Statistic.registry.find(candidate.informed_by)()
     if type(statistic).unit_likelihood is Statistic.unit_likelihood:
-        raise SpadError(f"the statistic {statistic.name} defines no unit_likelihood, so that it tells no map")
+        raise SpadError(f"the statistic {statistic.name} defines no unit_likelihood, so that it informs no map")
     ids = [id for id, seen in replicates.seen.items() if statistic.name in seen.summaries and (not use or id in use)]
     recordings = {id: replicates.recording(id) for id in ids}
     if not recordings:
-        raise SpadError(f"no capture has the statistic {statistic.name}, which tells {carrier[1]} by pixel")
+        raise SpadError(f"no capture has the statistic {statistic.name}, which informs {carrier[1]} by pixel")
     pixels = replicates.start.layout.pixels
 
     def at(grid: np.ndarray) -> dict[str, np.ndarray]:
@@ -125,7 +125,7 @@ def _likelihoods(
     middle, error = mean_of(_relative(sum(at(wide).values())), wide)
     informed = error < _INFORMED * float(np.std(wide))
     if informed.sum() < 2:
-        raise SpadError(f"the statistic {statistic.name} tells {carrier[1]} of fewer than two pixels")
+        raise SpadError(f"the statistic {statistic.name} informs {carrier[1]} of fewer than two pixels")
     ends = (middle - _BEYOND * error)[informed].min(), (middle + _BEYOND * error)[informed].max()
     grid = np.linspace(max(ends[0], wide[0]), min(ends[1], wide[-1]), _FINE)
     return grid, at(grid)

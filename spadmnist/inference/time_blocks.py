@@ -27,17 +27,15 @@ _LEAST = 16  # replicates of a half
 
 
 def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:
-    """The 95 % quantile of the misfit under the null.
+    """The 95 % quantile of the misfit under the null; the misfits of all rows and of their steps are set.
 
-    The misfits of all rows and their steps are set, in the same cells.
-
-    A capture that alone informs a coordinate of some row is split into two halves; all others are as they were
-    measured.
+    All rows are judged in the same cells. A capture that alone informs a coordinate of some row is split into two
+    halves; every other capture stays whole.
     """
     ids = set().union(*(_captures_needed(replicates, rung) for rung in rungs))
     half = replicates.halves(ids) if ids else None
     if half is None or not half.seen:
-        _tell(rungs)
+        _set_misfits(rungs)
         return misfit_null_95(rungs[0].evaluation.replicate_residuals)
     replicates.say(
         "the misfit in blocks of time of " + ", ".join(id for id in replicates.seen if halves_of(id)[0] in half.seen)
@@ -55,19 +53,21 @@ def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:
         if rung.placebo is not None:
             (signature,) = signatures(half, there, [there.sensors.changed(rung.placebo)])
             residuals = there.residuals if isinstance(signature, str) else residuals_at(half, there, signature)
-        own = _beside(rung.evaluation.replicate_residuals, there.replicate_residuals, apart)
-        left = _beside(rung.left, residuals, apart)
+        own = _with_halves(rung.evaluation.replicate_residuals, there.replicate_residuals, apart)
+        left = _with_halves(rung.left, residuals, apart)
         if rung.fit is not None:
-            jacobian = _beside(rung.fit.jacobian, _slopes(replicates, half, rung.fit.jacobian, apart), apart)
-            left = held_out.leave_one_capture_out(_beside(rung.evaluation.residuals, residuals, apart), jacobian)
+            jacobian = _with_halves(
+                rung.fit.jacobian, _jacobian_of_halves(replicates, half, rung.fit.jacobian, apart), apart
+            )
+            left = held_out.leave_one_capture_out(_with_halves(rung.evaluation.residuals, residuals, apart), jacobian)
         rung.left, rung.misfit = left, mean_misfit(own, left)
         first = first or own
     replicates.simulations += half.simulations - begun
-    _tell(rungs)
+    _set_misfits(rungs)
     return misfit_null_95(first)
 
 
-def _tell(rungs: Sequence[Rung]) -> None:
+def _set_misfits(rungs: Sequence[Rung]) -> None:
     for rung in rungs:
         for step in rung.steps:
             step.misfit = rung.misfit
@@ -100,7 +100,7 @@ def _evaluation(replicates: Replicates, half: Replicates, rung: Rung, apart: Col
     return evaluate(half, rung.evaluation.values, sensors, max(half.number // _FEWER, _LEAST))
 
 
-def _beside(
+def _with_halves(
     whole: Mapping[Cell, np.ndarray], halves: Mapping[Cell, np.ndarray], apart: Collection[str]
 ) -> dict[Cell, np.ndarray]:
     """The cells of whole captures, with those of halves in place of some; the totals are those of all captures."""
@@ -110,7 +110,7 @@ def _beside(
     }
 
 
-def _slopes(
+def _jacobian_of_halves(
     replicates: Replicates, half: Replicates, jacobian: Mapping[Cell, np.ndarray], apart: Collection[str]
 ) -> dict[Cell, np.ndarray]:
     """The Jacobian of the halves, (cells, coordinates) by block.

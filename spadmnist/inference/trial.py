@@ -15,7 +15,7 @@ from .candidates import Candidate
 from .coordinates import Coordinate, Key, is_edge
 from .evaluation import Evaluation
 from .gauss_newton import Fit
-from .levels import COST_OF_A_NUMBER
+from .levels import COST_OF_A_PARAMETER
 from .models import Model
 from .replicates import TOTALS, Cell
 from .signature import Signature
@@ -24,7 +24,7 @@ Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
 _RAISED = 12.0  # the factor on a strength without a signature for another trial
 # in chi square, constant and per root of the evidence: two candidates nearer than that are a tie, because a few
 # replicates blur the difference
-_ALIKE, _BLURRED = 8.0, 0.3
+_TIE, _BLURRED = 8.0, 0.3
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Trial:
     sensors: Model | None = None
     evidence: float = -math.inf
     power: float = 1.0  # the signature grows with this power of the strength
-    chance: float | None = None  # p-value, where a test of its own gives it
+    p_value: float | None = None  # p-value, where a test of its own gives it
     fit: Fit | None = None
     maps: dict[Key, pixel_maps.PixelMap] | None = None
     residuals: dict[Cell, np.ndarray] | None = None
@@ -62,10 +62,11 @@ class Trial:
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
     seen: set[str] = field(default_factory=set)  # captures in which it was simulated
     there: Signature | None = None  # the signature at the fitted values
-    others: tuple[Trial, ...] = ()  # of other shapes, where the squares do not tell which shape is best
+    others: tuple[Trial, ...] = ()  # of other shapes, where the squares do not determine the best shape
 
     @property
     def candidates(self) -> list[Candidate]:
+        """The candidate, and the maps that are fitted with it."""
         return [self.candidate, *self.more]
 
     @property
@@ -76,7 +77,7 @@ class Trial:
     def cost(self, evaluation: Evaluation) -> float:
         """The squares that it leaves in the totals, plus the cost of a free parameter."""
         left = (self.residuals or evaluation.residuals)[TOTALS]
-        return float(left @ left) + COST_OF_A_NUMBER
+        return float(left @ left) + COST_OF_A_PARAMETER
 
     @property
     def signed(self) -> bool:
@@ -176,4 +177,4 @@ def is_pattern(one: Trial) -> bool:
 
 def tie(evidence: float) -> float:
     """The difference of evidence, in chi square, within which two candidates are a tie."""
-    return _ALIKE + _BLURRED * math.sqrt(max(evidence, 0.0))
+    return _TIE + _BLURRED * math.sqrt(max(evidence, 0.0))

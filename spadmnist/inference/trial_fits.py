@@ -13,7 +13,7 @@ from ..errors import SpadError
 from .coordinates import Coordinate, Key, is_edge, point_of, room_of
 from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Fit, covariance_of, gauss_newton
-from .phases import NEAR, choose_side, simulate_phases
+from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
 from .replicates import FEW, TOTALS, Replicates
 from .signature import captures_showing, residuals_at, signatures, size_of, template_of
@@ -25,11 +25,12 @@ IGNORED = 0.01, 4.0
 STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
-_FAR, _MOVES = (0.6, 0.3, 0.15), 6  # the first distances of an edge, and how often they are repeated
+# of a logarithm: the first distances of an edge; how often they are repeated
+_FAR, _MOVES = (0.6, 0.3, 0.15), 6
 _POWERS = (0.85, 2.3)  # powers with which a signature may grow if it is simulated at another strength
 _LINE = 0.25  # of the square of a signature, in one cell of a spectrum: then it is a line
-_LEAST_BOOST = 1.5  # the least factor for which a stronger simulation is worth it
-_SWINGING = 6  # replicates for phases: a periodic model draws other random numbers
+_LEAST_BOOST = 1.5  # the least factor on the strength for which a stronger simulation is worth it
+_PHASE_REPLICATES = 6  # replicates for phases: a periodic model draws other random numbers
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first step to its neighbours, and the shortest
 # in chi square: the least fall for another whole number; the rise beyond which one is excluded
 _BETTER, EXCLUDED = 2.0, 6.0
@@ -189,13 +190,13 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     room = min(room_of(d, float(given[d.key])) for d in coordinates)
     stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
     strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in coordinates}}
-    swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _SWINGING)
+    swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _PHASE_REPLICATES)
     if isinstance(swing, str):
         raise SpadError(swing)
-    _, times, found = swing.suited(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
+    _, times, found = swing.best_fit(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in coordinates}}
-    mirrored = {id: swing.mirrored(id, p, times) for id, p in found.items()}
-    found = choose_side(replicates, evaluation, one.candidate.phases, one.values, found, mirrored)
+    mirrored = {id: swing.mirror_phase(id, p, times) for id, p in found.items()}
+    found = choose_phase(replicates, evaluation, one.candidate.phases, one.values, found, mirrored)
     signature = swing.at(found)
     one.phases = {(id, key): p for id, p in found.items() for key in one.candidate.phases}
     one.signature = signature.at(times)
@@ -240,7 +241,7 @@ def _fit_whole_number(
     step = _NEXT[0]
     while True:
         here = float(found.values[coordinate.key])
-        near = {_beside(coordinate, here, x) for x in (-step, step)} - {here}
+        near = {_neighbour(coordinate, here, x) for x in (-step, step)} - {here}
         # a fit from afar may not have converged
         last = step <= 2 * _NEXT[1]
         for x in sorted(x for x in near if x not in squares or (last and begun.get(x) != here)):
@@ -258,7 +259,7 @@ def _fit_whole_number(
         step = _NEXT[0]
         while all(side * (x - here) <= 0 or squares[x] <= excluded for x in squares):
             far = max(best, key=lambda x, side=side: side * x)  # type: ignore[misc]
-            if (further := _beside(coordinate, far, side * step)) in squares:
+            if (further := _neighbour(coordinate, far, side * step)) in squares:
                 break
             there(further, best[far])
             step *= 2
@@ -287,7 +288,7 @@ def _variance_inflation(fit: Fit) -> float:
     return max(float(np.mean(wider)) if wider.size else 1.0, 1.0)
 
 
-def _beside(coordinate: Coordinate, value: float, step: float) -> float:
+def _neighbour(coordinate: Coordinate, value: float, step: float) -> float:
     """The whole number at this distance in the logarithm, at least the next one; within its range."""
     other = coordinate.value(coordinate.coordinate(value) + step)
     other = min(other, value - 1) if step < 0 else max(other, value + 1)

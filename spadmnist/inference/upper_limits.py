@@ -16,7 +16,7 @@ from .trial import Trial, shape_of
 
 _ONE_SIDED = 1.645  # standard deviations of a one-sided limit of 95 %
 _CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a signature: one that noise does not hide, and one that it does
-_UNSEEN = 0.1  # of the square of a signature: the share in captures that are not simulated for its growth
+_LEFT_OUT = 0.1  # of the square of a signature: the share in captures that are not simulated for its growth
 _SATURATED = 1000.0  # standard deviations of a signature that hardly grows any more
 _LOOKS = 5  # simulations at other strengths, at most
 # (factor on the strength at the limit if the signature were linear, size of the signature, trial)
@@ -41,10 +41,10 @@ def upper_limits(
         if candidate.kind != "add" or len(candidate.strengths) != 1 or candidate.phases:
             continue
         test = score_test(replicates, evaluation, one.signature)
-        times = _seen_at(test)
+        times = _linear_limit(test)
         for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
             # iterated with the root of the factor, because a quadratic signature would oscillate
-            times *= math.sqrt(_seen_at(score_test(replicates, evaluation, one.signature.at(times))))
+            times *= math.sqrt(_linear_limit(score_test(replicates, evaluation, one.signature.at(times))))
         known = shapes.setdefault(candidate.effect, {})
         # of several strengths, the one with the largest signature
         if shape_of(one) not in known or known[shape_of(one)][1] < test.size:
@@ -72,7 +72,7 @@ def upper_limits(
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 
-def _seen_at(test: ScoreTest) -> float:
+def _linear_limit(test: ScoreTest) -> float:
     """The factor on the strength at its upper limit, if the signature were linear."""
     return (max(test.data, 0.0) + _ONE_SIDED) / test.size if test.size > 0 else math.inf
 
@@ -93,7 +93,7 @@ def _at_limit(
     for name, (times, size, one) in weakest.items():
         out[name] = times
         if size > 2 * _CLEARLY:
-            where[name] = captures_showing(template_of(replicates, evaluation, one.signature), _UNSEEN)
+            where[name] = captures_showing(template_of(replicates, evaluation, one.signature), _LEFT_OUT)
             seen = score_test(replicates, evaluation, one.signature.only(where[name])).size
             here = one.signature if one.signature.even is None else one.signature.at(times)
             needed[name] = score_test(replicates, evaluation, here.only(where[name])).size * (

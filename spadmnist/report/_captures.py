@@ -137,7 +137,7 @@ def flux_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 _FLUX_LEGEND = """\
 mean to max: over the pixels. saturated: pixels in which a rule stands in for the formula of the
-method (spadmnist methods NAME tells it). q: nominal PDP. T: exposure, or frames x frame time."""
+method (spadmnist methods NAME states it). q: nominal PDP. T: exposure, or frames x frame time."""
 
 
 def _recorded(numbers: Mapping[str, Any]) -> str:
@@ -204,7 +204,7 @@ def _scaled(value: float) -> tuple[float, str]:
 
 
 def _rate_histogram(axes: Any, one: Look) -> None:
-    """Of detections a pixel, in bins of whole numbers, beside the law if all pixels were alike."""
+    """Draw the histogram of the pixels' detections, in bins of whole numbers, with the law of equal pixels."""
     from scipy.special import gammaln, xlog1py, xlogy
 
     assert one.totals is not None

@@ -140,7 +140,7 @@ def _saturated(manifest: Mapping[str, Any]) -> str:
         return ""
     return text.wrapped(
         "saturated: pixels for which the formula of a method has no finite answer, so that a rule of the "
-        f"method stands in ({', '.join(named)}; spadmnist methods NAME tells the rule)."
+        f"method stands in ({', '.join(named)}; spadmnist methods NAME states the rule)."
     )
 
 

@@ -26,7 +26,7 @@ _CLIP = 20.0  # normalised fluxes end here, as in the paper's figure of reconstr
 _SMALL, _LARGE = 168, 256  # points of the picture: images are magnified up to one, and reduced to the other
 _LARGE_IMAGE = 128  # pixels; a larger image stands alone in its cell
 _PIXELS_AT_HAND = 1 << 18  # for a median, where the whole training split would have to be simulated
-_LETTER = 6.4  # points that one of the small print takes, at the most usual
+_LETTER = 6.4  # points: typical width of a letter of the small print
 _TOP, _GAP, _CAPTION, _LINE = 92, 16, 34, 18  # above the cells, between them, below each; small print
 _PAGE = tuple(bytes.fromhex(pictures.PAGE[1:]))
 

@@ -325,7 +325,9 @@ class Gaps(Statistic):
             score = -special.ndtri_exp(longer)
 
         def length(value: float) -> float:
-            """The gap (s) that has a score."""
+            """The gap (s) that has a score; without an event, the exposure."""
+            if not events:
+                return exposure
             log_of = np.log(np.maximum(-special.log_ndtr(value), 1e-300))
             return float(-np.expm1((log_of - np.log(events + 1.0)) / max(1, events)) * exposure)
 

@@ -336,7 +336,7 @@ def test_what_flips_too_often_is_a_sentence() -> None:
     assert SourceNoise(coherence_time=T / 1e6).terms(LIT) == 4
     assert SourceNoise(coherence_time=T / 4e6).terms(LIT) == 1
     assert SourceNoise(coherence_time=T / 4.9e7).terms(LIT) == 1
-    with pytest.raises(EffectError, match=r"source_noise failed: .* coherence_time must be at least 20 ps"):
+    with pytest.raises(EffectError, match=r"the effect source_noise: in an .* coherence_time must be at least 20 ps"):
         exposed(grid(1, 1), [SourceNoise(coherence_time=T / 6e7)], 1e5, 1)
 
 
@@ -424,7 +424,7 @@ def _uniforms(words: np.ndarray) -> np.ndarray:
 
 def counts_are_bunched(noise: SourceNoise, contrast: float, coherence_time: float) -> None:
     """Variance of counts against the window, covariance of two pixels, and means at both ends."""
-    images, photons = 6000, 2e4
+    images, photons = 6000, 1e5
     events = exposed(grid(1, 2), [noise], photons, images)
     image, pixel = image_of(events), events.pixel
     alpha = laws.FALSE_ALARM / 12
@@ -444,7 +444,10 @@ def counts_are_bunched(noise: SourceNoise, contrast: float, coherence_time: floa
     laws.mean_is(total[0::2] * total[1::2], 0.0, alpha, "covariance of two images")
 
 
-@pytest.mark.parametrize(("contrast", "coherence_time"), [(0.25, 1e-4), (1.0, 5e-4), (0.5, 1e-5)])
+BUNCHED = [(0.25, 1e-4), (1.0, 5e-4), (0.5, 1e-5)]
+
+
+@pytest.mark.parametrize(("contrast", "coherence_time"), BUNCHED)
 def test_light_of_a_noisy_source_comes_bunched(contrast: float, coherence_time: float) -> None:
     counts_are_bunched(SourceNoise(contrast=contrast, coherence_time=coherence_time), contrast, coherence_time)
 
@@ -454,6 +457,9 @@ def test_bunching_that_is_wrong_is_seen() -> None:
         counts_are_bunched(SourceNoise(contrast=1.0, coherence_time=4e-4), 1.0, 5e-4)
     with fails():
         counts_are_bunched(SourceNoise(contrast=0.9, coherence_time=5e-4), 1.0, 5e-4)
+    for contrast, coherence_time in BUNCHED:  # none at all
+        with fails():
+            counts_are_bunched(SourceNoise(contrast=0.0), contrast, coherence_time)
     with fails(), pytest.MonkeyPatch.context() as patch:  # all images alike
         right = source_noise.levels
         patch.setattr(source_noise, "levels", lambda *a: right(*a[:3], np.zeros_like(a[3]), *a[4:]))

@@ -23,7 +23,7 @@ from spadmnist.effects.print_contrast import PrintContrast
 from spadmnist.effects.print_tilt import PrintTilt
 from spadmnist.events import Layout
 from spadmnist.inference.candidates import candidates
-from spadmnist.inference.models import swinging
+from spadmnist.inference.models import phase_parameters
 from spadmnist.inference.named_fit import fit_named
 from spadmnist.recording import Capture, Light
 from spadmnist.scene import Scene
@@ -162,7 +162,7 @@ def test_prints_are_candidates_where_a_capture_is_of_a_scene_and_only_there() ->
 def test_the_angle_of_a_print_is_no_phase() -> None:
     """A phase is another one in every capture; a chart hangs as it hangs."""
     sensor = Sensor(Layout(4, 6, 25e-12, 1.0), [PrintTilt(angle=0.1), Flicker(amplitude=0.1)]).resolved()
-    assert swinging(sensor) == [("flicker", "phase")]
+    assert phase_parameters(sensor) == [("flicker", "phase")]
     (tilt,) = (c for c in candidates(Sensor(sensor.layout, []).resolved(), captures(Scene("c.npy", np.eye(4, 6))))
                if c.effect == "print_tilt")  # fmt: skip
     assert not tilt.phases and [coordinate.parameter for coordinate in tilt.strengths] == ["angle"]

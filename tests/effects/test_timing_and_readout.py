@@ -337,9 +337,10 @@ def test_the_right_code_late_in_a_long_exposure(rounding: str, exposure: float, 
     ticks = tdc.apply(effect.apply(events, None), None).ticks
     assert ticks is not None and not np.any(ticks % codes == 1)
     exact = [literal_code(t, tick, tdc.converter()[1], widths) for t in times.tolist()]
-    # where a double's step is a large part of a tick, an event within such a step of an edge may go either way
-    step = np.spacing(exposure / tick)
-    assert np.count_nonzero(ticks != np.array(exact, np.uint64)) <= len(times) * min(1.0, 20 * step)
+    # where a double's step is a large part of a tick, an event within such a step of an edge may go either way: to the
+    # next code, and one of them is missing
+    step, apart = np.spacing(exposure / tick), np.abs(ticks.astype(np.int64) - np.array(exact, np.int64))
+    assert apart.max() <= 2 and np.count_nonzero(apart) <= len(times) * min(0.15, 20 * step)
 
 
 @pytest.mark.parametrize("codes", [5, 7, 140])
@@ -440,6 +441,9 @@ def test_codes_drawn_for_a_chip() -> None:
     recorded = expose(made, range(3), 1e7)
     apiece = Recorded.join([expose(made, [i], 1e7) for i in range(3)])
     assert recorded.tr and apiece.tr and recorded.tr.times.tobytes() == apiece.tr.times.tobytes()
+    assert len(np.unique(effect.widths)) == 16  # type: ignore[attr-defined]
+    share = effect.widths / effect.widths.sum()  # type: ignore[attr-defined]
+    laws.histogram_is(recorded.tr.ticks % 16, lambda k: np.where(k < 16, share[np.minimum(k, 15)], 0.0))
     assert [e.name for e in sensor(1, Tdc(), TdcNonlinearity(), Jitter()).effects] == [
         "jitter",
         "tdc_nonlinearity",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import laws
 import numpy as np
 from scipy import special
@@ -35,6 +37,10 @@ def normal(values: np.ndarray, mean: float = 0.0, spread: float | None = 1.0) ->
     else:
         for cell in range(values.shape[1]):
             laws.mean_is(values[:, cell], mean, error=1e-9, what=f"cell {cell}")
-        laws.variance_is(np.resize(values, max(values.size, 1000)), spread**2)
+        if values.size >= 1000:
+            laws.variance_is(values, spread**2)
+        else:
+            bound = laws.z_bound() / math.sqrt(2 * values.size)
+            assert abs(math.log(values.std(ddof=1) / spread)) < bound, f"{n} recordings: spread"
     assert np.abs(values).max() < laws.z_bound(laws.FALSE_ALARM / values.size)
     laws.distribution_is(values[:, :: max(1, values.shape[1] // 4)].ravel(), special.ndtr, what=f"{n} recordings")

@@ -185,7 +185,11 @@ UNLIKE = partial(tr, layout=grid(8, 8), rates=1.5e6 * np.geomspace(0.7, 1.4, 64)
 def test_laws_of_steady_light(steady: partial[Recording]) -> None:
     for statistic, least in ((EdgeIntervals, 0.8), (Intervals, 0.6), (Rescaled, 0.9)):
         null_laws.poisson(many(statistic, steady, 120), least)
-    null_laws.normal(many(RescaledLag, steady, 120), spread=None)
+    lag = many(RescaledLag, steady, 120)
+    null_laws.normal(lag, spread=None)
+    bound = laws.z_bound(laws.FALSE_ALARM / (2 * lag.shape[1]))
+    assert np.abs(np.log(lag.std(axis=0, ddof=1))).max() < bound / math.sqrt(2 * 119)
+    assert np.abs(lag.mean(axis=0)).max() < 0.2 + bound / math.sqrt(120)  # the rate is fitted
     # the rate is fitted, so that u is not quite even where a pixel has few intervals; here it is, to 1 %
     share = many(Rescaled, steady, 60).sum(axis=0)
     assert np.abs(share / share.mean() - 1).max() < 5 / math.sqrt(share.mean()) + 0.02

@@ -12,8 +12,6 @@ from scipy import stats
 
 from spadmnist.statistics import _scores as scores
 
-RNG = np.random.default_rng(20)
-
 
 def all_pairs(boxes: int, detections: int) -> np.ndarray:
     """Pairs in the same box for every way to throw so many detections."""
@@ -61,7 +59,8 @@ def test_the_table_of_few_is_the_law_of_all_cases(boxes: int, detections: int) -
 
 
 def test_free_slots_have_the_same_pairs_but_for_a_constant() -> None:
-    taken = RNG.random((7, 30)) < 0.8  # 7 boxes of 30 slots
+    rng = np.random.default_rng(20)
+    taken = rng.random((7, 30)) < 0.8  # 7 boxes of 30 slots
     counts, free = taken.sum(axis=1), (~taken).sum(axis=1)
     pairs, number = scores.minority((counts * (counts - 1) // 2).sum(), np.array(taken.sum()), 7, 30.0)
     assert number == free.sum()
@@ -82,20 +81,21 @@ def test_free_slots_have_the_same_pairs_but_for_a_constant() -> None:
 )
 def test_scores_of_pairs_are_normal_far_out(detections: int, boxes: int, slots: float) -> None:
     """Far out: 4 standard deviations on either side have 1 in 31,574."""
+    rng = np.random.default_rng(20)
     draws = 100_000
     if np.isfinite(slots):
-        counts = RNG.multivariate_hypergeometric([int(slots)] * boxes, detections, size=draws)
+        counts = rng.multivariate_hypergeometric([int(slots)] * boxes, detections, size=draws)
     else:
-        counts = RNG.multinomial(detections, np.full(boxes, 1 / boxes), size=draws)
+        counts = rng.multinomial(detections, np.full(boxes, 1 / boxes), size=draws)
     pairs = (counts * (counts - 1) // 2).sum(axis=1)
-    found, _ = scores.pair_scores(pairs, np.full(draws, detections), boxes, slots, RNG.random(draws))
+    found, _ = scores.pair_scores(pairs, np.full(draws, detections), boxes, slots, rng.random(draws))
     assert abs(found.mean()) < 0.03
     assert 0.97 < found.std() < 1.05
     usual = 2 * stats.norm.sf(4) * draws
     assert stats.poisson.sf((np.abs(found) > 4).sum() - 1, 3 * usual) > laws.FALSE_ALARM
     # a law without clumps is too narrow for them, and the test above says so
     if detections == 20:
-        wrong = scores.poisson_score(pairs, detections * (detections - 1) / 2 / boxes, RNG.random(draws))
+        wrong = scores.poisson_score(pairs, detections * (detections - 1) / 2 / boxes, rng.random(draws))
         assert stats.poisson.sf((np.abs(wrong) > 4).sum() - 1, 3 * usual) < laws.FALSE_ALARM
 
 
@@ -103,11 +103,12 @@ def test_scores_of_pairs_are_normal_far_out(detections: int, boxes: int, slots: 
 @pytest.mark.parametrize("detections", [3, 5, 9, 20])
 def test_scores_of_few_pairs_of_few_pixels_are_normal(detections: int, slots: float) -> None:
     """Pairs of two pixels in 8 boxes: the law of their scores, by drawing, over all random shares."""
+    rng = np.random.default_rng(20)
     draws = (20_000, 2)
     if np.isfinite(slots):
-        counts = RNG.multivariate_hypergeometric([int(slots)] * 8, detections, size=draws)
+        counts = rng.multivariate_hypergeometric([int(slots)] * 8, detections, size=draws)
     else:
-        counts = RNG.multinomial(detections, np.full(8, 1 / 8), size=draws)
+        counts = rng.multinomial(detections, np.full(8, 1 / 8), size=draws)
     pairs, times = np.unique((counts * (counts - 1) // 2).sum(axis=(1, 2)), return_counts=True)
     law = scores.pairs_law(np.array(detections), 8, slots).pooled(np.array(2))
     shares = (np.arange(50) + 0.5) / 50
@@ -122,12 +123,13 @@ def test_scores_of_few_pairs_of_few_pixels_are_normal(detections: int, slots: fl
 
 @pytest.mark.parametrize("mean", [0.01, 0.7, 5.0, 28.0, 33.0, 1e4])
 def test_scores_of_counts_are_normal(mean: float) -> None:
-    count = RNG.poisson(mean, 50_000)
-    found = scores.poisson_score(count, mean, RNG.random(count.size))
+    rng = np.random.default_rng(20)
+    count = rng.poisson(mean, 50_000)
+    found = scores.poisson_score(count, mean, rng.random(count.size))
     laws.distribution_is(found, stats.norm.cdf)
     laws.variance_is(found, 1.0, what=f"scores at a mean of {mean:g}")
     with pytest.raises(AssertionError):  # without the share
-        laws.distribution_is(scores.poisson_score(count, mean * 1.02 + 0.05, RNG.random(count.size)), stats.norm.cdf)
+        laws.distribution_is(scores.poisson_score(count, mean * 1.02 + 0.05, rng.random(count.size)), stats.norm.cdf)
 
 
 def test_scores_never_end() -> None:
@@ -162,7 +164,8 @@ def test_a_number_is_found_from_its_score(law: tuple[float, float, float]) -> No
 
 
 def test_shares_are_a_function_of_what_they_are_for() -> None:
-    counts = RNG.poisson(3.0, 200)
+    rng = np.random.default_rng(20)
+    counts = rng.poisson(3.0, 200)
     found = scores.shares(counts, 50_000)
     assert np.array_equal(found, scores.shares(counts.copy(), 50_000))
     assert found.min() > 0 and found.max() < 1
