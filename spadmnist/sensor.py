@@ -602,6 +602,12 @@ class Sensor:
         kernels.counts_in_frames(events.times, events.offsets, *clock, most, out)
         return self._limited(out, window)
 
+    def full_counts(self, conditions: Conditions) -> np.ndarray:
+        """The largest count of each pixel in a count frame, (pixels,)."""
+        most = conditions.largest_count
+        counts = np.full((self.layout.pixels, 1), most, counts_type(most))
+        return np.asarray(self._limited(counts, None)[:, 0], np.float64)
+
     def _limited(self, counts: np.ndarray, window: Window | None) -> np.ndarray:
         limits = [effect for effect in self.at("readout") if hasattr(effect, "limit")]
         if not limits:

@@ -224,7 +224,7 @@ def test_a_lamp_that_was_off_is_no_light_level() -> None:
     """As few detections as the dark has say nothing of the light, and everything of the set-up."""
     dark, per = 20.0, 4e-3
     made = CaptureNull(1e6, 1e6, np.full(48, 4020.0), lambda level: dark + per * level, (0.0, 1.0), 0.016)
-    assert [made.drowned(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
+    assert [made.says_nothing(total) for total in (0.0, 18.0, 30.0, 200.0, 3900.0, 4100.0)] == [True] * 3 + [False] * 3
     assert made.score(18.0) < -40 and made.score(18.0, 0.05) < -15
     assert abs(made.score(18.0, mean=18.0)) < 0.2 and made.score(30.0, mean=18.0) == pytest.approx(2.5, abs=0.4)
     # and a recording of the model's own, made where there are as few, is none that stands out
@@ -239,7 +239,7 @@ def test_a_lamp_that_was_off_is_no_light_level() -> None:
     assert own is not None and abs(own) < 1 and data == made.score(18.0)
     # Poisson's own where the dark is most of it: 25 expected, 17 found
     dim = replace(made, level=1250.0, stated=1250.0, totals=np.full(48, 25.0), scatter=0.2)
-    assert dim.drowned(17.0) and dim.score(17.0) == pytest.approx(-1.7, abs=0.1)
+    assert dim.says_nothing(17.0) and dim.score(17.0) == pytest.approx(-1.7, abs=0.1)
     found = compared(sensor(dark_counts={"rate": 2000.0}), blacked_out(), replicates=16)
     (failing,) = (c for c in found.failing if c.statistic == "rate")
     assert (failing.capture, failing.where) == ("bright", "all pixels, hardly any light")

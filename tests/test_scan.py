@@ -293,12 +293,12 @@ def test_the_recordings_of_a_model_reach_as_far_as_the_data() -> None:
     capture = Capture("flat", "tr", light, None)  # type: ignore[arg-type]
     for mean in (30.0, 2000.0, 1e7):
         for total in (mean * 0.9, mean, mean * 1.08, mean + 3.5 * math.sqrt(mean), mean * 3):
-            centre, half = levels_about(lambda level, m=mean: m * level, total, 1.0, capture)
+            centre, half = levels_about(lambda level, m=mean: m * level, total, 1.0, capture, math.inf)
             assert abs(math.log(total / mean / centre)) <= half + 4 / math.sqrt(mean)
             assert abs(math.log(total / mean / centre)) <= half or mean > 6400
             assert half < 0.06 + 0.01 + 4 / math.sqrt(mean)
     # what chance may do is a matter of the model: the same recordings serve every measurement of it
-    places = {levels_about(lambda level: 2000 * level, t, 1.0, capture) for t in (1900, 2000, 2100)}
+    places = {levels_about(lambda level: 2000 * level, t, 1.0, capture, math.inf) for t in (1900, 2000, 2100)}
     assert len(places) == 1
 
 

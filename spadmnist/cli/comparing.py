@@ -18,6 +18,8 @@ from ._group import cli
 if TYPE_CHECKING:
     from ..library.answers import Diagnosis, Fit
 
+MAX_STEPS = 12  # steps of a diagnosis; `inference.model_selection` says it, and takes long to import
+
 
 @cli.verb(120, short_help="Where does a model fail?")
 @options.output("REPORT", "Folder of the report, an HTML page with pictures.")
@@ -74,11 +76,12 @@ def compare(
             plugins=plugin_files,
             progress=progress,
         )
-    _write_answer(json_file, comparison.canonical(found))
     what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files, crop))
-    if output is not None:
-        terminal.say(f"Report: {found.save(output, command=_command(), then=what)}")
-    terminal.print_lines(f"{found}\n\nNext: {what}")
+    with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
+        last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
+        if output is not None:
+            last.callback(lambda: terminal.say(f"Report: {found.save(output, command=_command(), then=what)}"))
+        last.callback(lambda: _write_answer(json_file, comparison.canonical(found)))
     if found.verdict != "adequate":
         sys.exit(1)
 
@@ -86,7 +89,11 @@ def compare(
 @cli.verb(130, short_help="Which physical effect does a model lack?")
 @options.output("FOLDER", "Folder of the report, an HTML page, and of the next sensor.yaml with its maps.")
 @click.option(
-    "--max-steps", type=click.IntRange(1, 12), default=12, metavar="N", help="Largest number of steps.  [default: 12]"
+    "--max-steps",
+    type=click.IntRange(1, MAX_STEPS),
+    default=MAX_STEPS,
+    metavar="N",
+    help=f"Largest number of steps.  [default: {MAX_STEPS}]",
 )
 @click.option("--quick", is_flag=True, help="Fewer simulations, for a first answer.")
 @click.option(
@@ -148,10 +155,11 @@ def diagnose(
     )
     if output is not None:
         _write_sensor(found, output / SENSOR)
-    new = quoted(found.file or f"next/{SENSOR}")
-    same = f"-o {quoted(output or 'next')}{' --quick' if quick else ''}"
+    new = None if found.file is None else quoted(found.file)
+    same = f"-o {quoted(output or 'next')}{' --quick' if quick else ''}{f' --seed {seed}' if seed else ''}"
+    same += f" --max-steps {max_steps}" if max_steps != MAX_STEPS else ""
     again = options.again(measurement, plugin_files, crop)
-    what = next_step.after_diagnosis(found.found, quoted(sensor), again, new, same)
+    what = next_step.after_diagnosis(found.found, quoted(sensor), again, new, same, output is not None)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         if output is not None:
             last.callback(lambda: terminal.say(f"Report: {found.write_report(output, command=_command(), then=what)}"))
@@ -211,10 +219,11 @@ def fit(
         progress=terminal.say,
     )
     _write_sensor(found, output)
-    _write_answer(json_file, results.canonical(found.found))
     again = options.again(measurement, plugin_files, crop)
     what = next_step.after_diagnosis(found.found, quoted(sensor), again, quoted(found.file or output))
-    terminal.print_lines(f"{found}\n\nNext: {what}")
+    with contextlib.ExitStack() as last:
+        last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
+        last.callback(lambda: _write_answer(json_file, results.canonical(found.found)))
     if found.unwritten:
         sys.exit(2)
 
@@ -240,7 +249,9 @@ def _check_answer(file: Path | None) -> None:
         return
     if file.is_dir():
         raise InputError(f"--json {file}: is a folder; name a file, for example {file / 'answer.json'}")
-    if file.is_file():
+    if not file.is_file() or file.is_symlink():
+        raise InputError(f"--json {file}: is a link, a pipe or a device, and is left alone; name a file")
+    else:
         with open(file, "rb") as there:
             head = there.read(_HEAD)
         if head and b'"format": "spadmnist-' not in head:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, ClassVar
 
@@ -52,11 +53,41 @@ class ReadoutLoss(Effect, stage="readout"):
         return math.inf if self.service_time else 0.0
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        """A bound, nearly reached far below and far above the bus's capacity: an image has no more than that."""
-        with np.errstate(divide="ignore"):
-            return rate * np.minimum(1.0, 1 / (self.service_time * rate.sum(axis=-1, keepdims=True)))
+        """What a queue with Poisson arrivals and a fixed time of service takes (M/D/1/K), once it is in equilibrium.
+
+        Source: Gross and Harris, Fundamentals of Queueing Theory, on M/G/1/K.
+        """
+        loads = self.service_time * rate.sum(axis=-1, keepdims=True)
+        taken = [_taken(float(load), self.queue) for load in loads.ravel()]
+        return rate * np.reshape(taken, loads.shape)
 
 
+_MOST_LOAD = 30.0  # arrivals in a time of service: beyond it the bus is never free
+_MOST_QUEUE = 4096  # a longer queue is full only where the load is above 1, or hardly below
+
+
+@functools.lru_cache(maxsize=4096)
+def _taken(load: float, queue: float) -> float:
+    """The share of arrivals that the bus takes, at a load of so many arrivals in a time of service."""
+    if load == 0:
+        return 1.0
+    if load > _MOST_LOAD or queue > _MOST_QUEUE:
+        return min(1.0, 1 / load)
+    from scipy import special
+
+    # of the chain at the departures: from how many are left behind, what crosses each level upwards crosses it back
+    room = int(queue)
+    more = special.pdtrc(np.arange(room), load)  # P(more than k arrive during a service)
+    left = np.zeros(room)
+    left[0] = 1.0
+    for i in range(room - 1):
+        left[i + 1] = (left[0] * more[i] + left[1 : i + 1] @ more[i:0:-1]) * math.exp(load)
+        if left[i + 1] > _LARGE:
+            left /= _LARGE
+    return 1 / (float(left[0] / left.sum()) + load)
+
+
+_LARGE = 1e200  # no number becomes larger
 _CROWD = 64  # events in a bucket from which on it is sorted by merging
 
 

@@ -240,10 +240,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     checks += common
     checks += _between_wavelengths(captures, checks, replicates.start.layout.columns)
     if not checks:
-        raise InputError(
-            f"{replicates.measurement.source}: nothing here can be compared: of no capture are light and detections "
-            "known. State the light (irradiance or illuminance) of a capture, or name the file of one"
-        )
+        raise InputError(nothing_to_compare(replicates))
     checks = _verdicts([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
     return Comparison(
@@ -257,6 +254,14 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         len(evaluation.replicate_residuals[TOTALS]),
         tolerance,
         crop=str(sensor.window) if sensor.window else None,
+    )
+
+
+def nothing_to_compare(replicates: Replicates) -> str:
+    """The sentence on a measurement of which nothing says whether a model is right."""
+    return (
+        f"{replicates.measurement.source}: nothing here can be compared: of no capture are light and detections "
+        "known. State the light (irradiance or illuminance) of a capture, or name the file of one"
     )
 
 
@@ -307,7 +312,7 @@ def _level_checks(
     """The check of the total of a dark capture; for a lit one its light level is appended to `levels`."""
     if made.stated is None:
         return []
-    lost = not capture.light.dark and made.drowned(total)
+    lost = not capture.light.dark and made.says_nothing(total)
     if not capture.light.dark and not lost:
         level, error, elasticity = made.level_of(max(total, 0.5))
         if elasticity > LEAST_ELASTICITY:
@@ -320,7 +325,9 @@ def _level_checks(
     size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
     relative = (total - mean) / max(mean, 1.0)
     p = float(2 * stats.norm.sf(abs(z)))
-    where = "all pixels, hardly any light" if lost else "all pixels, no light"
+    where = "all pixels, no light"
+    if lost:
+        where = f"all pixels, {'too much light to count' if made.saturated else 'hardly any light'}"
     return [Check("rate", capture.id, z * z, p, where, size, relative)]
 
 
@@ -328,6 +335,8 @@ def light_of(
     levels: Sequence[tuple[Capture, float, float, float]], captures: Sequence[Capture]
 ) -> tuple[list[Nuisance], list[Check]]:
     """(nuisance parameters, checks): the common light factor and each capture's own, against the stated levels.
+
+    The factor of a capture is the common one to the power of its relative uncertainty over the largest.
 
     Args:
         levels: (capture, log of the light factor, its standard error, elasticity) of each lit capture.
@@ -338,13 +347,17 @@ def light_of(
     x = np.array([log for _, log, _, _ in levels])
     error = np.array([math.hypot(e, c.light.own_uncertainty) for c, _, e, _ in levels])
     error = np.maximum(error, 1e-6)
-    common = max(c.light.relative_uncertainty for c, _, _, _ in levels)
+    uncertain = np.array([c.light.relative_uncertainty for c, _, _, _ in levels])
+    common = float(uncertain.max())
+    follows = uncertain / common if common > 0 else np.ones(len(levels))  # the common factor, to this power
     weight = 1 / error**2
-    total_weight = weight.sum() + (1 / common**2 if common > 0 else 1e18)
-    best = float((weight * x).sum() / total_weight)
+    informed = (weight * follows**2).sum()
+    total_weight = informed + (1 / common**2 if common > 0 else 1e18)
+    projection = float((weight * follows * x).sum())
+    best = projection / total_weight
     spread = 1 / math.sqrt(total_weight)
-    own = float((weight * x).sum() / weight.sum())  # the estimate of the captures alone, without the stated level
-    own_error = 1 / math.sqrt(weight.sum())
+    own = projection / informed  # the estimate of the captures alone, without the stated level
+    own_error = 1 / math.sqrt(informed)
     pull = own / math.hypot(common, own_error)
     name = "light"
     nuisances = [
@@ -363,11 +376,11 @@ def light_of(
             math.expm1(own),
         )
     ]
-    for (capture, log, _, elasticity), e in zip(levels, error, strict=True):
+    for (capture, log, _, elasticity), e, power in zip(levels, error, follows, strict=True):
         # the common factor by the other captures and the stated level
-        others = weight.sum() - 1 / e**2 + (1 / common**2 if common > 0 else 1e18)
-        mean = (float((weight * x).sum()) - log / e**2) / others
-        z = (log - mean) / math.sqrt(e**2 + 1 / others)
+        others = informed - power**2 / e**2 + (1 / common**2 if common > 0 else 1e18)
+        mean = power * (projection - power * log / e**2) / others
+        z = (log - mean) / math.sqrt(e**2 + power**2 / others)
         if capture.light.own_uncertainty > 0:
             nuisances.append(
                 Nuisance(

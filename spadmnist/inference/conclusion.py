@@ -103,7 +103,7 @@ def answer(
     excluded, invisible, unlimited = limits
     path.locate()
     unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
-    if unexplained and verdict == "unexplained" and path.nearest:
+    if unexplained and path.nearest:
         unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]
     return Diagnosis(
         sensor=replicates.start.name,

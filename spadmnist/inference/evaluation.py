@@ -19,7 +19,16 @@ from . import replicate_cache
 from .candidates import with_values
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
-from .light_levels import CaptureNull, central_level, law_of, levels_about, of_mean, own_totals, totals_residuals
+from .light_levels import (
+    CaptureNull,
+    central_level,
+    law_of,
+    levels_about,
+    most_detections,
+    of_mean,
+    own_totals,
+    totals_residuals,
+)
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
 from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
@@ -30,6 +39,7 @@ _MOVED = 1.0  # sum of squares of a signature in one statistic, in variances, ab
 _WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts
 _OTHER_SCATTER = 3.0  # standard errors of that log: a cell beyond has another scatter; 3 of 1000 do so by chance
 _NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
+_PILOTS = 5  # rounds of a few replicates in which the level is found that gives the measured total, at most
 _FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
 
 
@@ -157,7 +167,9 @@ def _evaluate(
         if remember and sensors.alike and centre == stated and id not in before:
             sensor = sensors.of(id, 0)
             entries[id] = replicate_cache.entry_name(sensor, seen.capture, half, replicates.seed, replicates.dead)
-            if (found := replicate_cache.recall(entries[id])) is not None:
+            found = replicate_cache.recall(entries[id])
+            # a statistic that only a later replicate lacks is in none of a longer entry
+            if found is not None and (len(found.numbers) <= n or seen.summaries.keys() <= found.values.keys()):
                 before[id] = found.first(n)
         here = len(before[id].numbers) if id in before else 0
         if here < n:
@@ -211,18 +223,27 @@ def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
     }
     some = [id for id in out if not all(effect.states_mean for effect in sensors.mean_sensor(id).effects)]
     numbers = np.arange(FEW, dtype=np.uint64)
-    pilots = replicates.simulate([(sensors, id, np.full(FEW, out[id][0]), numbers) for id in some]) if some else []
-    for id, made in zip(some, pilots, strict=True):
-        if isinstance(made, str):
-            continue  # the replicates themselves will say so
-        centre, stated, expected, half = out[id]
-        logs = np.log(np.maximum(made.totals, 0.5))
-        off = float(logs.mean()) - math.log(expected(centre))
-        if abs(off) > half + _NOISE * float(np.std(logs, ddof=1)) / math.sqrt(FEW):
-            seen = replicates.seen[id]
-            # the total at which the closed form would have to be, for the measured one to come out
-            centre, half = levels_about(expected, seen.total / math.exp(off), stated, seen.capture)
-            out[id] = centre, stated, expected, half
+    closed = dict(out)
+    # a loss that grows with the light is that of the stated light, if this gives as many
+    at = {id: out[id][0] if out[id][1] is None else float(out[id][1] or 0.0) for id in some}
+    for _ in range(_PILOTS):
+        pilots = replicates.simulate([(sensors, id, np.full(FEW, at[id]), numbers) for id in at]) if at else []
+        for id, made in zip(list(at), pilots, strict=True):
+            level = at.pop(id)
+            if isinstance(made, str):
+                continue  # the replicates themselves will say so
+            start, stated, expected, half = closed[id]
+            logs = np.log(np.maximum(made.totals, 0.5))
+            noise = _NOISE * float(np.std(logs, ddof=1)) / math.sqrt(FEW)
+            off = float(logs.mean()) - math.log(expected(level))
+            if abs(off) > half + noise:
+                seen = replicates.seen[id]
+                most = most_detections(seen.capture, sensors.one.layout.pixels)
+                # the total at which the closed form would have to be, for the measured one to come out
+                start, half = levels_about(expected, seen.total / math.exp(off), stated, seen.capture, most)
+            out[id] = start, stated, expected, half
+            if abs(math.log(start / level)) > half + noise:
+                at[id] = start
     return out
 
 

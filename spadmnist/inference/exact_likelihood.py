@@ -324,7 +324,8 @@ def _maximum(
         without.own = function.own
         likelihood_ratios.append(2 * (best - without(np.zeros(0))))
     inverse = np.linalg.inv(top.curved)
-    spread = np.sqrt(np.diag(inverse))
+    # of some coordinates the value falls as they rise
+    spread = np.sqrt(np.diag(inverse)) * [-1.0 if d.lacks else 1.0 for d in coordinates]
     return MaximumLikelihood(
         {**fixed, **found}, intervals, likelihood_ratios, tuple(found), inverse / np.outer(spread, spread)
     )

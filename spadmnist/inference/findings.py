@@ -132,7 +132,7 @@ def nuisances(replicates: Replicates, evaluation: Evaluation) -> list[dict[str, 
         if seen.capture.light.dark or null.stated is None:
             continue
         level, error, elasticity = null.level_of(max(seen.total, 0.5))
-        if elasticity <= LEAST_ELASTICITY or null.drowned(seen.total):
+        if elasticity <= LEAST_ELASTICITY or null.says_nothing(seen.total):
             continue  # no light level gives so few
         levels.append((seen.capture, math.log(level / null.stated), error, elasticity))
     found, _ = comparison.light_of(levels, [s.capture for s in replicates.seen.values()])

@@ -14,6 +14,8 @@ from scipy import special, stats
 _LEAST = 1e-300  # in place of 0 in a denominator or a tail probability
 _LEAST_RATIO = 1e-3  # of a power relative to its mean: a smaller one is rounded up to this
 _LEAST_POWER = 0.3  # of the mean of a power in a spectrum: the least that a shift may leave
+# of the mean square of one normal score, whose variance is 2: the least that the mean of several may have
+_LEAST_OF_SQUARES = 0.25
 _MANY = 200.0  # expected counts beyond which Anscombe's residual is normal enough
 _FEW = 20.0  # expected counts: below it, a cell does not determine its own dependence on the light
 _EVENTS = 25.0  # expected independent events from which on a count is nearly normal
@@ -262,6 +264,10 @@ class Exponential(Scaled):
         """Each relative to the mean of the others."""
         n = len(values)
         return self.standardized(values, (n * fitted - values) / (n - 1), spread, 0.0, n - 1)
+
+    def variance_of_squares(self, variance: float, cells: int) -> float:
+        """At least an eighth of that of independent powers: without a detection all replicates have the same ones."""
+        return max(variance, _LEAST_OF_SQUARES / cells)
 
     def spread_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
         """The expectation."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from .. import twin
 from ..effects import Conditions
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 SPREAD = 3.0  # standard deviations of the stated level: half the range over which the light of the replicates varies
 LEAST_SPREAD = 0.01  # of a logarithm: the least half range of the light of the replicates
-# of a logarithm, 4 standard deviations of the counts: beyond the first they extend the range of the replicates; the
-# second is the most that they count
+_NOISE = 4.0  # standard deviations of the counts: within it a total is the expected one
+# of a logarithm: the noise of the counts beyond which it extends the range of the replicates; the most that it counts
 _MUCH, _MOST_NOISE = 0.05, 0.7
 _DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
 _CLOSED = 5e-4  # relative error of the closed forms, at most
@@ -87,11 +87,18 @@ class CaptureNull:
     def _scatter(self) -> float:
         return self.scatter * math.sqrt(1 + 2 / len(self.totals))
 
-    def drowned(self, total: float) -> bool:
-        """Whether a total is so small that it hardly depends on the light, though it would at the stated level.
+    @property
+    def saturated(self) -> bool:
+        """Whether the total does not depend on the light at the stated level: frames, counters or a bus are full."""
+        return self.stated is not None and self.elasticity_at(self.stated) < LEAST_ELASTICITY
+
+    def says_nothing(self, total: float) -> bool:
+        """Whether a total hardly depends on the light: at the stated level, or because it is so small.
 
         The level that gives such a total is meaningless; `score` applies.
         """
+        if self.saturated:
+            return True
         if self.stated is None or total >= self.total_at(self.stated):
             return False
         _, _, elasticity = self.level_of(max(total, 0.5))
@@ -131,7 +138,7 @@ def law_of(totals: np.ndarray, closed: np.ndarray) -> tuple[tuple[float, float],
 
 
 def levels_about(
-    expected: Callable[[float], float], total: float, stated: float | None, capture: Capture
+    expected: Callable[[float], float], total: float, stated: float | None, capture: Capture, most: float
 ) -> tuple[float, float]:
     """(level about which a capture is simulated, half the range of its logarithm).
 
@@ -141,16 +148,33 @@ def levels_about(
         expected: level -> detections.
         total: detections of the measurement.
         stated: the stated level; None where there is none.
+        most: detections that the capture can hold; inf where there is no end to them.
     """
     centre = level_for(expected, total, stated)
     half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
     if stated is not None:
-        noise = min(4 / math.sqrt(max(expected(stated), 1.0)), _MOST_NOISE)
-        if total == 0 or abs(math.log(centre / stated)) < half + noise:
+        wanted = expected(stated)
+        noise = min(_NOISE / math.sqrt(max(wanted, 1.0)), _MOST_NOISE)
+        # where frames or counters are full a total says little of its light; it is as expected, all the same
+        if total == 0 or abs(math.log(centre / stated)) < half + noise or as_expected(capture, total, wanted, most):
             # the same replicates then serve every measurement of this model; where detections are few, their range
             # reaches the data
             return stated, half + noise if noise > _MUCH else half
     return centre, half
+
+
+def as_expected(capture: Capture, total: float, wanted: float, most: float) -> bool:
+    """Whether a total is within the noise of the expected one, detections; of what can be full, of what is not full."""
+    free = most - wanted if math.isfinite(most) and not capture.counts_events else wanted
+    return abs(total - wanted) < _NOISE * math.sqrt(max(min(free, wanted), 0.0) + 1.0)
+
+
+def most_detections(capture: Capture, pixels: int) -> float:
+    """The detections that a capture can hold; inf for time stamps."""
+    if capture.modality == "tr":
+        return math.inf
+    c = capture.conditions
+    return float(pixels * (c.count_frames * c.largest_count if capture.modality == "counts" else c.frames))
 
 
 def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
@@ -192,10 +216,42 @@ def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
     def detections(level: float) -> float:
         light = np.full((1, sensor.layout.pixels), level)
         if capture.counts_events:
-            return max(float(sensor.expected(light, conditions)[1].sum()), 1e-9)
-        return max(float(conditions.frames * in_frames(sensor, light, conditions).sum()), 1e-9)
+            made = sensor.expected(light, conditions)[1]
+        else:
+            made = conditions.frames * in_frames(sensor, light, conditions)
+        if full is not None:
+            mean = made.ravel() / conditions.count_frames
+            if np.any(mean + 10 * np.sqrt(mean) + 10 > full):  # otherwise none is full
+                made = in_counters(mean, full, slots) * conditions.count_frames
+        return max(float(made.sum()), 1e-9)
 
+    full, slots = None, math.inf
+    if capture.modality == "counts":
+        full = sensor.full_counts(conditions)
+        if conditions.counting == "frames":
+            slots = float(conditions.largest_count)
+            full = full if np.any(full < slots) else None  # by itself a sum of binary frames does not pile up
     return detections
+
+
+def in_counters(mean: np.ndarray, full: np.ndarray, slots: float) -> np.ndarray:
+    """The expected counts of counters that stop, E[min(N, full)], (pixels,).
+
+    N is binomial, or Poisson where the slots have no end; a dead time makes it scatter less.
+
+    Args:
+        mean: (pixels,) events in a count frame.
+        full: (pixels,) the largest count.
+        slots: binary frames in a count frame; inf for a counter.
+    """
+    if math.isinf(slots):
+        below, beyond = special.pdtr(full - 1, mean), special.pdtrc(full, mean)
+    else:
+        share = np.minimum(mean / slots, 1.0)
+        below = special.bdtr(np.minimum(full, slots) - 1, slots - 1, share) if slots > 1 else np.ones_like(mean)
+        beyond = np.where(full >= slots, 0.0, special.bdtrc(np.minimum(full, slots - 1), slots, share))
+        below = np.where(full >= slots, 1.0, below)
+    return np.asarray(mean * below + full * beyond)
 
 
 def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
@@ -293,7 +349,8 @@ def central_level(
     else:
         stated = twin.photons_at(capture, sensor.layout)  # type: ignore[assignment]
     expected = closed_form(sensor, capture)
-    centre, half = levels_about(expected, seen.total, stated, capture)
+    most = most_detections(capture, sensor.layout.pixels)
+    centre, half = levels_about(expected, seen.total, stated, capture, most)
     return centre, stated, expected, half
 
 
@@ -363,7 +420,7 @@ def _score(replicates: Replicates, evaluation: Evaluation, id: str, total: float
     if replicates.seen[id].capture.light.dark:
         wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
         return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
-    if null.drowned(total):
+    if null.says_nothing(total):
         return null.score(total, mean=expected)
     if null.total_at(_FAINT * stated) < 0.5 * null.total_at(stated):
         return None

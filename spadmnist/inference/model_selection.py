@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from .. import golden
-from ..errors import UNABLE, why
+from ..errors import UNABLE, InputError, why
 from ..measurement import Measurement
 from ..sensor import Sensor
 from ..workers import Executor, executor
@@ -22,7 +22,7 @@ from . import experiment_design, setups, time_blocks, upper_limits
 from .alternatives import alternatives
 from .budget import FITS, STEPS, Budget, OutOfBudget, clock
 from .candidates import Candidate
-from .comparison import Comparison, comparison_of, comparison_with
+from .comparison import Comparison, comparison_of, comparison_with, nothing_to_compare
 from .conclusion import Limits, Notes, answer, left_over, not_done, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, left_in_own_cells, no_step_explains
 from .error_budget import Rung, placebo_of
@@ -105,6 +105,8 @@ def _diagnosed(
     keep: Callable[[Diagnosis], None],
 ) -> Diagnosis:
     path = begin(replicates)
+    if not any(z.size for z in path.evaluation.residuals.values()):
+        raise InputError(nothing_to_compare(replicates))
     start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
     while len(path.steps) < max_steps and not no_step_explains(path, not notes.explained) and _possible(path, notes):

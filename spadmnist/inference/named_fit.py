@@ -142,7 +142,9 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[s
         free, correlations = exact.free, exact.correlations
     elif path.fit is not None:
         free, matrix = tuple(coordinate.key for coordinate in path.fit.coordinates), path.fit.covariance
-        spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        # of some coordinates the value falls as they rise
+        sign = np.array([-1.0 if coordinate.lacks else 1.0 for coordinate in path.fit.coordinates])
+        spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300)) * sign
         held = tuple(d.key for step in path.steps for d in step.coordinates if d.key not in free)
         correlations = np.eye(len(free) + len(held))  # what keeps the value of an earlier fit is taken as independent
         correlations[: len(free), : len(free)] = matrix / np.outer(spread, spread)

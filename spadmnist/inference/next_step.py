@@ -24,22 +24,27 @@ def after_diagnosis(
     found: Diagnosis,
     sensor: str = SENSOR,
     measurement: str = MEASUREMENT,
-    new: str = "next/sensor.yaml",
+    new: str | None = "next/sensor.yaml",
     same: str = "-o next",
+    kept: bool = True,
 ) -> str:
     """What follows a diagnosis or a fit.
 
     Args:
         sensor, measurement: as of `after_comparison`.
-        new: the next sensor file.
-        same: the options under which a diagnosis that is not finished goes on from its journal.
+        new: the next sensor file; None where it was not written.
+        same: the options of the same diagnosis.
+        kept: a diagnosis that is not finished goes on from its journal.
     """
     if not found.finished:
-        return f"spadmnist diagnose {sensor} {measurement} {same} --within none goes on to the end."
+        how = "goes on to the end" if kept else "begins again, keeps what it simulates, and goes to the end"
+        return f"spadmnist diagnose {sensor} {measurement} {same} --within none {how}."
     if found.asked == "fit":
         return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
     if found.verdict == "adequate":
         return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
+    if new is None and found.steps and found.verdict in ("explained", "partly_explained", "confused"):
+        return f"spadmnist diagnose {sensor} {measurement} {same} writes the new model, for compare to check."
     if found.verdict == "setup" and found.setup:
         entry = found.setup[0]
         return (

@@ -206,7 +206,7 @@ class Diagnosis:
             "finished": self.finished,
             **({"crop": self.crop} if self.crop else {}),
             "misfit": {"before": plain(self.before), "after": plain(self.after)},
-            "misfit_in_sample": plain(self.after if self.in_sample is None else self.in_sample.misfit),
+            "misfit_in_sample": None if self.in_sample is None else plain(self.in_sample.misfit),
             "misfit_null_95": plain(self.null_95),
             "nuisances": self.nuisances,
             "steps": [step.as_data() for step in self.steps],

@@ -297,6 +297,10 @@ def _plan(plan: Measurement | PathLike | Sequence[Capture], model: Sensor) -> Me
     wrong = [one for one in captures if not isinstance(one, Capture)]
     if wrong or not captures:
         raise InputError(f"plan: {wrong[0]!r} is not a capture" if wrong else "plan: has no captures")
+    names = [capture.id for capture in captures]
+    twice = [id for id in names if names.count(id) > 1]
+    if twice:
+        raise InputError(f"plan: {twice[0]} is there twice; give each capture a name of its own")
     return measurements.in_memory(model.name or "simulated", model.layout, captures)
 
 

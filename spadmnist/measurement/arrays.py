@@ -84,12 +84,12 @@ def Capture(
         if value is not None and not (_number(value) and value > 0):
             raise _wrong(id, f"{name} is {value!r}; it is more than 0, in {'m' if name == 'wavelength' else 's'}")
     shares = {"relative_uncertainty": relative_uncertainty, "own_uncertainty": own_uncertainty}
-    for name, value in {"irradiance": irradiance, "lux": lux, **shares}.items():
-        if value is not None and not (_number(value) and value >= 0):
-            raise _wrong(id, f"{name} is {value!r}; it is a number of at least 0")
+    for name, value in {"irradiance": irradiance, "lux": lux}.items():
+        if value is not None and not (_number(value) and value > 0):
+            raise _wrong(id, f"{name} is {value!r}; it is more than 0; a capture without light has dark=True")
     for name, value in shares.items():
-        if value >= 1:
-            raise _wrong(id, f"{name} is {value!r}; it is a share less than 1, 0.05 for 5 %")
+        if not (_number(value) and 0 <= value < 1):
+            raise _wrong(id, f"{name} is {value!r}; it is a share from 0 to less than 1, 0.05 for 5 %")
     if wavelength is not None and not _WAVELENGTHS[0] <= wavelength <= _WAVELENGTHS[1]:
         raise _wrong(id, f"wavelength is {wavelength!r} m; give it in m, 500e-9 for 500 nm")
     light = _light(id, wavelength, irradiance, lux, dark, relative_uncertainty, own_uncertainty)
@@ -101,7 +101,7 @@ def Capture(
         return recordings.Capture(id, modality, light, Conditions(*clock), tick=tick)
     if frames is None or frame_time is None:
         raise _wrong(id, f"{modality.upper()} needs frames and frame_time (s); give frames=1000, frame_time=10e-6")
-    if isinstance(frames, bool) or int(frames) != frames or not 0 < frames <= MOST_FRAMES:
+    if not _number(frames) or int(frames) != frames or not 0 < frames <= MOST_FRAMES:
         raise _wrong(id, f"frames is {frames!r}; it is a whole number from 1 to {MOST_FRAMES:g}")
     period = frame_time if frame_period is None else frame_period
     if frame_time > period * (1 + 1e-12):
@@ -113,7 +113,7 @@ def Capture(
     if modality != "counts":
         _none(id, modality, bits=bits)
         return recordings.Capture(id, modality, light, Conditions(*clock), tick=tick if modality == "str" else None)
-    if bits is None or isinstance(bits, bool) or int(bits) != bits or not 1 <= bits <= _MOST_BITS:
+    if bits is None or not _number(bits) or int(bits) != bits or not 1 <= bits <= _MOST_BITS:
         raise _wrong(id, f"bits is {bits!r}; of a count it is a whole number from 1 to {_MOST_BITS}")
     if counting not in ("frames", "counter"):
         raise _wrong(id, f"counting is {counting!r}; it is 'frames' or 'counter'")
@@ -328,6 +328,8 @@ def _stamps(capture: recordings.Capture, layout: Layout, data: Any) -> Recording
         raise _wrong(capture.id, f"times have shape {times.shape}, pixels {pixels.shape}; both are (detections,)")
     if pixels.dtype.kind not in "ui" and pixels.size:
         raise _wrong(capture.id, f"pixels are {pixels.dtype}; they are whole numbers, row by row")
+    if not pixels.size:  # of an empty list numpy makes floats
+        pixels = pixels.astype(np.int64)
     if pixels.size and not 0 <= pixels.min() <= pixels.max() < layout.pixels:
         raise _wrong(capture.id, f"has pixels {pixels.min()} to {pixels.max()}; there are 0 to {layout.pixels - 1}")
     end, tick, whole = capture.conditions.exposure, capture.tick, times.dtype.kind in "ui"

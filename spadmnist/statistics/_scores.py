@@ -267,7 +267,7 @@ def pair_scores(
         return gamma_score(pairs + share - 0.5, law), law
     lower, own, upper = _pairs_of_few(boxes)
     n, u = detections[few].astype(np.intp), share[few]
-    k = np.minimum(pairs[few].astype(np.intp), own.shape[1] - 1)
+    k = np.minimum(pairs[few], own.shape[1] - 1).astype(np.intp)
     below, above = lower[n, k] + u * own[n, k], upper[n, k] + (1.0 - u) * own[n, k]
     exact = _from_tails(np.maximum(below, 1e-12), np.maximum(above, 1e-12))
     # the table is for slots without end; where they end, mean and spread are less, the score's but half as much

@@ -193,15 +193,15 @@ def _chance_of_counts(recording: Recording) -> Callable[[np.ndarray], float]:
 
     frames, slots = recording.n_frames, slots_of_frame(recording)
     mean = (recording.totals + 0.5) / (frames + 1.0)
+    share = (recording.totals + 0.5) / (frames * slots + 1.0)
     full = recording.conditions.largest_count
 
     def of_counts(frame: np.ndarray) -> float:
         k = frame.ravel().astype(np.float64)
         if not np.isfinite(slots):
             return float(np.where(k >= full, 0.0, special.xlogy(k, mean) - mean - special.gammaln(k + 1.0)).sum())
-        p = np.minimum(mean / slots, 1.0 - 0.5 / (frames * slots))
         ways = -np.log(slots + 1.0) - special.betaln(slots - k + 1.0, k + 1.0)
-        return float((ways + special.xlogy(k, p) + special.xlog1py(slots - k, -p)).sum())
+        return float((ways + special.xlogy(k, share) + special.xlog1py(slots - k, -share)).sum())
 
     return of_counts
 

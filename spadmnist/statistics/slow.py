@@ -231,6 +231,8 @@ class SlowSeries(Statistic):
 
         def fano(cell: int, score: float) -> float:
             """Variance of the blocks' counts over what it is at a steady rate."""
+            if few[cell] < 2:  # there are no pairs, whatever the score
+                return steady(few[cell], blocks, slots, 0.0)
             one = np.array([few[cell]])
             mean = float(pairs_law(one, blocks, slots).mean[0])
 
