@@ -133,6 +133,7 @@ def test_a_budget_ends_a_search_and_the_answer_says_so(lab, few, monkeypatch):
     assert any(e["effect"] is None and "--within" in e["why"] for e in data["not_tried"])
     assert sentence(found).startswith("not finished") and "--within" in table(found)
     assert "lab -o there --quick --within none" in after_diagnosis(found, "s.yaml", "lab", same="-o there --quick")
+    assert "goes on to the end" in after_diagnosis(found) and "begins again" in after_diagnosis(found, kept=False)
     assert any("left)" in line for line in told)
 
 

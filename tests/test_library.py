@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 
 import spadmnist as sp
 from spadmnist import config, sensor_file, twin
+from spadmnist import measurement as measurements
 from spadmnist.errors import InputError, SpadError
 from spadmnist.plugins import ByWavelength, Distribution
 
@@ -43,10 +46,15 @@ CLOCK = {"frames": 10, "frame_time": 1e-5}
         ("qis", {**CLOCK, "irradiance": 1.0}, "give wavelength=500e-9"),
         ("qis", {**CLOCK, **LIGHT, "lux": 1.0}, "has both irradiance and lux; keep one"),
         ("qis", {**CLOCK, "wavelength": 500.0}, r"wavelength is 500.0 m; give it in m, 500e-9 for 500 nm"),
-        ("qis", {**CLOCK, **LIGHT, "irradiance": -1.0}, "irradiance is -1.0; it is a number of at least 0"),
-        ("qis", {**CLOCK, **LIGHT, "relative_uncertainty": 1.5}, "a share less than 1, 0.05 for 5 %"),
+        ("qis", {**CLOCK, **LIGHT, "irradiance": -1.0}, "irradiance is -1.0; it is more than 0; a capture"),
+        ("qis", {**CLOCK, **LIGHT, "irradiance": 0.0}, "a capture without light has dark=True"),
+        ("qis", {**CLOCK, **LIGHT, "own_uncertainty": None}, "own_uncertainty is None; it is a share from 0"),
+        ("qis", {**CLOCK, **LIGHT, "relative_uncertainty": 1.5}, "a share from 0 to less than 1, 0.05 for 5 %"),
         ("qis", {**DARK, "frames": 10}, "QIS needs frames and frame_time"),
         ("qis", {**DARK, **CLOCK, "frames": 2.5}, "frames is 2.5; it is a whole number"),
+        ("qis", {**DARK, **CLOCK, "frames": float("nan")}, "frames is nan; it is a whole number"),
+        ("qis", {**DARK, **CLOCK, "frames": math.inf}, "frames is inf; it is a whole number"),
+        ("counts", {**DARK, **CLOCK, "bits": math.nan}, "bits is nan; of a count it is a whole number"),
         ("qis", {**DARK, **CLOCK, "frame_period": 1e-6}, "does not fit into the frame_period"),
         ("qis", {**DARK, **CLOCK, "exposure": 1.0}, "is not frames x frame_period"),
         ("qis", {**DARK, **CLOCK, "bits": 8}, "bits means nothing for QIS; leave it out"),
@@ -136,6 +144,8 @@ def test_arrays_are_the_data() -> None:
     first = sp.Measurement.from_arrays(sensor().layout, {FIRST: seconds})["a"]
     assert first.none == 10_000 and first.frames[1, 2, 4] == 7123 and first.frames[0, 0, 0] == 0
     assert int((first.frames < first.none).sum()) == 2
+    for nothing in (([], []), (np.zeros(0), np.zeros(0))):  # of an empty list numpy makes floats
+        assert len(sp.Measurement.from_arrays(sensor().layout, {STAMPS: nothing})[STAMPS.id].events) == 0
     ticks = np.where(np.isfinite(seconds), np.rint(np.nan_to_num(seconds) * 1e9), 10_000).astype(np.int32)
     assert np.array_equal(sp.Measurement.from_arrays(sensor().layout, {FIRST: ticks})["a"].frames, first.frames)
 
@@ -324,6 +334,9 @@ def test_a_diagnosis_gives_the_model_that_it_found(asked: tuple[Any, Any], tmp_p
 
 
 LAB = {FLAT: np.zeros((40, 3, 5), np.uint8)}
+# of one capture nothing but the mean is known, and not how bright its light was
+UNKNOWN = sp.Capture("mean", "qis", wavelength=500e-9, frames=1000, frame_time=10e-6)
+MEAN = measurements.in_memory("mean", sensor().layout, [replace(UNKNOWN, mean=470.0)])
 
 
 @pytest.mark.parametrize(
@@ -350,6 +363,9 @@ LAB = {FLAT: np.zeros((40, 3, 5), np.uint8)}
         (lambda s, lab: s.with_effect("crosstalk"), "'crosstalk' is not an effect; give one with its values"),
         (lambda s, lab: sp.Sensor(s.layout, [sp.effects.Crosstalk]), "Crosstalk'> is not an effect; give one with"),
         (lambda s, lab: sp.simulate(s, 7), "plan: 7 is not a capture"),
+        (lambda s, lab: sp.simulate(s, [FLAT, FLAT]), "plan: flat is there twice"),
+        (lambda s, lab: sp.diagnose(s, MEAN), "nothing here can be compared: of no capture are light"),
+        (lambda s, lab: sp.compare(s, MEAN), "nothing here can be compared: of no capture are light"),
     ],
 )
 def test_what_the_functions_cannot_take_is_one_sentence(call: Any, said: str) -> None:

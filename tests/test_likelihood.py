@@ -12,7 +12,7 @@ import pytest
 from scipy import integrate, stats
 
 from spadmnist import config, plugins
-from spadmnist.effects import Conditions, Effect
+from spadmnist.effects import Conditions, Effect, ShortGate
 from spadmnist.inference.candidates import Candidate, candidates, with_values
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.exact_likelihood import Likelihood, MaximumLikelihood, maximise, not_in_likelihood
@@ -348,3 +348,15 @@ def test_maps_and_switches_have_none(sensor: Sensor) -> None:
     for name in ("per_pixel detection.pdp", "set dead_time.paralyzable"):
         assert isinstance(maximise(sensor, [data], named(sensor, name)), str)
     assert maximise(sensor, [data], named(sensor, "add crosstalk")) == "crosstalk"
+
+
+def test_the_covariance_of_a_gate_has_the_sign_of_its_values(sensor: Sensor) -> None:
+    """The coordinate of a fraction that is off at 1 falls as it rises; a wider gate means fewer dark counts."""
+    plain = with_values(sensor.without("afterpulsing"), {("dark_counts", "rate"): 5e4})
+    gated = plain.with_effect(ShortGate(fraction=0.7))
+    data = bits(gated, 3000, [5e5], 5e5) + bits(gated, 3000, [0.0], 0.0)
+    wanted = named(plain, "add short_gate", "set dark_counts.rate")
+    exact = maximise(plain, data, wanted)
+    assert isinstance(exact, MaximumLikelihood)
+    at = [exact.free.index(key) for key in (("short_gate", "fraction"), ("dark_counts", "rate"))]
+    assert abs(exact.values["short_gate", "fraction"] - 0.7) < 0.1 and exact.correlations[at[0], at[1]] < -0.05

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,6 +248,12 @@ def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
         comparing._check_answer(data)
     with pytest.raises(InputError, match="is a folder"):
         comparing._check_answer(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(answer)
+    answer.write_text('{"format": "spadmnist-fit/1"}')
+    for place in ("pipe", "link"):
+        with pytest.raises(InputError, match="a link, a pipe or a device, and is left alone; name a file"):
+            comparing._check_answer(tmp_path / place)
     answer.write_text('{\n "format": "spadmnist-diagnosis/1"}')
     for free in (answer, tmp_path / "new.json", None):
         comparing._check_answer(free)

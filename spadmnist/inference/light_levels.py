@@ -40,6 +40,7 @@ _MOST_LIGHT, _MOST_DARK = 1.5, 9.0
 # expected detections: the least that inform the level; below the other, none are expected
 _LEAST_TOTAL, _NEVER = 5.0, 0.5
 _SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
+_FAR_ABOVE = 4.0  # times the replicates' totals: beyond it, their scatter is not that of the expected one
 _FAINT = 1e-6  # of the stated light: as good as none
 
 
@@ -115,8 +116,21 @@ class CaptureNull:
         assert self.stated is not None
         mean = self.total_at(self.stated) if mean is None else mean
         level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
-        wider = max(1.0, math.hypot(self._scatter, level) * math.sqrt(max(mean, 1.0)))
-        return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / wider
+        if self.saturated:  # what is full scatters less than counts do, and by a count at least
+            return (total - mean) / max(math.hypot(self._scatter, level) * mean, 1.0)
+        wider = math.hypot(self.dispersion_at(mean, self._scatter), level * math.sqrt(max(mean, 1.0)))
+        return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / max(wider, 1.0)
+
+    def dispersion_at(self, mean: float, scatter: float) -> float:
+        """The factor on the scatter of independent events that totals of this mean have; at least 1.
+
+        Far above the replicates' totals, their scatter is mostly that of few counts. What two such variances do not
+        account for is that of the rate, which stays in proportion.
+        """
+        here = max(float(self.totals.mean()), 0.5)
+        if mean < _FAR_ABOVE * here:
+            return max(1.0, scatter * math.sqrt(max(mean, 1.0)))
+        return math.sqrt(max(1.0, scatter**2 * here) + max(scatter**2 - 2 / here, 0.0) * mean)
 
 
 def law_of(totals: np.ndarray, closed: np.ndarray) -> tuple[tuple[float, float], float]:
@@ -247,10 +261,9 @@ def in_counters(mean: np.ndarray, full: np.ndarray, slots: float) -> np.ndarray:
     if math.isinf(slots):
         below, beyond = special.pdtr(full - 1, mean), special.pdtrc(full, mean)
     else:
-        share = np.minimum(mean / slots, 1.0)
-        below = special.bdtr(np.minimum(full, slots) - 1, slots - 1, share) if slots > 1 else np.ones_like(mean)
-        beyond = np.where(full >= slots, 0.0, special.bdtrc(np.minimum(full, slots - 1), slots, share))
-        below = np.where(full >= slots, 1.0, below)
+        share, never = np.minimum(mean / slots, 1.0), full >= slots
+        below = np.where(never, 1.0, stats.binom.cdf(full - 1, slots - 1, share))
+        beyond = np.where(never, 0.0, stats.binom.sf(full, slots, share))
     return np.asarray(mean * below + full * beyond)
 
 
@@ -418,7 +431,7 @@ def _score(replicates: Replicates, evaluation: Evaluation, id: str, total: float
     null = evaluation.rates[id]
     stated = float(null.stated or 1.0)
     if replicates.seen[id].capture.light.dark:
-        wider = max(1.0, null.scatter * math.sqrt(expected)) if expected >= _LEAST_TOTAL else 1.0
+        wider = null.dispersion_at(expected, null.scatter) if expected >= _LEAST_TOTAL else 1.0
         return float(poisson_scores(np.array([round(total)]), np.array([max(expected, 1e-3)]))[0]) / wider
     if null.says_nothing(total):
         return null.score(total, mean=expected)
