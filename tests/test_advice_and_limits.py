@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
+from spadmnist.inference import conclusion
 from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
@@ -193,6 +194,10 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     assert path.failed
     drop_unexplaining(path, start, True)
     assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
+    # partly explained: what was dropped is named beside the rest
+    monkeypatch.setattr(conclusion, "remainder", lambda *_: [{"statistic": "intervals"}])
+    (rest,) = conclusion.unexplained_by(path)
+    assert [(e["effect"], e["nearest"]) for e in rest["alternatives"]] == [("afterpulsing", True)]
     # what is left is kept if it explains nearly all, whatever its own cells have
     foul = with_residuals(end, {"neighbours": 5.0})
     path.evaluation = foul

@@ -62,6 +62,14 @@ def so_far(path: ModelPath, start: Evaluation, notes: Notes) -> Diagnosis:
     return found
 
 
+def unexplained_by(path: ModelPath) -> list[dict[str, Any]]:
+    """What the steps leave unexplained, for the JSON data; the nearest candidates are alternatives of the first."""
+    found = remainder(path.replicates, path.evaluation, path.evaluation.residuals)
+    if found and path.nearest:
+        found[0]["alternatives"] = [_nearest(step) for step in path.nearest]
+    return found
+
+
 def _nearest(step: Step) -> dict[str, Any]:
     """The entry of a step that explains too little of its own cells, as an alternative of what is unexplained."""
     c = step.candidate
@@ -102,9 +110,6 @@ def answer(
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
     excluded, invisible, unlimited = limits
     path.locate()
-    unexplained = remainder(replicates, path.evaluation, path.evaluation.residuals) if remains else []
-    if unexplained and path.nearest:
-        unexplained[0]["alternatives"] = [_nearest(step) for step in path.nearest]
     return Diagnosis(
         sensor=replicates.start.name,
         measurement=replicates.measurement.name,
@@ -115,7 +120,7 @@ def answer(
         nuisances=nuisances(replicates, path.evaluation),
         steps=path.steps,
         setup=notes.setup,
-        unexplained=unexplained,
+        unexplained=unexplained_by(path) if remains else [],
         ladder=[rung.row for rung in rungs],
         advice=notes.advice,
         excluded=excluded,
