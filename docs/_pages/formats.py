@@ -82,7 +82,8 @@ MEANINGS = {
     "unexplained": "significant residuals that no step explains: statistic, capture, place, `nearest` alternatives",
     "ladder": "misfit and errors of each model from the start on; `placebo`: an effect that was not needed",
     "advice": "captures that would separate what is confused, with the significance now and then",
-    "excluded": "effects that are not there, with the upper limit (95 %) of their strength",
+    "excluded": "effects that are not there, with the upper limit (95 %) of their strength; with `at_least` where an "
+    "effect vanishes at the upper end of its range: then the value is at least that",
     "not_identifiable": "effects that the captures cannot show",
     "no_limit": "effects without a finding and without an upper limit",
     "not_tried": "candidates that were not tried, and why",

@@ -142,22 +142,24 @@ def likelihoods(
     return grid, np.exp(logs - logs.max(axis=1, keepdims=True))
 
 
-def _law(grid: np.ndarray, sigma: float, middle: float) -> np.ndarray:
-    """Prior of the logarithms, (grid,): normal, with a small uniform share for pixels of any dead time."""
+def _law(grid: np.ndarray, sigma: float, middle: float, others: float = _OTHERS) -> np.ndarray:
+    """Prior of the logarithms, (grid,): normal, with a small uniform share for pixels of any value."""
     ends = np.concatenate([grid[:1], (grid[1:] + grid[:-1]) / 2, grid[-1:]])
     normal = np.diff(special.ndtr((ends - middle) / sigma))
-    return np.asarray((1 - _OTHERS) * normal + _OTHERS * np.diff(ends) / (ends[-1] - ends[0]))
+    return np.asarray((1 - others) * normal + others * np.diff(ends) / (ends[-1] - ends[0]))
 
 
-def _log_likelihood(grid: np.ndarray, likely: np.ndarray, sigma: float, middle: float) -> float:
-    return float(np.log(np.maximum(likely @ _law(grid, sigma, middle), 1e-300)).sum())
+def _log_likelihood(grid: np.ndarray, likely: np.ndarray, sigma: float, middle: float, others: float) -> float:
+    return float(np.log(np.maximum(likely @ _law(grid, sigma, middle, others), 1e-300)).sum())
 
 
-def _at_best(grid: np.ndarray, likely: np.ndarray, sigma: float, about: float) -> tuple[float, float]:
+def _at_best(grid: np.ndarray, likely: np.ndarray, sigma: float, about: float, others: float) -> tuple[float, float]:
     """(largest log-likelihood at this width, the mean at which it is found)."""
     reach = 3 * sigma + 0.02
     found = optimize.minimize_scalar(
-        lambda m: -_log_likelihood(grid, likely, sigma, m), bounds=(about - reach, about + reach), method="bounded"
+        lambda m: -_log_likelihood(grid, likely, sigma, m, others),
+        bounds=(about - reach, about + reach),
+        method="bounded",
     )
     return -float(found.fun), float(found.x)
 
@@ -171,6 +173,7 @@ class Width:
         middle: its mean.
         likelihood_ratio: twice the log-likelihood ratio to equal dead times.
         prior: (grid,) the law itself.
+        log_likelihood: of all pixels at the maximum, but for a constant.
     """
 
     sigma: float
@@ -179,22 +182,24 @@ class Width:
     middle: float
     likelihood_ratio: float
     prior: np.ndarray
+    log_likelihood: float
 
 
-def width_of(grid: np.ndarray, likely: np.ndarray) -> Width:
+def width_of(grid: np.ndarray, likely: np.ndarray, others: float = _OTHERS) -> Width:
     """The maximum-likelihood width of the pixels' log dead times, from the likelihood of all pixels together.
 
     Args:
         grid, likely: as `likelihoods` returns them.
+        others: the uniform share of the law.
     """
     steps = np.diff(grid)
     sigmas = np.geomspace(float(steps.min()) / 4, float(grid[-1] - grid[0]) / 2, _WIDTHS)
     about = float(np.average(grid, weights=likely.sum(axis=0)))
-    about = _at_best(grid, likely, float(sigmas[_WIDTHS // 2]), about)[1]
-    tops = np.array([_at_best(grid, likely, float(s), about) for s in sigmas])
+    about = _at_best(grid, likely, float(sigmas[_WIDTHS // 2]), about, others)[1]
+    tops = np.array([_at_best(grid, likely, float(s), about, others) for s in sigmas])
     best = int(np.argmax(tops[:, 0]))
     fine = np.geomspace(sigmas[max(best - 1, 0)], sigmas[min(best + 1, _WIDTHS - 1)], 9)
-    found = max((*_at_best(grid, likely, float(s), float(tops[best, 1])), float(s)) for s in fine)
+    found = max((*_at_best(grid, likely, float(s), float(tops[best, 1]), others), float(s)) for s in fine)
     top, middle, sigma = found
     wanted = top - FALL_95 / 2
     inside = np.flatnonzero(tops[:, 0] > wanted)
@@ -209,4 +214,4 @@ def width_of(grid: np.ndarray, likely: np.ndarray) -> Width:
 
     ends = min(between(low, low - 1), sigma), max(between(high, high + 1), sigma)
     likelihood_ratio = max(2 * (top - float(tops[0, 0])), 0.0)
-    return Width(sigma, *ends, middle, likelihood_ratio, _law(grid, sigma, middle))
+    return Width(sigma, *ends, middle, likelihood_ratio, _law(grid, sigma, middle, others), top)

@@ -24,6 +24,7 @@ from .coordinates import Coordinate, Key, Values, coordinate_of, is_edge
 
 _SHAPES = 4  # the largest number of values of a shape within its search range
 _MOST = 6  # the largest number of templates per strength of one candidate
+_BEYOND = 3.0  # factor by which a listed value at an end of the search range may leave it
 _TURNED = 1.02  # factor on a parameter, to test whether the dead times follow it
 
 
@@ -179,10 +180,21 @@ def _settings(effect: Effect) -> Iterator[Candidate]:
             continue  # a common factor on the light belongs to the light level, not to the sensor
         if declared.kind == "frequency":
             continue  # a periodic effect at another frequency is another candidate
-        low, high = declared.search  # type: ignore[misc]
-        low, high = min(low, value) if value > 0 else low, max(high, value)
+        low, high = _about(value, declared)
         coordinate = replace(coordinate_of(effect.name, declared, float(value)), low=float(low), high=float(high))
         yield Candidate("set", effect.name, name, (coordinate,))
+
+
+def _about(value: float, declared: Parameter) -> tuple[float, float]:
+    """The search range of a listed value: it may fall, and it may rise, within its bounds."""
+    low, high = declared.search  # type: ignore[misc]
+    least, most = declared.bounds
+    if 0 < value <= low:
+        low = value / _BEYOND if low > 0 else low
+    if value >= high:
+        high = value * _BEYOND
+    low = low if least is None else max(low, min(least, value))
+    return min(low, value) if value > 0 else low, high if most is None else max(min(high, most), value)
 
 
 def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[Candidate]:

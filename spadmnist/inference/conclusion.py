@@ -11,7 +11,7 @@ from ..effects import Mimic
 from .comparison import Comparison
 from .error_budget import Rung
 from .evaluation import BlockCheck, Evaluation, mean_misfit, misfit_null_95
-from .findings import nuisances, remainder, traces
+from .findings import levels_of, nuisances, remainder, traces
 from .model_path import ModelPath
 from .results import Diagnosis, Step, Value, plain
 from .trial import Trial
@@ -117,7 +117,8 @@ def answer(
         before=rungs[0].misfit,
         after=(path.ladder[-1] if path.steps else path.ladder[0]).misfit,
         null_95=null_95,
-        nuisances=nuisances(replicates, path.evaluation),
+        # of the last values, where they were compared: the evaluation may be that of values near them
+        nuisances=nuisances(replicates, path.evaluation) if in_sample is None else levels_of(in_sample),
         steps=path.steps,
         setup=notes.setup,
         unexplained=unexplained_by(path) if remains else [],

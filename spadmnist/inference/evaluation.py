@@ -171,6 +171,7 @@ def _evaluate(
             # a statistic that only a later replicate lacks is in none of a longer entry
             if found is not None and (len(found.numbers) <= n or seen.summaries.keys() <= found.values.keys()):
                 before[id] = found.first(n)
+                replicates.charge(sensor, id, len(before[id].numbers))
         here = len(before[id].numbers) if id in before else 0
         if here < n:
             wanted.append((sensors, id, centre * factors[here:], np.arange(here, n, dtype=np.uint64)))

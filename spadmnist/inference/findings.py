@@ -15,7 +15,7 @@ from . import comparison
 from .deviations import Deviation, deviations, excess
 from .evaluation import BlockCheck, Evaluation, block_checks, failing
 from .levels import LEAST_P
-from .light_levels import LEAST_ELASTICITY, totals_space
+from .light_levels import LEAST_ELASTICITY, Nuisance, totals_space
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
@@ -136,6 +136,15 @@ def nuisances(replicates: Replicates, evaluation: Evaluation) -> list[dict[str, 
             continue  # no light level gives so few
         levels.append((seen.capture, math.log(level / null.stated), error, elasticity))
     found, _ = comparison.light_of(levels, [s.capture for s in replicates.seen.values()])
+    return _as_data(found)
+
+
+def levels_of(found: comparison.Comparison) -> list[dict[str, Any]]:
+    """The light levels of a comparison, for the JSON data."""
+    return _as_data(found.nuisances)
+
+
+def _as_data(found: Sequence[Nuisance]) -> list[dict[str, Any]]:
     return [
         {"capture": n.capture, "name": n.name, **{k: plain(getattr(n, k)) for k in ("value", "low", "high", "pull")}}
         for n in found

@@ -156,7 +156,7 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
     if fit is not None:
         place = {d.key: i for i, d in enumerate(fit.coordinates)}
         for step in path.steps:
-            extra = _of_pixels(path, step, maps)
+            extra = variances_by_pixels(path, step, maps)
             for k, coordinate in enumerate(step.coordinates):
                 if (i := place.get(coordinate.key)) is None:
                     continue
@@ -183,7 +183,7 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
                 step.values[name] = Value(float(value), None, None)
 
 
-def _of_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_maps.PixelMap]) -> np.ndarray:
+def variances_by_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_maps.PixelMap]) -> np.ndarray:
     """The variances of a light pattern's coordinates that random differences of the pixels cause, (coordinates,).
 
     Random differences of the pixels have an accidental gradient, which is degenerate with a gradient of the light.

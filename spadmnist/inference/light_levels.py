@@ -472,12 +472,18 @@ def own_totals(replicates: Replicates, evaluation: Evaluation, k: int, draw: flo
     """
     ids, elasticities, root, common = totals_space(replicates, evaluation)
     x = []
-    for id, slope in zip(ids, elasticities, strict=True):
+    # each capture's light deviates by itself as well
+    apart = [replicates.seen[id].capture.light.own_uncertainty for id in ids]
+    if any(apart):
+        own = np.random.Generator(np.random.Philox(key=[replicates.seed + 2, k])).standard_normal(len(ids)) * apart
+    else:
+        own = np.zeros(len(ids))
+    for id, slope, deviation in zip(ids, elasticities, own, strict=True):
         null = evaluation.rates[id]
         mean_log = null.law[0] + null.law[1] * math.log(null.expected(float(null.level * evaluation.factors[id][k])))
         z = _score(replicates, evaluation, id, float(null.totals[k]), math.exp(mean_log))
         if z is not None:
             x.append(z * level_error(replicates, evaluation, id))
             continue
-        x.append((math.log(max(null.totals[k], 0.5)) - mean_log) / slope)
+        x.append((math.log(max(null.totals[k], 0.5)) - mean_log) / slope + deviation)
     return root @ (np.array(x) + draw * common) if ids else np.zeros(0)

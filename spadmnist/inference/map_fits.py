@@ -22,6 +22,7 @@ from . import blind_times
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
 from .count_model import CountModel
+from .levels import LEAST_P
 from .pixel_maps import (
     CODES,
     GRID,
@@ -116,7 +117,7 @@ class _Fitted:
         size = int(group.max()) + 1
         return cls(
             candidate,
-            base if base > 0 else float((declared.scan or (1e-3, 1))[0]),
+            base if base > 0 else float((declared.search or (1e-3, 1))[0]),
             group,
             *bounds_of(candidate.carrier),
             acts_on_light(start, candidate),
@@ -363,15 +364,15 @@ def _of_few_counts(map_: PixelMap, lines: Sequence[CountModel], model: Callable[
         ],
         axis=1,
     )
-    weights = _by_their_law(np.exp(logs - logs.max(axis=1, keepdims=True)))
+    weights, prior = _by_their_law(np.exp(logs - logs.max(axis=1, keepdims=True)))
     mean, error = mean_of(weights, grid)
     informed = map_.raw_error < INFORMED
     estimate, error = np.where(informed, map_.estimate, mean), np.where(informed, map_.error, error)
-    return replace(map_, estimate=estimate, error=error, likely=(grid, weights))
+    return replace(map_, estimate=estimate, error=error, likely=(grid, weights), prior=prior)
 
 
-def _by_their_law(likely: np.ndarray) -> np.ndarray:
-    """(groups, grid) posterior weights of each value under the common law of all pixels.
+def _by_their_law(likely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((groups, grid) posterior weights of each value under the common law of all pixels, (grid,) that law).
 
     The law is the nonparametric maximum-likelihood estimate by expectation and maximization (Laird, JASA 73, 1978),
     stopped while it is smooth.
@@ -379,12 +380,12 @@ def _by_their_law(likely: np.ndarray) -> np.ndarray:
     Args:
         likely: (groups, grid) likelihoods.
     """
-    prior = np.full(likely.shape[1], 1 / likely.shape[1])
+    law = np.full(likely.shape[1], 1 / likely.shape[1])
     for _ in range(ROUNDS):
-        weights = likely * prior
+        prior, weights = law, likely * law
         weights /= weights.sum(axis=1, keepdims=True)
-        prior = weights.mean(axis=0)
-    return weights
+        law = weights.mean(axis=0)
+    return weights, prior
 
 
 def _begun(
@@ -416,10 +417,19 @@ def _begun(
     return out
 
 
+def _score_of_square(square: float, freedom: int) -> float:
+    """The normal score of the upper tail of a chi square; of a tail that is 0, by Wilson and Hilferty's cube root."""
+    p = float(stats.chi2.sf(square, freedom))
+    if p > LEAST_P:
+        return float(stats.norm.isf(p))
+    spread = 2 / (9 * freedom)
+    return float((np.cbrt(square / freedom) - 1 + spread) / math.sqrt(spread))
+
+
 def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] = ()) -> PixelMap:
     """The map of a converter's code widths from the frequency of each code.
 
-    Its period is that with the smallest p-value.
+    Its period is that with the smallest p-value, by its normal score: of many detections all p-values may be 0.
 
     Args:
         use: the captures that are used; all where it is empty.
@@ -435,13 +445,13 @@ def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] =
             folded[period] = folded.get(period, 0.0) + summary.values[part]
     assert candidate.carrier is not None
     found: PixelMap | None = None
-    least = 2.0
+    most = -math.inf
     for period, counts in folded.items():
         mean = max(float(counts.mean()), 1.0)
-        p = float(stats.chi2.sf(float(((counts - mean) ** 2).sum()) / mean, period - 1))
-        if p >= least:
+        score = _score_of_square(float(((counts - mean) ** 2).sum()) / mean, period - 1)
+        if score <= most:
             continue
-        least, raw, noise = p, np.maximum(counts, 0.5) / mean - 1, 1 / mean
+        most, raw, noise = score, np.maximum(counts, 0.5) / mean - 1, 1 / mean
         sigma = math.sqrt(max(float(np.mean(raw**2)) - noise, 1e-8))
         share = sigma**2 / (sigma**2 + noise)
         logs = np.log(np.maximum(1 + raw * share, 1e-3))

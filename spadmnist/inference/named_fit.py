@@ -20,15 +20,16 @@ from ..workers import Executor, executor
 from . import count_model, counts_in_the_dark, time_blocks
 from .candidates import Candidate, candidates
 from .comparison import comparison_with
-from .coordinates import Key, point_of
+from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
-from .joint_fit import edge_errors, fit_all
+from .joint_fit import edge_errors, fit_all, variances_by_pixels
 from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
+from .pixel_maps import HALF_95
 from .replicates import FEW, REPLICATES, Replicates
 from .results import Diagnosis, Step, Value, title
 from .scan import of_other_shapes
@@ -147,7 +148,10 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[s
         spread = np.sqrt(np.maximum(np.diag(matrix), 1e-300)) * sign
         held = tuple(d.key for step in path.steps for d in step.coordinates if d.key not in free)
         correlations = np.eye(len(free) + len(held))  # what keeps the value of an earlier fit is taken as independent
-        correlations[: len(free), : len(free)] = matrix / np.outer(spread, spread)
+        with np.errstate(invalid="ignore"):
+            known = np.nan_to_num(matrix / np.outer(spread, spread), nan=0.0, posinf=0.0, neginf=0.0)
+        np.fill_diagonal(known, 1.0)  # what is not informed has an interval all the same
+        correlations[: len(free), : len(free)] = known
         free += held
     results = {
         (s.candidate.effect, name): v for s in path.steps if not s.candidate.carrier for name, v in s.values.items()
@@ -215,13 +219,29 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
         if isinstance(fit, Fit):
             fit = replace(fit, point=point_of(coordinates, path.values))
             ends = profile_intervals(replicates, path.evaluation, fit, sensors, few)
+    maps = {s.candidate.carrier: s.map for s in path.steps if s.candidate.carrier and s.map is not None}
     for step in path.steps:
+        extra = dict(zip([d.key for d in step.coordinates], variances_by_pixels(path, step, maps), strict=True))
         for name, value in step.values.items():
-            low, high = ends.get((step.candidate.effect, name), (value.low, value.high))
+            key = step.candidate.effect, name
+            low, high = ends.get(key, (value.low, value.high))
+            if key in ends and extra.get(key):
+                low, high = _widened(
+                    next(d for d in step.coordinates if d.key == key), value.value, ends[key], extra[key]
+                )
+            if key in ends and key in step.intervals and value.low is not None and value.high is not None:
+                low, high = min(ends[key][0], value.low), max(ends[key][1], value.high)  # over all whole numbers
             how = "simulation"
             if step.candidate.carrier:
                 how = step.candidate.informed_by or ("intervals" if step.candidate.blinds else "counts")
             step.values[name] = replace(value, low=low, high=high, method=how)
+
+
+def _widened(coordinate: Coordinate, value: float, ends: tuple[float, float], variance: float) -> tuple[float, float]:
+    """An interval with a further variance of its coordinate."""
+    middle = coordinate.coordinate(value)
+    reach = [math.hypot(coordinate.coordinate(end) - middle, HALF_95 * math.sqrt(variance)) for end in ends]
+    return coordinate.interval(middle - max(reach), middle + max(reach))
 
 
 def _kept(path: ModelPath, candidate: Candidate) -> None:

@@ -25,6 +25,8 @@ INFORMED, LEAST_WIDTH = 0.2, 1e-3
 # relative standard error of the variance of many pixels by the median of their distances, times the root of their
 # number: twice that of the width, 1.166 for a normal law
 _DOUBT = 2.34
+_HOT = (0.001, 0.01, 0.03, 0.1)  # shares of hot pixels that are tried
+_MOST_FOR_WIDTH = 16_384  # pixels whose likelihood gives the width of their law: drawn at random from more
 TURNS = 16  # iterations of a fit of maps
 MOST = 10.0  # of a logarithm: the most that a value deviates from that of the array
 # standard deviations beyond which a pixel is odd; of a logarithm, the width of the prior of odd pixels
@@ -65,6 +67,7 @@ class PixelMap:
     low: float = 0.0
     high: float = math.inf
     likely: tuple[np.ndarray, np.ndarray] | None = None  # (grid,) logarithms, (groups, grid) posterior weights
+    prior: np.ndarray | None = None  # (grid,) the common law of pixels with few counts, in those weights
     certain: float = INFORMED  # raw_error below which a value is the estimate, whatever the others are
     width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
     of_scene: bool = False  # no light falls on some pixels, and nothing says how much of it they detect
@@ -279,6 +282,24 @@ def acts_on_light(sensor: Sensor, candidate: Candidate) -> bool:
     return Effect.registry.find(candidate.effect).on_light
 
 
+def _width_of_few(map_: PixelMap) -> blind_times.Width | None:
+    """The width of the pixels' law by the likelihood of all of them; None for many counts.
+
+    The estimate of a pixel with few counts is no normal number, so that its variance is not that of the noise and more.
+    Hot pixels are a uniform share of the law, the one of a few that is most likely.
+    """
+    if map_.likely is None or map_.prior is None or float(np.median(map_.raw_error)) < map_.certain:
+        return None
+    rest = np.flatnonzero(map_.informed)
+    if rest.size > _MOST_FOR_WIDTH:
+        rest = np.sort(np.random.Generator(np.random.SFC64(rest.size)).permutation(rest)[:_MOST_FOR_WIDTH])
+    grid, weights = map_.likely
+    known = map_.prior > 0
+    likely = weights[rest][:, known] / map_.prior[known]
+    widths = [blind_times.width_of(grid[known], likely, share) for share in _HOT] if rest.size > 3 else []
+    return max(widths, key=lambda width: width.log_likelihood, default=None)
+
+
 def map_values(map_: PixelMap) -> dict[str, Value]:
     """The results of a map by name, with 95 % intervals."""
     results = {name: Value(number, None, None) for name, number in summary(map_).items()}
@@ -287,8 +308,9 @@ def map_values(map_: PixelMap) -> dict[str, Value]:
     half = HALF_95 * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
     ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
     results["sigma"] = Value(sigma, ends[0], ends[1])
-    if map_.width is not None:
-        results["sigma"] = Value(map_.width.sigma, map_.width.low, map_.width.high)
+    width = map_.width or _width_of_few(map_)
+    if width is not None:
+        results["sigma"] = Value(width.sigma, width.low, width.high)
     for name in ("low_fraction", "high_fraction"):
         n, k = len(map_.raw), results[name].value * len(map_.raw)
         low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0

@@ -252,6 +252,10 @@ class Replicates:
             )
         return workers
 
+    def charge(self, sensor: Sensor, id: str, number: int) -> None:
+        """Spend the work of replicates that are remembered: an answer does not depend on what is in the cache."""
+        self.budget.spend(number * self._work(sensor, id))
+
     def _work(self, sensor: Sensor, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
         seen = self.seen[id]

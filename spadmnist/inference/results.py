@@ -375,7 +375,8 @@ def shown(v: Value) -> str:
 
 def _limit(entry: Mapping[str, Any]) -> str:
     unit = Effect.registry.find(entry["effect"]).parameters[entry["parameter"]].unit
-    return units.show(entry["upper_limit_95"], unit, 2) if unit else f"{entry['upper_limit_95']:.2g}"
+    limit = units.show(entry["upper_limit_95"], unit, 2) if unit else f"{entry['upper_limit_95']:.2g}"
+    return f"{limit} (at least)" if entry.get("at_least") else limit
 
 
 def sentence(found: Diagnosis) -> str:

@@ -20,7 +20,8 @@ from .. import twin
 from .candidates import templates
 from .evaluation import Evaluation, square
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM
-from .light_levels import totals_space
+from .light_levels import closed_form, totals_space
+from .models import InTheDark
 from .replicates import TOTALS, Replicates
 from .results import plain
 from .scan import Scan
@@ -29,6 +30,7 @@ from .trial import Trial
 
 TIE = 6.0  # in chi square: explanations nearer than that are a tie
 _VERIFIED = 3  # rivals that are simulated
+_FURTHEST = 7.0  # of a logarithm: the largest factor on an exposure
 _MOST = 300.0  # of a logarithm: beyond any light
 _MISSING = 20.0  # detections missing at the end of a capture that stopped early
 
@@ -147,12 +149,49 @@ def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[Set
                     if (id, name) in seen:
                         continue
                     seen.add((id, name))
-                    factor_of = {"value": value, "low": low, "high": high}
+                    factor_of: dict[str, float | None] = {"value": value, "low": low, "high": high}
+                    if name == "exposure":
+                        factor_of = _of_exposure(replicates, evaluation, id, float(log), float(error))
                     confused = len(likely) > 1 or len(names) > 1
                     out.append({"capture": id, "quantity": name, "factor": factor_of, "confused": confused})
         if number == 0 and one.cost < likely[-1].cost - TIE:
             break
     return out
+
+
+def _of_exposure(
+    replicates: Replicates, evaluation: Evaluation, id: str, log: float, error: float
+) -> dict[str, float | None]:
+    """The factor on an exposure or a frame time that gives as many detections as one on the level, with its interval.
+
+    Args:
+        log, error: of the factor on the level, with its standard error.
+    """
+    capture, sensor = replicates.seen[id].capture, evaluation.sensors.mean_sensor(id)
+    level = float(evaluation.rates[id].stated or evaluation.rates[id].level)
+    clock = capture.conditions
+
+    def detections(factor: float) -> float:
+        """By the closed forms, of a clock that is `factor` times as long."""
+        longer = replace(
+            clock,
+            exposure=clock.exposure * factor,
+            frame_time=clock.frame_time * factor,
+            frame_period=clock.frame_period * factor,
+        )
+        of = InTheDark.of(sensor) if capture.light.dark else sensor
+        return closed_form(of, replace(capture, conditions=longer))(level)
+
+    def factor_at(x: float) -> float:
+        wanted = evaluation.rates[id].expected(level * math.exp(min(x, _MOST)))
+        low, high = -_FURTHEST, _FURTHEST
+        for _ in range(50):
+            middle = (low + high) / 2
+            low, high = (middle, high) if detections(math.exp(middle)) < wanted else (low, middle)
+        return math.exp((low + high) / 2)
+
+    value, low, high = (plain(factor_at(log + k * error)) for k in (0.0, -1.96, 1.96))
+    return {"value": value, "low": low, "high": high}
 
 
 def _names(

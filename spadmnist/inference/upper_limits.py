@@ -54,7 +54,7 @@ def upper_limits(
         (name, n): shape
         for name, all_ in shapes.items()
         for n, shape in enumerate(all_.values())
-        if shape is max(all_.values(), key=lambda s: s[0]) or min(s[1] for s in all_.values()) > _SATURATED
+        if shape is max(all_.values(), key=_strength_at_limit) or min(s[1] for s in all_.values()) > _SATURATED
     }
     times_of = _at_limit(scan, evaluation, asked)
     excluded, hidden = [], []
@@ -65,11 +65,20 @@ def upper_limits(
             hidden.append(name)
         else:
             far = max((x for x in limits if x is not None), key=lambda x: abs(x - (coordinate.off or 0.0)))
-            excluded.append({"effect": name, "parameter": coordinate.parameter, "upper_limit_95": plain(far)})
+            entry = {"effect": name, "parameter": coordinate.parameter, "upper_limit_95": plain(far)}
+            # an effect that vanishes at the upper end of its range: the strength is at least that
+            excluded.append(entry | ({"at_least": True} if far < (coordinate.off or 0.0) else {}))
     looked = {one.candidate.effect for one in tried}  # an effect that could not be tried is reported where it failed
     every = scan.replicates.candidates(evaluation.sensors.one)
     others = {one.effect for one in every if one.kind == "add"} & looked - shapes.keys()
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
+
+
+def _strength_at_limit(shape: _Shape) -> float:
+    """The distance of the strength from where the effect vanishes, at the limit of one shape."""
+    times, _, one = shape
+    coordinate = one.candidate.strengths[0]
+    return times * abs(float(one.values[coordinate.key]) - (coordinate.off or 0.0))
 
 
 def _linear_limit(test: ScoreTest) -> float:

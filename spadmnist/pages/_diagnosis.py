@@ -231,7 +231,8 @@ def _quantity(value: float, unit: str, digits: int = 4) -> str:
 def _limit(entry: Mapping[str, Any]) -> tuple[str, str]:
     """(upper limit, what the parameter is)."""
     own = _described(entry["effect"])["parameters"].get(entry["parameter"], {})
-    return _quantity(entry["upper_limit_95"], own.get("unit", ""), 2), own.get("about", "")
+    limit = _quantity(entry["upper_limit_95"], own.get("unit", ""), 2)
+    return f"at least {limit}" if entry.get("at_least") else limit, own.get("about", "")
 
 
 # --- pictures -------------------------------------------------------------------------------------------------------
