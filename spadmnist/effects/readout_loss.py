@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, ClassVar
 
@@ -63,21 +62,20 @@ class ReadoutLoss(Effect, stage="readout"):
 
 
 _MOST_LOAD = 30.0  # arrivals in a time of service: beyond it the bus is never free
-_MOST_QUEUE = 4096  # a longer queue is full only where the load is above 1, or hardly below
+_MOST_QUEUE = 512  # a longer queue is full only where the load is above 1, or hardly below
 
 
-@functools.lru_cache(maxsize=4096)
 def _taken(load: float, queue: float) -> float:
     """The share of arrivals that the bus takes, at a load of so many arrivals in a time of service."""
     if load == 0:
         return 1.0
     if load > _MOST_LOAD or queue > _MOST_QUEUE:
         return min(1.0, 1 / load)
-    from scipy import special
-
     # of the chain at the departures: from how many are left behind, what crosses each level upwards crosses it back
     room = int(queue)
-    more = special.pdtrc(np.arange(room), load)  # P(more than k arrive during a service)
+    number = np.arange(1, room + 60 + int(load + 12 * math.sqrt(load)))
+    arriving = np.exp(number * math.log(load) - load - np.cumsum(np.log(number)))
+    more = np.cumsum(arriving[::-1])[::-1][:room]  # P(more than k arrive during a service), k from 0
     left = np.zeros(room)
     left[0] = 1.0
     for i in range(room - 1):

@@ -317,7 +317,8 @@ def _level_checks(
         level, error, elasticity = made.level_of(max(total, 0.5))
         if elasticity > LEAST_ELASTICITY:
             levels.append((capture, math.log(level / made.stated), error, elasticity))
-        return []
+            return []
+        lost = True
     mean = made.total_at(made.stated)
     light = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
     z = made.score(total, light if lost else 0.0)
@@ -327,7 +328,8 @@ def _level_checks(
     p = float(2 * stats.norm.sf(abs(z)))
     where = "all pixels, no light"
     if lost:
-        where = f"all pixels, {'too much light to count' if made.saturated else 'hardly any light'}"
+        full = made.saturated or total > mean
+        where = f"all pixels, {'too much light to count' if full else 'hardly any light'}"
     return [Check("rate", capture.id, z * z, p, where, size, relative)]
 
 

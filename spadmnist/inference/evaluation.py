@@ -39,6 +39,8 @@ _MOVED = 1.0  # sum of squares of a signature in one statistic, in variances, ab
 _WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts
 _OTHER_SCATTER = 3.0  # standard errors of that log: a cell beyond has another scatter; 3 of 1000 do so by chance
 _NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
+# replicates at the stated rates where pixels blink; standard deviations of their totals within which a total is one
+_BLINKING, _SCATTERS = 16, 4.0
 _PILOTS = 5  # rounds of a few replicates in which the level is found that gives the measured total, at most
 _FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
 
@@ -185,7 +187,8 @@ def _evaluate(
             replicate_cache.keep(entries[id], made)
         evaluation.made[id] = made
         law, scatter = law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
-        evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter)
+        most = most_detections(replicates.seen[id].capture, sensors.one.layout.pixels)
+        evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter, most)
         evaluation.factors[id] = factors
         for name, summary in replicates.seen[id].summaries.items():
             if name not in made.values:
@@ -225,6 +228,19 @@ def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
     some = [id for id in out if not all(effect.states_mean for effect in sensors.mean_sensor(id).effects)]
     numbers = np.arange(FEW, dtype=np.uint64)
     closed = dict(out)
+    # where pixels blink by themselves a total may be far from its mean, at the stated rates
+    own = [
+        id for id in out if any(e.acts_on == "own" for e in sensors.mean_sensor(id).effects) and out[id][1] is not None
+    ]
+    many = np.arange(_BLINKING, dtype=np.uint64)
+    asked = [(sensors, id, np.full(_BLINKING, out[id][1]), many) for id in own if out[id][0] != out[id][1]]
+    for (_, id, _, _), made in zip(asked, replicates.simulate(asked) if asked else [], strict=True):
+        if not isinstance(made, str):
+            logs = np.log(np.maximum(made.totals, 0.5))
+            reach = _SCATTERS * float(np.std(logs, ddof=1)) * math.sqrt(1 + 1 / _BLINKING)
+            if abs(math.log(max(replicates.seen[id].total, 0.5)) - float(logs.mean())) < reach:
+                _, stated, expected, half = out[id]
+                out[id] = closed[id] = float(stated or 1.0), stated, expected, half
     # a loss that grows with the light is that of the stated light, if this gives as many
     at = {id: out[id][0] if out[id][1] is None else float(out[id][1] or 0.0) for id in some}
     for _ in range(_PILOTS):

@@ -6,6 +6,7 @@ uncertainty.
 
 from __future__ import annotations
 
+import decimal
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special, stats
+from scipy import optimize, special, stats
 
 from .. import twin
 from ..effects import Conditions
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 SPREAD = 3.0  # standard deviations of the stated level: half the range over which the light of the replicates varies
 LEAST_SPREAD = 0.01  # of a logarithm: the least half range of the light of the replicates
+_WIDE = 0.15  # of a logarithm: half the widest range of the light of the replicates, that of an uncertainty of 5 %
 _NOISE = 4.0  # standard deviations of the counts: within it a total is the expected one
 # of a logarithm: the noise of the counts beyond which it extends the range of the replicates; the most that it counts
 _MUCH, _MOST_NOISE = 0.05, 0.7
@@ -40,7 +42,9 @@ _MOST_LIGHT, _MOST_DARK = 1.5, 9.0
 # expected detections: the least that inform the level; below the other, none are expected
 _LEAST_TOTAL, _NEVER = 5.0, 0.5
 _SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
-_FAR_ABOVE = 4.0  # times the replicates' totals: beyond it, their scatter is not that of the expected one
+_FEW_COUNTS = 30.0  # expected detections of a lit capture: the logarithm of fewer is not normal
+# levels among which the largest total is looked for; relative: a fall that is none
+_COARSE, _FLAT = 37, 1e-6
 _FAINT = 1e-6  # of the stated light: as good as none
 
 
@@ -56,6 +60,7 @@ class CaptureNull:
         expected: level -> detections of the array, by the closed forms.
         law: (offset, slope) of the log of the total as a function of the log of `expected`.
         scatter: standard deviation of the log of the total about that law.
+        most: detections that the capture can hold; inf where there is no end to them.
     """
 
     level: float
@@ -64,6 +69,7 @@ class CaptureNull:
     expected: Callable[[float], float]
     law: tuple[float, float]
     scatter: float
+    most: float = math.inf
 
     def total_at(self, level: float) -> float:
         """Expected detections of the whole array at a level."""
@@ -71,13 +77,18 @@ class CaptureNull:
 
     def level_of(self, total: float) -> tuple[float, float, float]:
         """(level that gives this total, standard error of its log, elasticity of the total there)."""
-        low, high = self.level * 1e-6, self.level * 1e6
+        low, high = self.level * 1e-6, self._highest
         for _ in range(200):
             middle = math.sqrt(low * high)
             low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
         found = math.sqrt(low * high)
         elasticity = self.elasticity_at(found)
         return found, self._scatter / max(elasticity, 1e-3), elasticity
+
+    @functools.cached_property
+    def _highest(self) -> float:
+        """The highest level that is looked at: the total may fall beyond a maximum, with a paralyzable dead time."""
+        return rising_until(self.expected, self.level * 1e-6, self.level * 1e6)
 
     def elasticity_at(self, level: float) -> float:
         """Elasticity of the total: d log(total) / d log(level)."""
@@ -94,15 +105,18 @@ class CaptureNull:
         return self.stated is not None and self.elasticity_at(self.stated) < LEAST_ELASTICITY
 
     def says_nothing(self, total: float) -> bool:
-        """Whether a total hardly depends on the light: at the stated level, or because it is so small.
+        """Whether a total hardly depends on the light: at the stated level, so large or so small as it is, or so few.
 
-        The level that gives such a total is meaningless; `score` applies.
+        The level that gives such a total is meaningless, or far from normal; `score` applies.
         """
-        if self.saturated:
-            return True
-        if self.stated is None or total >= self.total_at(self.stated):
+        if self.stated is None:
             return False
+        stated = self.total_at(self.stated)
+        if self.saturated or stated < _FEW_COUNTS:
+            return True
         _, _, elasticity = self.level_of(max(total, 0.5))
+        if total >= stated:
+            return elasticity <= LEAST_ELASTICITY
         return elasticity < _DROWNED * self.elasticity_at(self.stated)
 
     def score(self, total: float, uncertainty: float = 0.0, mean: float | None = None) -> float:
@@ -116,7 +130,11 @@ class CaptureNull:
         assert self.stated is not None
         mean = self.total_at(self.stated) if mean is None else mean
         level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
-        if self.saturated:  # what is full scatters less than counts do, and by a count at least
+        if mean > self.most / 2:  # of what can be full, by what is not full
+            free, wanted = max(self.most - total, 0.0), max(self.most - mean, 1e-3)
+            wider = math.hypot(1.0, level * mean / math.sqrt(max(wanted, 1.0)))
+            return -float(poisson_scores(np.array([free]), np.array([wanted]))[0]) / wider
+        if self.saturated:  # a full bus scatters less than counts do, and by a count at least
             return (total - mean) / max(math.hypot(self._scatter, level) * mean, 1.0)
         wider = math.hypot(self.dispersion_at(mean, self._scatter), level * math.sqrt(max(mean, 1.0)))
         return float(poisson_scores(np.array([total]), np.array([max(mean, 1e-3)]))[0]) / max(wider, 1.0)
@@ -124,11 +142,11 @@ class CaptureNull:
     def dispersion_at(self, mean: float, scatter: float) -> float:
         """The factor on the scatter of independent events that totals of this mean have; at least 1.
 
-        Far above the replicates' totals, their scatter is mostly that of few counts. What two such variances do not
-        account for is that of the rate, which stays in proportion.
+        The replicates may be at another level than the stated one: their scatter is then that of other counts. What two
+        such variances do not account for is that of the rate, which stays in proportion.
         """
         here = max(float(self.totals.mean()), 0.5)
-        if mean < _FAR_ABOVE * here:
+        if self.level == self.stated or here > mean:
             return max(1.0, scatter * math.sqrt(max(mean, 1.0)))
         return math.sqrt(max(1.0, scatter**2 * here) + max(scatter**2 - 2 / here, 0.0) * mean)
 
@@ -166,6 +184,8 @@ def levels_about(
     """
     centre = level_for(expected, total, stated)
     half = max(LEAST_SPREAD, SPREAD * math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty))
+    if half > _WIDE * (1 + 1e-9) and total > 0:  # over a wider range no regression on the total holds
+        return centre, _WIDE
     if stated is not None:
         wanted = expected(stated)
         noise = min(_NOISE / math.sqrt(max(wanted, 1.0)), _MOST_NOISE)
@@ -209,7 +229,9 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
     digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
     rounding = _last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
-    scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2)
+    # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one
+    caused = 0.0 if capture.counts_events else sum(sensor.caused().values())
+    scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2 + caused**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
     totals = mean * np.exp(scatter * normal[order])
@@ -218,8 +240,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
 
 def _last_digit(value: float) -> float:
     """The last decimal place of a number as written: 0.1 of 2.6, 1 of 470."""
-    text = f"{value:.10g}"
-    return 10.0 ** -len(text.partition(".")[2]) if "." in text else 1.0
+    return 10.0 ** int(decimal.Decimal(f"{value:.10g}").as_tuple().exponent)
 
 
 def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
@@ -281,12 +302,27 @@ def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.n
 
 def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
     """The level at which this total is expected; the stated one where there is none."""
-    low, high = 1e-6, 1e12
+    low, high = 1e-6, rising_until(expected, 1e-6, 1e12)
     for _ in range(100):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if expected(middle) < total else (low, middle)
     found = math.sqrt(low * high)
     return found if 1e-5 < found < 1e11 else stated or 1.0
+
+
+def rising_until(expected: Callable[[float], float], low: float, high: float) -> float:
+    """The level up to which the expected detections rise: `high`, or where they are largest below it."""
+    levels = np.geomspace(low, high, _COARSE)
+    values = [expected(float(level)) for level in levels]
+    top = int(np.argmax(values))
+    if values[-1] >= values[top] * (1 - _FLAT):
+        return high
+    found = optimize.minimize_scalar(
+        lambda x: -expected(math.exp(x)),
+        bounds=(math.log(levels[max(top - 1, 0)]), math.log(levels[top + 1])),
+        method="bounded",
+    )
+    return math.exp(float(found.x))
 
 
 @dataclass(frozen=True)

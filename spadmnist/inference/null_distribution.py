@@ -21,6 +21,7 @@ from .laws import Law, law_of
 if TYPE_CHECKING:
     from .replicates import CaptureReplicates
 
+_BEYOND = 1.0  # of the range of the replicates' totals: how far beyond it they inform expectations
 _LEAST = 1e-300  # in place of a variance of 0
 
 
@@ -58,6 +59,7 @@ class Null:
         factor: the factor by which standardized residuals are too large, from the replicates.
         tail: the same for the largest residuals.
         own: (replicates,) mean squared residual of each replicate.
+        reach: (least, most) total relative to `middle`, less 1, to which the regression is extrapolated.
     """
 
     law: Law
@@ -69,6 +71,7 @@ class Null:
     factor: float
     tail: float
     own: np.ndarray
+    reach: tuple[float, float] = (-math.inf, math.inf)
 
     def expected(self, total: float) -> tuple[np.ndarray, float]:
         """((cells,) expectation for a capture with this total of detections, its variance relative to the scatter)."""
@@ -77,7 +80,8 @@ class Null:
 
     def expected_all(self, totals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `expected`, for several totals (captures,): ((captures, cells), (captures,))."""
-        terms = _terms(totals / self.middle - 1.0, len(self.coefficients))
+        # far from the totals of the replicates the regression says nothing
+        terms = _terms(np.clip(totals / self.middle - 1.0, *self.reach), len(self.coefficients))
         expected = np.maximum(terms @ self.coefficients, self.law.least(self.recordings))
         return expected, np.einsum("ij,jk,ik->i", terms, self.inverse, terms)
 
@@ -167,7 +171,9 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     z = law.of_their_own(values, fitted, spread, hat[:, None], len(coefficients))
     factor = law.factor(z)
     z = z / factor
-    return Null(law, middle, coefficients, inverse, spread, n, factor, _tail(z), np.mean(z**2, axis=1))
+    low, high = float(x.min()), float(x.max())
+    reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
+    return Null(law, middle, coefficients, inverse, spread, n, factor, _tail(z), np.mean(z**2, axis=1), reach)
 
 
 def _terms(x: np.ndarray, terms: int) -> np.ndarray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import plugins
+from ..errors import SpadError
 from ..recording import Capture, Recording
 from ..statistics import Statistic, Summary
 from .blind_times import ShortestIntervals
@@ -84,4 +85,12 @@ def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
         SpadError: where a user's own statistic fails; it names the file and line.
     """
     with plugins.blaming(type(statistic)):
-        return statistic.reduce(recording)
+        found = statistic.reduce(recording)
+    if found is not None and not plugins.is_built_in(type(statistic)) and not np.isfinite(found.values).all():
+        cell = int(np.argmin(np.isfinite(found.values)))
+        where = f"cell {cell} of {recording.capture.id}"
+        raise SpadError(
+            f"{plugins.source_file(type(statistic))}: the statistic {statistic.name} has the value "
+            f"{found.values[cell]} in {where}; values are finite numbers, and None says that there are none"
+        )
+    return found
