@@ -317,7 +317,8 @@ def crosstalk_set(lab: Lab, x: float) -> Hidden:
     lab.effects["crosstalk"] = sheet
     near = {(dx, dy): 1.0 if dx * dy == 0 else 0.16 for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy}
     lab.world.crosstalk = {place: real * ratio for place, ratio in near.items()}
-    lab.world.crosstalk_delay = CROSSTALK_DELAY
+    # the law of the delay is the stated one, too: the number alone is wrong
+    lab.world.crosstalk_delay, lab.world.crosstalk_order = CROSSTALK_DELAY, 1
     ratios = np.array(list(near.values()))
     if lab.family == "tr":
         hazard = np.exp(-LAGS / CROSSTALK_DELAY) / CROSSTALK_DELAY

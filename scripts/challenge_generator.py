@@ -75,7 +75,8 @@ class World:
     stray_rate: float = 0.0  # detections of stray light while the shutter is open
     traps: list[Traps] = field(default_factory=list)
     crosstalk: dict[tuple[int, int], float] = field(default_factory=dict)  # (dx, dy): chance
-    crosstalk_delay: float = 300e-12  # mean; the delay is the sum of two exponentials
+    crosstalk_delay: float = 300e-12  # mean
+    crosstalk_order: int = 2  # of the Erlang law of the delay: the sum of so many exponentials, 1 or 2
     dead_time: Any = 0.0
     dead_time_order: int = 0  # k: every blind time is drawn anew from an Erlang law of this order; 0: it is fixed
     paralyzable: bool = False
@@ -279,7 +280,10 @@ def expose(world: World, capture: Capture, rng: np.random.Generator) -> tuple[li
             y, x = divmod(pixel, world.columns)
             for (dx, dy), chance in table:
                 if uniform() < chance and 0 <= x + dx < world.columns and 0 <= y + dy < world.rows:
-                    late = 0.5 * world.crosstalk_delay * (exponential() + exponential())
+                    if world.crosstalk_order == 1:
+                        late = world.crosstalk_delay * exponential()
+                    else:
+                        late = 0.5 * world.crosstalk_delay * (exponential() + exponential())
                     push(heap, (t + late, CARRIER, pixel + dy * world.columns + dx))
         if world.echo and uniform() < world.echo:
             late = world.echo_delay + 1e-9 * (uniform() - 0.5)

@@ -234,6 +234,21 @@ def test_every_case_can_be_built_and_meets_its_tier() -> None:
         assert abs(lab.scale - 1) <= 2.5 * 0.015 or case.kind == "setup"
 
 
+def test_crosstalk_of_another_strength_has_the_delay_that_the_data_sheet_states() -> None:
+    """Otherwise two things are hidden. The law of an effect that the data sheet lacks is another one."""
+    lab = hidden.Lab("tr", 5)
+    hidden.crosstalk_set(lab, 0.02)
+    dark = next(c for c in lab.real if c.dark)
+    times, places = (np.array(x) for x in generator.expose(lab.world, dark, np.random.default_rng(3)))
+    order = np.argsort(times, kind="stable")
+    gaps, apart = np.diff(times[order]), np.diff(places[order]) != 0
+    found = gaps[apart & (gaps < 6e-9)]
+    assert len(found) > 2000  # of which one in a thousand is by chance
+    cut = -np.expm1(-6e-9 / hidden.CROSSTALK_DELAY)
+    laws.distribution_is(found, lambda x: -np.expm1(-x / hidden.CROSSTALK_DELAY) / cut)
+    assert generator.World.crosstalk_order == 2
+
+
 def test_the_oracle_significance_of_a_sine_is_what_a_sine_shows() -> None:
     """A matched filter that knows phase and frequency, on generated data, has the stated Z within its scatter of 1."""
     lab = hidden.Lab("tr", 5)
