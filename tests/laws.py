@@ -103,14 +103,19 @@ def histogram_is(
         top *= 2
     if not np.all(probability >= 0) or not probability.sum() < 1 + 1e-9:
         raise ValueError(f"{what}: these are no probabilities; their sum is {probability.sum():.6g}")
-    probability[-1] += max(0.0, 1 - probability.sum())
     observed = np.bincount(x, minlength=probability.size).astype(float)
+    never = np.flatnonzero((observed > 0) & (probability[: observed.size] == 0))
+    if never.size:
+        return _judge(0.0, alpha, what, f"{observed[never[0]]:.0f} times {never[0]}", "none, by the law")
+    probability[-1] += max(0.0, 1 - probability.sum())
     expected = probability * x.size
     bins = _merge(expected)
     observed, expected = _fold(observed, bins), _fold(expected, bins)
     freedom = expected.size - 1
-    if freedom == 0:
+    if freedom == 0 and np.count_nonzero(probability) > 1:
         raise ValueError(f"{what}: the law has all values in one bin, so that nothing is tested")
+    if freedom == 0:  # one value alone, which all have
+        return _judge(1.0, alpha, what, "one value", "one value")
     deviance = 2 * float(_xlogy(observed, observed / expected).sum())
     williams = 1 + (float((x.size / expected).sum()) - 1) / (6 * x.size * freedom)
     p = float(stats.chi2.sf(deviance / williams, freedom))

@@ -16,7 +16,7 @@ from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, square
 from spadmnist.inference.evidence import evaluation_of, optimism
 from spadmnist.inference.gauss_newton import Fit
-from spadmnist.inference.joint_fit import _of_pixels
+from spadmnist.inference.joint_fit import variances_by_pixels
 from spadmnist.inference.map_trials import patterns_first
 from spadmnist.inference.mixed_model import PatternEvidence
 from spadmnist.inference.model_path import ModelPath, accept, begin
@@ -250,15 +250,15 @@ def test_a_gradient_beside_pixels_that_differ_is_known_no_better_than_they_allow
     pixels = np.arange(64)
     assert map_.carrier is not None
     maps: Any = {map_.carrier: SimpleNamespace(sigma=0.02)}
-    assert not _of_pixels(path, step, maps).any()  # no map is held
+    assert not variances_by_pixels(path, step, maps).any()  # no map is held
     path.scan.accepted = [gradient, map_]
     u = (pixels % 8 - 3.5) / 7
     span = path.replicates.start.layout.centred[:, 0]
     assert np.ptp(span) == pytest.approx(np.ptp(u), rel=0.2)
-    found = np.sqrt(_of_pixels(path, step, maps))
+    found = np.sqrt(variances_by_pixels(path, step, maps))
     assert found == pytest.approx(np.full(2, 0.02 / math.sqrt(float(span @ span))), rel=0.1)
     other = Step(change_of(path.replicates, "add crosstalk"), {}, 1.0, 9.0, "", coordinates=coordinates)
-    assert not _of_pixels(path, other, maps).any()
+    assert not variances_by_pixels(path, other, maps).any()
 
 
 def test_what_is_fitted_is_looked_at_everywhere(lab, monkeypatch) -> None:

@@ -82,9 +82,11 @@ def _taken(load: float, queue: float) -> float:
         left[i + 1] = (left[0] * more[i] + left[1 : i + 1] @ more[i:0:-1]) * math.exp(load)
         if left[i + 1] > _LARGE:
             left /= _LARGE
-    return 1 / (float(left[0] / left.sum()) + load)
+    share = 1 / (float(left[0] / left.sum()) + load)
+    return share if share < 1 - _NO_LOSS else 1.0
 
 
+_NO_LOSS = 1e-12  # a smaller share is that of rounding
 _LARGE = 1e200  # no number becomes larger
 _CROWD = 64  # events in a bucket from which on it is sorted by merging
 
