@@ -194,7 +194,7 @@ def test_what_only_looks_alike_is_taken_out(lab, monkeypatch):
     assert path.failed
     drop_unexplaining(path, start, True)
     assert names(path) == ["add crosstalk"] and set(path.values) == {CROSSTALK}
-    # partly explained: what was dropped is named beside the rest
+    # what remains unexplained lists the dropped step as the nearest candidate
     monkeypatch.setattr(conclusion, "remainder", lambda *_: [{"statistic": "intervals"}])
     (rest,) = conclusion.unexplained_by(path)
     assert [(e["effect"], e["nearest"]) for e in rest["alternatives"]] == [("afterpulsing", True)]

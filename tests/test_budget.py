@@ -12,9 +12,11 @@ import pytest
 import tinylab
 
 from spadmnist import twin
+from spadmnist.cli import comparing
 from spadmnist.effects import Conditions, Effect
 from spadmnist.errors import InputError
 from spadmnist.events import Layout
+from spadmnist.inference import model_selection
 from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of, work_of
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
@@ -211,3 +213,8 @@ def test_what_a_journal_holds_is_of_this_model_capture_light_and_seed(lab):
         Journal.name([sensor], seen, photons, numbers, 1),
     ]
     assert len(set(names)) == len(names) and names[0] == Journal.name([sensor], seen, photons, numbers, 0)
+
+
+def test_the_command_line_and_the_library_take_as_many_steps():
+    """The command line holds the number itself, because the module of the search takes long to import."""
+    assert comparing.MAX_STEPS == model_selection.MAX_STEPS

@@ -234,7 +234,7 @@ def test_what_no_light_gives_is_not_excused_by_an_extrapolation() -> None:
 
 @pytest.mark.parametrize("seen", [3, 8])
 def test_few_detections_are_judged_by_their_own_law(seen: int) -> None:
-    """Of 28 expected ones beside brighter captures; P(8 | 28) is 1e-5."""
+    """A dim capture has 3 or 8 detections of 28 expected: P(8 or fewer) is 1e-5. Four captures are brighter."""
     model = sensor(dark=0.0)
     captures = [lit("dim", "tr", 1.75e5, exposure=1e-5), *(lit(f"f{k}", "tr", 4e4, exposure=1e-3) for k in range(4))]
     lab = sp.simulate(model, captures, seed=6)

@@ -251,13 +251,12 @@ def _check_answer(file: Path | None) -> None:
         raise InputError(f"--json {file}: is a folder; name a file, for example {file / 'answer.json'}")
     if not file.is_file() or file.is_symlink():
         raise InputError(f"--json {file}: is a link, a pipe or a device, and is left alone; name a file")
-    else:
-        with open(file, "rb") as there:
-            head = there.read(_HEAD)
-        if head and b'"format": "spadmnist-' not in head:
-            raise InputError(
-                f"--json {file}: exists, and is no answer of this program; it is left alone: name another file"
-            )
+    with open(file, "rb") as there:
+        head = there.read(_HEAD)
+    if head and b'"format": "spadmnist-' not in head:
+        raise InputError(
+            f"--json {file}: exists, and is no answer of this program; it is left alone: name another file"
+        )
 
 
 def _write_answer(file: Path | None, text: str) -> None:

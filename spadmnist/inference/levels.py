@@ -1,8 +1,7 @@
 """Levels of decisions: what each decides, its unit, and its price in false alarms.
 
 In this package a constant that names no source and no measurement is a rule of thumb. Right models, open cases and
-sealed ones (`scripts/frozen.py`, `scripts/challenge.py`) say whether all of them together are right; none was fitted by
-itself.
+sealed ones (`scripts/frozen.py`, `scripts/challenge.py`) say whether all of them together are right.
 """
 
 from __future__ import annotations

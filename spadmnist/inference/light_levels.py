@@ -105,7 +105,7 @@ class CaptureNull:
         return self.stated is not None and self.elasticity_at(self.stated) < LEAST_ELASTICITY
 
     def says_nothing(self, total: float) -> bool:
-        """Whether a total hardly depends on the light: at the stated level, so large or so small as it is, or so few.
+        """Whether a total does not inform the light level: too many detections, too few, or a saturated model.
 
         The level that gives such a total is meaningless, or far from normal; `score` applies.
         """
@@ -198,7 +198,14 @@ def levels_about(
 
 
 def as_expected(capture: Capture, total: float, wanted: float, most: float) -> bool:
-    """Whether a total is within the noise of the expected one, detections; of what can be full, of what is not full."""
+    """Whether a total lies within the noise of the expected one.
+
+    In binary frames the noise is that of the rarer ones, with a detection or without.
+
+    Args:
+        total, wanted: detections, measured and expected.
+        most: detections that the capture can hold.
+    """
     free = most - wanted if math.isfinite(most) and not capture.counts_events else wanted
     return abs(total - wanted) < _NOISE * math.sqrt(max(min(free, wanted), 0.0) + 1.0)
 
