@@ -248,6 +248,8 @@ def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
         comparing._check_answer(data)
     with pytest.raises(InputError, match="is a folder"):
         comparing._check_answer(tmp_path)
+    with pytest.raises(InputError, match="is the place of -o, too"):
+        comparing._check_answer(tmp_path / "new", tmp_path / "." / "new")
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(answer)
     answer.write_text('{"format": "spadmnist-fit/1"}')
