@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import SpadError
-from .evaluation import Evaluation, log_likelihood_ratio, mean_misfit, square
-from .gauss_newton import Fit, gauss_newton
+from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
+from .gauss_newton import Fit, column_of, gauss_newton
 from .joint_fit import fit_all, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of
@@ -22,6 +22,7 @@ from .trial_fits import fit_trial
 _MOSTLY = 0.95  # of the excess misfit: a step that explains as much is kept, whatever is left in its own cells
 _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
 _VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
+_CLEARLY = 1e-6  # p-value of a check that fails clearly: noise of a fit to first order does not make it
 _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
 
 
@@ -76,7 +77,11 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
     path.scan.accepted = [c for c in path.scan.accepted if c is not step.candidate]
     kept = set().union(*(keys_of(s.candidate, path) for s in path.steps))
     path.values = {k: x for k, x in path.values.items() if k in kept}
-    fit_all(path)
+    evaluation = without_fit(path)
+    if step.candidate.carrier and _fail_clearly(path, evaluation) > failed:
+        path.back_to(before)
+        return
+    fit_all(path, known=evaluation)
     missed = len(path.failed) > failed
     if (step.fluctuates or step.chips) and not missed:
         template = {cell: step.template.get(cell, np.zeros_like(z)) for cell, z in before[0].residuals.items()}
@@ -86,6 +91,23 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
     else:
         _fit_from_templates(path)
         path.rung(f"- {title(step.candidate)}")
+
+
+def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
+    """The number of checks that fail clearly, wherever the coordinates of the fit are, to first order.
+
+    Args:
+        evaluation: of the model without a step that has no coordinates of its own.
+    """
+    residuals = evaluation.residuals
+    if path.fit is not None:
+        fit, keys = path.fit, list(residuals)
+        slope = np.stack([stacked(column_of(fit, i, evaluation), keys) for i in range(len(fit.coordinates))], axis=1)
+        z = stacked(residuals, keys)
+        left = z - slope @ (np.linalg.pinv(slope, rcond=1e-6) @ z)
+        ends = np.cumsum([len(residuals[k]) for k in keys])[:-1]
+        residuals = dict(zip(keys, np.split(left, ends), strict=True))
+    return sum(block.p < _CLEARLY for block in failing(block_checks(path.replicates, evaluation, residuals)))
 
 
 def _fit_from_templates(path: ModelPath) -> None:

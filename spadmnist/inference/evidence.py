@@ -13,16 +13,18 @@ from collections.abc import Callable, Sequence
 
 from ..statistics import Statistic
 from . import held_out
-from .evaluation import Evaluation, evaluate, log_likelihood_ratio
+from .evaluation import Evaluation, evaluate, log_likelihood_ratio, stacked
 from .levels import OPTIMISM_OF_A_PARAMETER, PROMISING
 from .replicates import TOTALS, Replicates
 from .score_test import sigmas_of
-from .signature import Signature, template_of
-from .trial import Trial
+from .signature import Signature, residuals_at, template_of
+from .trial import Trial, is_pattern
 
 # the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
 # fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
 _FITTED, _NEAR = 3, 0.4
+# of the score of a trial: if as much remains beside another one, they do not compete. A guess
+_UNMOVED = 0.9
 _MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
 
 
@@ -92,6 +94,38 @@ def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
     chips = any(t.chips for t in out)
     more = [t for t in second if (chips and is_map_of_pixels(t)) or (faint and maps and t.chips and t.fall > PROMISING)]
     return (out + [t for t in more if all(t is not one for one in out)]) or list(second[:1])
+
+
+def contests(replicates: Replicates, evaluation: Evaluation, trials: Sequence[Trial]) -> list[list[Trial]]:
+    """The trials in groups, in their order: in the first one those that compete with the first trial, and so on.
+
+    Two trials compete if one of them explains a part of what the other one explains. Maps and patterns compete with
+    each other, and random odd pixels with everything, because the squares do not say what they explain. A trial that
+    does not compete with a step needs no fit beside it: a later step finds it.
+    """
+    groups: list[list[Trial]] = []
+    for one in trials:
+        own = next((g for g in groups if any(_compete(replicates, evaluation, one, other) for other in g)), None)
+        if own is None:
+            groups.append([one])
+        else:
+            own.append(one)
+    return groups
+
+
+def _compete(replicates: Replicates, evaluation: Evaluation, one: Trial, other: Trial) -> bool:
+    if one.chips or other.chips or (_over_the_array(one) and _over_the_array(other)):
+        return True
+    keys = list(evaluation.residuals)
+    z = stacked(evaluation.residuals, keys)
+    templates = [stacked(template_of(replicates, evaluation, t.signature.at(t.times)), keys) for t in (one, other)]
+    left = [stacked(residuals_at(replicates, evaluation, t.signature, t.times), keys) for t in (one, other)]
+    scores = [(float(z @ t), float(rest @ t)) for t, rest in zip(templates, reversed(left), strict=True)]
+    return any(after * before <= _UNMOVED * before**2 for before, after in scores)
+
+
+def _over_the_array(one: Trial) -> bool:
+    return one.maps is not None or is_pattern(one)
 
 
 def best_of(

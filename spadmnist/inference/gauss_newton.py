@@ -242,9 +242,7 @@ def gauss_newton_step(
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
     jacobian: np.ndarray | str
     if before is not None and before.coordinates == coordinates:
-        jacobian = np.stack(
-            [_stacked_column(evaluation, _column(before, i), keys) for i in range(len(coordinates))], axis=1
-        )
+        jacobian = np.stack([stacked(column_of(before, i, evaluation), keys) for i in range(len(coordinates))], axis=1)
     else:
         jacobian = _jacobian(replicates, evaluation, coordinates, u, values, sensors_of, few, errors or {}, known or {})
     if isinstance(jacobian, str):
@@ -289,7 +287,7 @@ def _jacobian(
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
     near = np.array([errors.get(d.key, math.inf) for d in coordinates])
     h = np.minimum(h, np.maximum(8 * near, _CLOSE))
-    columns = {i: _stacked_column(evaluation, known[d.key], keys) for i, d in enumerate(coordinates) if d.key in known}
+    columns = {i: stacked(_column(known[d.key], evaluation), keys) for i, d in enumerate(coordinates) if d.key in known}
     for i, slope in columns.items():  # so far that the shift is visible
         h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_KNOWN_ASIDE) * (h[i] / _ASIDE)
     points = _points_aside(coordinates, u, h)
@@ -311,18 +309,17 @@ def _jacobian(
     return jacobian
 
 
-def _column(fit: Fit, i: int) -> dict[Cell, np.ndarray]:
-    return {cell: jacobian[:, i] for cell, jacobian in fit.jacobian.items()}
+def column_of(fit: Fit, i: int, evaluation: Evaluation) -> dict[Cell, np.ndarray]:
+    """A column of a fit's Jacobian, (cells,) by block; 0 in blocks that have other cells under this evaluation."""
+    return _column({cell: jacobian[:, i] for cell, jacobian in fit.jacobian.items()}, evaluation)
 
 
-def _stacked_column(evaluation: Evaluation, slope: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarray:
-    """A column of another evaluation's Jacobian, (cells,); 0 in blocks that have other cells here."""
-    parts = []
-    for key in keys:
+def _column(slope: Mapping[Cell, np.ndarray], evaluation: Evaluation) -> dict[Cell, np.ndarray]:
+    out = {}
+    for key, residuals in evaluation.residuals.items():
         own = slope.get(key)
-        size = len(evaluation.residuals[key])
-        parts.append(own if own is not None and len(own) == size else np.zeros(size))
-    return np.concatenate(parts)
+        out[key] = own if own is not None and len(own) == len(residuals) else np.zeros(len(residuals))
+    return out
 
 
 def profile_intervals(

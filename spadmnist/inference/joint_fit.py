@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from ..effects import Effect
 from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
-from .gauss_newton import Fit, gauss_newton_step
+from .gauss_newton import Fit, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
 from .replicates import FEW, TOTALS, Cell
@@ -31,26 +31,58 @@ _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
 _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
+_KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
 _LOST = 30.0  # in chi square: a rise beyond which a fitted step is not taken
 
 
-def fit_all(path: ModelPath, fit: Fit | None = None, known: Evaluation | None = None) -> None:
+def fit_all(
+    path: ModelPath, fit: Fit | None = None, known: Evaluation | None = None, columns: Sequence[Fit] = ()
+) -> None:
     """Fit the model with all its steps: the maps, then all coordinates together.
 
     Args:
         fit: of the coordinates of the last step.
         known: an evaluation of the model with it.
+        columns: fits near by that hold a column of the Jacobian for every coordinate together; the Jacobian is made
+            of these while the squares fall as it says, and `path.approximate` is set. It is simulated without them.
     """
     sensors, maps = model_of(path)
     evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
     coordinates = path.free
     found: Fit | None = None
+    path.approximate = False
     if coordinates:
-        found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit))
+        near = _side_by_side(evaluation, coordinates, columns)
+        found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit), near)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.evaluation = evaluation
     path.fit = found = None if found is None else _bounded(path, found)
     _write_values(path, found, maps)
+
+
+def complete_fit(path: ModelPath) -> None:
+    """Fit all coordinates together by a Jacobian at the model with all steps, where the last one was approximate."""
+    if path.approximate:
+        path.replicates.say("fitting all numbers together")
+        known = None if any(candidate.carrier for candidate in path.scan.accepted) else path.evaluation
+        path.values = dict(path.values if known is None else known.values)
+        fit_all(path, known=known)
+
+
+def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], fits: Sequence[Fit]) -> Fit | None:
+    """A fit with the columns of several fits as its Jacobian; None where one of the coordinates is in none of them.
+
+    Of its estimate and its covariance nothing is used.
+    """
+    columns = []
+    for coordinate in coordinates:
+        fit = next((fit for fit in fits if coordinate in fit.coordinates), None)
+        if fit is None:
+            return None
+        columns.append(column_of(fit, fit.coordinates.index(coordinate), evaluation))
+    jacobian = {cell: np.stack([column[cell] for column in columns], axis=1) for cell in evaluation.residuals}
+    n = len(coordinates)
+    return Fit(coordinates, np.zeros(n), np.full((n, n), np.inf), {}, jacobian, math.inf, {})
 
 
 def _gauss_newton(
@@ -59,14 +91,18 @@ def _gauss_newton(
     maps: dict[Key, pixel_maps.PixelMap],
     coordinates: tuple[Coordinate, ...],
     errors: Mapping[Key, float],
+    near: Fit | None = None,
 ) -> tuple[Fit | None, Evaluation, dict[Key, pixel_maps.PixelMap]]:
     """(fit of all coordinates, evaluation of the model, its maps), from values near the best ones.
 
     The fit is None where the model cannot be simulated around them.
+
+    Args:
+        near: a fit whose Jacobian is taken at first.
     """
     replicates, known = path.replicates, _known_jacobian(path)
     fit: Fit | None = None
-    near: Fit | None = None
+    path.approximate = near is not None
     for turn in range(_AGAIN + 1):
         here = {d.key: path.values[d.key] for d in coordinates}
         closer = gauss_newton_step(
@@ -95,9 +131,18 @@ def _gauss_newton(
                 break
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
+            if path.approximate:
+                path.approximate, near = False, None
+                continue
             fit = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             break
+        fell, promised = (square(before[2].residuals) - x for x in (square(evaluation.residuals), closer.square))
+        if path.approximate and fell < _KEPT * promised:  # the Jacobian is that of another model
+            path.values, maps, evaluation = before
+            path.approximate, near = False, None
+            continue
         near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < _SAME) else None
+        path.approximate = path.approximate and near is not None
     return fit, evaluation, maps
 
 

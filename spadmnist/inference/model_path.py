@@ -48,6 +48,7 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
+    approximate: bool = False  # the Jacobian of `fit` is that of fits near by
     # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
     located: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -109,12 +110,13 @@ class ModelPath:
         """A copy of all that a step changes, for `back_to`."""
         own = (self.evaluation, dict(self.values), list(self.steps), list(self.ladder), self.fit)
         fitted = [(step, dict(step.values), step.map) for step in self.steps]  # a fit writes into the steps
-        return (*own, list(self.scan.accepted), dict(self.scan.phases), fitted, dict(self.located))
+        scan = list(self.scan.accepted), dict(self.scan.phases)
+        return (*own, *scan, fitted, dict(self.located), self.approximate)
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """Restore the state that `kept` returned."""
         self.evaluation, self.values, self.steps, self.ladder, self.fit = kept[:5]
-        self.scan.accepted, self.scan.phases, fitted, self.located = kept[5:]
+        self.scan.accepted, self.scan.phases, fitted, self.located, self.approximate = kept[5:]
         for step, values, map_ in fitted:
             step.values, step.map = values, map_
 
@@ -214,7 +216,9 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     known = best.evaluation if not any(candidate.carrier for candidate in path.scan.accepted) else None
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
     path.values = {**(path.values if known is None else before.values), **best.values}
-    fit_all(path, best.fit, known)
+    # a later step makes all be fitted again: the columns as they were fitted do until then
+    likely = len(path.steps) > len(new) and not (best.chips or best.fluctuates)
+    fit_all(path, best.fit, known, [fit for fit in (path.fit, best.fit) if fit is not None] if likely else ())
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new
 

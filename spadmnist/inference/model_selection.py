@@ -27,9 +27,10 @@ from .conclusion import Limits, Notes, answer, left_over, not_done, outside, riv
 from .elimination import drop_needless, drop_unexplaining, left_in_own_cells, no_step_explains
 from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
-from .evidence import best_of, evidence_of, judge_maps_by_odd_pixels, worth_fitting
+from .evidence import best_of, contests, evidence_of, judge_maps_by_odd_pixels, worth_fitting
 from .findings import mimicked
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
+from .joint_fit import complete_fit
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_EVIDENCE
 from .map_trials import patterns_first, random_map_trials
@@ -118,6 +119,8 @@ def _diagnosed(
             drop_needless(path)
         with _or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
+        with _or_as_before(path, "the fit of all numbers together"):
+            complete_fit(path)
     if path.steps and not short:
         with _or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
@@ -302,6 +305,29 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     if not second:
         return False
     worth = worth_fitting(second, faint)
+    groups = [worth] if faint else contests(replicates, path.evaluation, worth)
+    for k, group in enumerate(groups):
+        if _best_of_these_added(path, notes, failed, least, second, group, k + 1 == len(groups)):
+            return True
+    return False
+
+
+def _best_of_these_added(
+    path: ModelPath,
+    notes: Notes,
+    failed: Sequence[BlockCheck],
+    least: float,
+    second: list[Trial],
+    worth: Sequence[Trial],
+    last: bool,
+) -> bool:
+    """As `_best_added`, of the trials of the second look that are worth fitting.
+
+    Args:
+        last: no others are.
+    """
+    replicates, scan, faint = path.replicates, path.scan, not failed
+    number = len(path.steps) + 1
     replicates.say(f"step {number}: fitting " + ", ".join(title(t.candidate) for t in worth))
     fitted = []
     for one in worth:
@@ -311,6 +337,8 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
                 one.evidence = evidence_of(replicates, path.evaluation, one)
             fitted.append(one)
     if not fitted:
+        if not last:
+            return False
         raise _NoCandidate({one.candidate.name for one in worth})
     judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in fitted}
     if faint:
@@ -328,7 +356,7 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     significance, p = judged[id(best)]
     # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
     if p > least or (best.evidence < LEAST_EVIDENCE and not faint):
-        if faint or not _few(path):
+        if faint or not last or not _few(path):
             return False
         path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
         return True
@@ -353,7 +381,7 @@ def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], lea
     # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
     explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
     if not explains and len(path.failed) >= max(len(failed), 1) and fell - path.misfit < 0.05 * (fell - 1):
-        if path.misfit > fell:
+        if path.misfit > fell or not last:
             path.back_to(earlier)
         return False
     return True

@@ -18,7 +18,7 @@ from .evaluation import Evaluation, block_checks, failing, square
 from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
-from .phases import NEAR, TIMES, simulate_phases
+from .phases import NEAR, TIMES, PeriodicSignature, simulate_phases
 from .replicates import FEW, Replicates
 from .score_test import best_direction, sigmas_of
 from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
@@ -33,6 +33,8 @@ _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, 
 _BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
 # of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
 _FAR_OFF = 0.4
+# factor on the size of a signature: by more, another model has another scatter, and the signature is simulated anew
+_CHANGED = 1.15
 _LEAST_SIZE = 6.0  # standard deviations: a signature below it is none
 _SATURATED = 300.0  # standard deviations: a signature beyond it says little of a smaller one
 _STEPS = 3  # how often a weaker or a stronger edge is tried
@@ -54,6 +56,8 @@ class Scan:
         self.accepted: list[Candidate] = []
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[Evaluation, list[Line]] | None = None
+        # candidate, values, and its signature at these
+        self._periodic: list[tuple[str, dict[Key, Any], PeriodicSignature]] = []
 
         self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
         self._out: set[str] = set()  # names of those that are excluded from now on
@@ -172,14 +176,16 @@ class Scan:
                 still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
         for one in self._simulated(evaluation, still, _SCAN, only):
             one.seen = set(only or evaluation.made)
+            one.size = size_of(self.replicates, evaluation, one.signature)
             one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(one)
         for candidate, tried in tries:
             if not candidate.phases:
                 continue
             swing: Any = None
+            line = self._line_at(evaluation, candidate, tried)
             with self.if_possible(candidate, _LOOKING, wholly=False):
-                swing = simulate_phases(self.replicates, evaluation, candidate.phases, tried, FEW)
+                tried, swing = self._periodic_signature(evaluation, candidate, tried, line)
             if swing is None or isinstance(swing, str):
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
@@ -190,7 +196,6 @@ class Scan:
             one = Trial(candidate, tried, swing.at(found), fall, times, phases=phases, seen=set(evaluation.made))
             for coordinate in frequencies_of(candidate):
                 f = float(tried[coordinate.key])
-                line = next((line for line in self.lines(evaluation) if line.frequency == f), None)
                 error = line.error if line else coordinate.high
                 one.intervals[coordinate.key] = (
                     max(f - 1.96 * error, coordinate.low),
@@ -199,6 +204,30 @@ class Scan:
                 one.p_value = line.p if line else None
             out.append(one)
         return out
+
+    def _line_at(self, evaluation: Evaluation, candidate: Candidate, tried: Mapping[Key, Any]) -> Line | None:
+        """The line of the data at the frequency of a periodic candidate; None where it is at no line."""
+        at = [float(tried[coordinate.key]) for coordinate in frequencies_of(candidate)]
+        return next((line for line in self.lines(evaluation) if line.frequency in at), None)
+
+    def _periodic_signature(
+        self, evaluation: Evaluation, candidate: Candidate, tried: dict[Key, Any], line: Line | None
+    ) -> tuple[dict[Key, Any], PeriodicSignature | str]:
+        """(values, signature at any phase) of a periodic candidate, or the reason why it cannot be simulated.
+
+        That under an earlier model is used again, at a frequency that no data distinguish from that of the line: it
+        chooses what is fitted, and the fit simulates it anew.
+        """
+        narrow = [coordinate.key for coordinate in frequencies_of(candidate)]
+        within = line.error if line else 0.0
+        for name, values, found in self._periodic:
+            same = all(values.get(k) == x or (k in narrow and abs(values[k] - x) <= within) for k, x in tried.items())
+            if name == candidate.name and same:
+                return values, found
+        made = simulate_phases(self.replicates, evaluation, candidate.phases, tried, FEW)
+        if not isinstance(made, str):
+            self._periodic.append((candidate.name, tried, made))
+        return tried, made
 
     def _simulated(
         self, evaluation: Evaluation, tried: Sequence[Trial], few: int, only: Sequence[str] = ()
@@ -231,8 +260,9 @@ class Scan:
 
         Args:
             everywhere: in all captures, not only in the most informative ones.
-            known: trials under an earlier model. Their signatures are used again where the data do not resemble them;
-                captures in which they were not simulated are added.
+            known: trials under an earlier model. Their signatures are used again where the data do not resemble them,
+                or where the scatter of their cells has not changed; captures in which they were not simulated are
+                added.
         """
         tries: list[tuple[Candidate, dict[Key, Any]]] = []
         for candidate in self.candidates(evaluation.sensors.one):
@@ -333,7 +363,10 @@ class Scan:
     def _still(
         self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]], known: Sequence[Trial]
     ) -> list[Trial]:
-        """The known trials that are still candidates and that the data do not resemble, at their best strength."""
+        """The known trials that are still candidates, at their best strength.
+
+        Those that the data resemble are left out where their signature, in standard deviations, is not what it was.
+        """
         out, promising = [], set()
         for one in known:
             if one.candidate.phases or not any(is_same(one, *t) for t in tries):
@@ -341,9 +374,16 @@ class Scan:
             now = replace(one)
             now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
-            if now.fall >= PROMISING / 4:
+            if now.fall >= PROMISING / 4 and self._has_changed(evaluation, now):
                 promising.add((now.candidate.name, shape_of(now)))
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
+
+    def _has_changed(self, evaluation: Evaluation, known: Trial) -> bool:
+        """Whether the signature of a known trial may be another one with the steps that the model has now."""
+        if any(known.candidate.effect == candidate.effect for candidate in self.accepted):
+            return True
+        now = size_of(self.replicates, evaluation, known.signature)
+        return not known.size / _CHANGED < now < known.size * _CHANGED
 
     def _completed(self, evaluation: Evaluation, known: Sequence[Trial], wanted: Collection[str]) -> list[Trial]:
         """The trials with their signatures completed in captures in which they were not simulated."""
@@ -360,6 +400,7 @@ class Scan:
             for one in self._simulated(evaluation, some, _SCAN, sorted(missing)):
                 one.signature = earlier[id(one)].completed(one.signature, missing)
                 one.seen = one.seen | missing
+                one.size = size_of(self.replicates, evaluation, one.signature)
                 one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
                 out.append(one)
         return out

@@ -57,6 +57,7 @@ class Trial:
     evaluation: Evaluation | None = None  # of this model, where it was needed
     phases: Phases = field(default_factory=dict)
     chips: bool = False  # the pixels that it affects are random
+    size: float = 0.0  # of the signature under the model with which it was simulated, standard deviations
     faint: bool = False  # fitted by the signature of a stronger one
     more: tuple[Candidate, ...] = ()  # maps that only make sense together
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)

@@ -1,0 +1,173 @@
+"""A model that lacks several effects at once: what one step has simulated, the next one uses again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, names, quiet, taken
+
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.coordinates import is_edge
+from spadmnist.inference.elimination import _drop_unless_missed
+from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.evidence import contests
+from spadmnist.inference.joint_fit import complete_fit
+from spadmnist.inference.map_trials import map_trials_of
+from spadmnist.inference.model_path import ModelPath, accept, begin
+from spadmnist.inference.scan import Scan
+from spadmnist.inference.signature import signatures
+from spadmnist.inference.trial import Trial
+
+BOTH = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n    crosstalk: {probability: 3 %}\n"
+FLICKER = "    flicker: {amplitude: 0.3, frequency: 500 Hz, phase: 0.7 rad}\n"
+
+
+@pytest.fixture
+def lab(tmp_path):
+    return labs(tmp_path)
+
+
+def both_added(path: ModelPath) -> None:
+    taken(path, "add afterpulsing", {PROBABILITY: 0.04, LIFETIME: 6e-8})
+    taken(path, "add crosstalk", {CROSSTALK: 0.02})
+
+
+def test_the_fit_of_a_later_step_uses_the_columns_that_are_known(lab) -> None:
+    """With as many simulations as the squares need; once all steps are there, the Jacobian is simulated with all."""
+    path = begin(bench_of(lab(BOTH), 16))
+    both_added(path)
+    assert names(path) == ["add afterpulsing", "add crosstalk"] and path.approximate
+    assert path.fit is not None
+    first, kept, done = path.fit, path.kept(), path.replicates.simulations
+    complete_fit(path)
+    assert not path.approximate and path.fit is not None
+    assert path.replicates.simulations - done >= 2 * len(first.coordinates) * 8  # of one capture at least
+    # the values and their errors are nearly those of the whole fit
+    error = np.sqrt(np.diag(path.fit.covariance))
+    for i, coordinate in enumerate(path.fit.coordinates):
+        if coordinate.key in (PROBABILITY, CROSSTALK, LIFETIME):
+            assert abs(first.point[i] - path.fit.point[i]) < 2 * error[i]
+            assert np.sqrt(first.covariance[i, i]) == pytest.approx(error[i], rel=0.6)
+            truth = {PROBABILITY: 0.05, CROSSTALK: 0.03, LIFETIME: 6e-8}[coordinate.key]
+            assert abs(path.fit.point[i] - coordinate.coordinate(truth)) < 4 * error[i]
+    done = path.replicates.simulations
+    complete_fit(path)  # nothing is left to do
+    assert path.replicates.simulations == done
+    path.back_to(kept)
+    assert path.approximate and path.fit is first
+
+
+def test_columns_of_another_model_do_not_end_a_fit(lab) -> None:
+    """Where the squares do not fall as the known columns say, the Jacobian is simulated."""
+    path = begin(bench_of(lab(BOTH), 16))
+    taken(path, "add afterpulsing", {PROBABILITY: 0.04, LIFETIME: 6e-8})
+    best = given(path, "add crosstalk", {CROSSTALK: 0.02}, fitted=True)
+    assert best.fit is not None
+    wrong = {cell: -x for cell, x in best.fit.jacobian.items()}  # it leads away from the data
+    far = {**best.values, CROSSTALK: 0.005}
+    sensors = path.evaluation.sensors.changed(far)
+    accept(path, replace(best, fit=replace(best.fit, jacobian=wrong), values=far, sensors=sensors), 1.0)
+    assert not path.approximate
+    assert path.values[CROSSTALK] == pytest.approx(0.03, rel=0.3)
+
+
+def test_only_what_explains_the_same_is_fitted_beside_each_other(lab) -> None:
+    """A dead time and a slow recovery compete for one edge; neighbours that trigger each other have nothing to do
+    with it, and are found by the next step."""
+    path = begin(bench_of(lab("    crosstalk: {probability: 10 %}\n", dead=60, light=1000), 16))
+    recovery = change_of(path.replicates, "add slow_recovery")
+    edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
+    slow = given(path, "add slow_recovery", {d.key: 1.5e-8 for d in recovery.coordinates}, fitted=False)
+    cross = given(path, "add crosstalk", {CROSSTALK: 0.1}, fitted=False)
+    assert is_edge(edge.candidate.strengths[0])
+    groups = contests(path.replicates, path.evaluation, [edge, cross, slow])
+    assert [[t.candidate.name for t in group] for group in groups] == [
+        ["set dead_time.duration", "add slow_recovery"],
+        ["add crosstalk"],
+    ]
+    # random odd pixels have more scatter: what they explain, the squares do not say
+    chips = replace(cross, chips=True)
+    assert contests(path.replicates, path.evaluation, [edge, chips]) == [[edge, chips]]
+    assert contests(path.replicates, path.evaluation, []) == []
+
+
+def test_signatures_of_the_first_look_are_used_again(lab) -> None:
+    """Those of the effect that was added are not, nor those whose cells scatter in another way now."""
+    replicates = bench_of(lab(BOTH), 16)
+    path = begin(replicates)
+    some = ("add afterpulsing", "add crosstalk", "set dead_time.duration", "add jitter")
+    path.scan.candidates = lambda sensor: [c for c in candidates(sensor) if c.name in some]  # type: ignore[method-assign]
+    first = path.scan.scan(path.evaluation)
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 6e-8})
+    path.scan.accepted = [c for c in candidates(replicates.start) if c.name == "add afterpulsing"]
+    done = replicates.simulations
+    again = path.scan.scan(path.evaluation, known=first)
+    used = replicates.simulations - done
+    done = replicates.simulations
+    anew = path.scan.scan(path.evaluation)
+    assert used < 0.5 * (replicates.simulations - done)
+    best = [next(t for t in found if t.candidate.name == "add crosstalk") for found in (again, anew)]
+    assert best[0].fall == pytest.approx(best[1].fall, rel=0.2) and best[0].fall > 100
+    assert again[0].candidate.name == anew[0].candidate.name == "add crosstalk"
+    # of another size: the same trial is simulated anew
+    known = next(t for t in first if t.candidate.name == "add crosstalk")
+    assert not path.scan._has_changed(path.evaluation, known)
+    assert path.scan._has_changed(path.evaluation, replace(known, size=known.size * 1.3))
+    path.scan.accepted = [known.candidate]
+    assert path.scan._has_changed(path.evaluation, known)
+
+
+def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:
+    replicates = bench_of(lab(FLICKER, light=400), 16)
+    look, evaluation = quiet(replicates), evaluate(replicates, {})
+    candidate = change_of(replicates, "add flicker")
+    (line, *_) = look.lines(evaluation)
+    assert line.frequency == pytest.approx(500, abs=3 * line.error)
+    tries = look.begun(evaluation, candidate)
+    first = look.looked_at(evaluation, candidate, tries)
+    done = replicates.simulations
+    again = look.looked_at(evaluation, candidate, tries)
+    assert replicates.simulations == done and [t.fall for t in again] == [t.fall for t in first]
+    key = ("flicker", "frequency")
+    near = {**tries[0], key: line.frequency + 0.5 * line.error}
+    assert look._periodic_signature(evaluation, candidate, near, line)[0] == tries[0]
+    assert replicates.simulations == done
+    far = {**tries[0], key: line.frequency + 2 * line.error}
+    assert look._periodic_signature(evaluation, candidate, far, line)[0] == far
+    assert replicates.simulations > done
+
+
+def test_a_map_that_is_clearly_needed_stays_without_another_fit(lab) -> None:
+    extra = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
+    sensor, data = lab(extra, light=400, side=4)
+    hot = np.where(np.arange(16) == 5, 20.0, 1.0)
+    stated = sensor.with_values({"dark_counts.rate": 100.0 * hot})
+    from spadmnist import simulate
+
+    data = simulate(stated.with_effect(_afterpulsing()), data, seed=3)
+    replicates = bench_of((sensor, data), 16)
+    path = begin(replicates)
+    (one,) = [
+        t
+        for t in _with_signatures(path.scan, map_trials_of(path.scan, path.evaluation, path.values))
+        if t.candidate.name == "per_pixel dark_counts.rate" and not t.more
+    ]
+    accept(path, one, 10.0)
+    taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 6e-8})
+    done, before = replicates.simulations, path.evaluation
+    _drop_unless_missed(path, path.steps[0])
+    assert names(path) == ["per_pixel dark_counts.rate", "add afterpulsing"] and path.evaluation is before
+    assert replicates.simulations - done == 16 * len(replicates.seen)  # one evaluation, no Jacobian
+
+
+def _afterpulsing():
+    from spadmnist import effects
+
+    return effects.Afterpulsing(probability=0.05, lifetime=60e-9)
+
+
+def _with_signatures(scan: Scan, trials: list[Trial]) -> list[Trial]:
+    found = signatures(scan.replicates, begin(scan.replicates).evaluation, [t.sensors for t in trials if t.sensors])
+    return [replace(t, signature=s) for t, s in zip(trials, found, strict=True) if not isinstance(s, str)]
