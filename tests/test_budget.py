@@ -6,6 +6,7 @@ import json
 import math
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from spadmnist.cli import comparing
 from spadmnist.effects import Conditions, Effect
 from spadmnist.errors import InputError
 from spadmnist.events import Layout
-from spadmnist.inference import model_selection
+from spadmnist.inference import budget, model_selection
 from spadmnist.inference.budget import Budget, OutOfBudget, clock, seconds_of, work_of
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.comparison import compare
@@ -116,6 +117,25 @@ def test_the_clock_ends_what_takes_three_times_as_long():
     Budget(10.0, until=1.0, began=time.monotonic() - 29.0).spend(1.0)
     with pytest.raises(OutOfBudget):
         Budget(10.0, until=1.0, began=time.monotonic() - 31.0).spend(1.0)
+
+
+def test_the_time_left_is_that_of_the_speed_after_the_start(monkeypatch):
+    """The first work also compiles the program, which says nothing of the rest."""
+    now = [0.0]
+    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    one = Budget(400.0, began=0.0)
+    assert one.left == 400.0
+    one.spend(10.0)
+    now[0] = 100.0
+    assert one.left == 290.0  # 300 s of steps at the speed of two idle cores
+    one.spend(20.0)
+    now[0] = 150.0
+    assert one.left == 270.0 * 50 / 20
+    one.spend(70.0, remembered=70.0)  # what a cache held took no time
+    assert one.left == 200.0 * 50 / 20
+    now[0] = 1190.0
+    assert one.left == 10.0  # the clock ends it
+    assert Budget().left == math.inf
 
 
 def test_a_time_as_people_read_it():

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, names, quiet, taken
 
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import is_edge
 from spadmnist.inference.elimination import _drop_unless_missed
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.evidence import contests
+from spadmnist.inference.evidence import competing, leads
 from spadmnist.inference.joint_fit import complete_fit
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin
+from spadmnist.inference.model_selection import _best_added
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
 from spadmnist.inference.trial import Trial
@@ -82,15 +85,54 @@ def test_only_what_explains_the_same_is_fitted_beside_each_other(lab) -> None:
     slow = given(path, "add slow_recovery", {d.key: 1.5e-8 for d in recovery.coordinates}, fitted=False)
     cross = given(path, "add crosstalk", {CROSSTALK: 0.1}, fitted=False)
     assert is_edge(edge.candidate.strengths[0])
-    groups = contests(path.replicates, path.evaluation, [edge, cross, slow])
+    groups = competing(path.replicates, path.evaluation, [edge, cross, slow])
     assert [[t.candidate.name for t in group] for group in groups] == [
         ["set dead_time.duration", "add slow_recovery"],
         ["add crosstalk"],
     ]
     # random odd pixels have more scatter: what they explain, the squares do not say
     chips = replace(cross, chips=True)
-    assert contests(path.replicates, path.evaluation, [edge, chips]) == [[edge, chips]]
-    assert contests(path.replicates, path.evaluation, []) == []
+    assert competing(path.replicates, path.evaluation, [edge, chips]) == [[edge, chips]]
+    assert competing(path.replicates, path.evaluation, []) == []
+    # what competes with two that do not compete with each other brings them together
+    assert competing(path.replicates, path.evaluation, [edge, cross, replace(slow, chips=True)])[0][:2] == [edge, cross]
+    # the better one of two groups may be the one whose squares promise less
+    assert leads(replace(edge, evidence=40.0), [[replace(cross, fall=90.0)], [replace(slow, fall=10.0)]])
+    assert not leads(replace(edge, evidence=30.0), [[replace(cross, fall=90.0)]])
+    assert leads(replace(edge, evidence=30.0), [])
+
+
+@pytest.mark.parametrize("helps", [False, True])
+def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeypatch, helps: bool) -> None:
+    """A step that helps too little to go on from stays only where no other one does better."""
+    path, asked = begin(bench_of(lab("    crosstalk: {probability: 10 %}\n", dead=60, light=1000), 16)), []
+    edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
+    cross = given(path, "add crosstalk", {CROSSTALK: 0.1}, fitted=False)
+    trials = [replace(edge, fall=500.0), replace(cross, fall=400.0)]
+    module = "spadmnist.inference.model_selection."
+
+    def taken_or_not(path: ModelPath, notes, failed, second, best, significance) -> bool:
+        asked.append(best.candidate.name)
+        path.steps.append(SimpleNamespace(name=best.candidate.name, values={}, map=None))  # type: ignore[arg-type]
+        return helps and best.candidate.effect == "crosstalk"
+
+    def fitted(path, worth, faint):
+        return [replace(t, evidence=t.fall) for t in worth]
+
+    monkeypatch.setattr(module + "_fitted", fitted)
+    monkeypatch.setattr(module + "_taken", taken_or_not)
+    monkeypatch.setattr(module + "p_of_best", lambda *_: (9.0, 1e-20))
+    monkeypatch.setattr(module + "patterns_first", lambda scan, evaluation, second: second)
+    monkeypatch.setattr(path.scan, "again", lambda *_: trials)
+    assert _best_added(path, Notes([], False), path.failed, 0.01) is helps
+    assert asked == ["set dead_time.duration", "add crosstalk"]
+    assert [step.name for step in path.steps] == [asked[1] if helps else asked[0]]
+    # a group of which the squares promise far more is fitted before one of little evidence is taken
+    path.steps.clear()
+    asked.clear()
+    trials[1].fall = 2000.0
+    _best_added(path, Notes([], False), path.failed, 0.01)
+    assert asked[0] == "add crosstalk"
 
 
 def test_signatures_of_the_first_look_are_used_again(lab) -> None:
@@ -131,11 +173,17 @@ def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:
     again = look.looked_at(evaluation, candidate, tries)
     assert replicates.simulations == done and [t.fall for t in again] == [t.fall for t in first]
     key = ("flicker", "frequency")
-    near = {**tries[0], key: line.frequency + 0.5 * line.error}
-    assert look._periodic_signature(evaluation, candidate, near, line)[0] == tries[0]
-    assert replicates.simulations == done
+    near = replace(line, frequency=line.frequency + 0.5 * line.error)
+    look._lines = evaluation, [near]  # the line under another model: the trial is at its frequency
+    found = look.looked_at(evaluation, candidate, [{**tries[0], key: near.frequency}])
+    assert replicates.simulations == done and [t.values[key] for t in found] == [near.frequency]
+    # another periodic effect, and another frequency, have another signature
+    other = replace(candidate, effect="other", kind="add")
+    known = look._periodic
+    assert other.name != candidate.name
+    known._known = [("add other", {("other", "rate"): 1.0}, known._known[0][2]), *known._known]
     far = {**tries[0], key: line.frequency + 2 * line.error}
-    assert look._periodic_signature(evaluation, candidate, far, line)[0] == far
+    assert not isinstance(known.signature(replicates, evaluation, candidate, far, line), str)
     assert replicates.simulations > done
 
 

@@ -40,34 +40,49 @@ class Budget:
         until: the share of the budget that may be spent now; infinite for the work that every answer needs.
         spent: work done so far, s of two idle cores.
         began: start of the run on the monotonic clock, s.
+        remembered: the part of that work whose result was in a cache, s of two idle cores.
+        measured_from: the time, s, and the simulated work from which on the speed of this machine is measured: the
+            end of the first work, which also compiles the program.
     """
 
     seconds: float = math.inf
     until: float = math.inf
     spent: float = 0.0
     began: float = field(default_factory=time.monotonic)
+    remembered: float = 0.0
+    measured_from: tuple[float, float] | None = None
 
-    def spend(self, seconds: float) -> None:
+    @property
+    def _simulated(self) -> float:
+        return self.spent - self.remembered
+
+    def spend(self, seconds: float, remembered: float = 0.0) -> None:
         """Count some work before it is done.
 
         Args:
             seconds: the work, s of two idle cores.
+            remembered: the part of it whose result is in a cache.
         Raises:
             OutOfBudget: where it exceeds the share that may be spent now, or the run is late.
         """
         late = time.monotonic() - self.began > _SLOW * self.seconds
         if self.until < math.inf and (self.spent + seconds > self.until * self.seconds or late):
             raise OutOfBudget
-        self.spent += seconds
+        if self._simulated > 0 and self.measured_from is None:
+            self.measured_from = time.monotonic(), self._simulated
+        self.spent, self.remembered = self.spent + seconds, self.remembered + remembered
 
     @property
     def left(self) -> float:
         """Time on this machine until the steps end, s, at most, at the speed so far; infinite without an end."""
         if not self.spent or self.seconds == math.inf:
             return self.seconds
-        elapsed = time.monotonic() - self.began
-        at_this_speed = max(STEPS * self.seconds - self.spent, 0.0) * elapsed / self.spent
-        return min(at_this_speed, max(_SLOW * self.seconds - elapsed, 0.0))
+        now = time.monotonic()
+        since, done = self.measured_from or (now, self._simulated)
+        # at first the speed of two idle cores
+        speed = (now - since) / (self._simulated - done) if self._simulated > done else 1.0
+        at_this_speed = max(STEPS * self.seconds - self.spent, 0.0) * speed
+        return min(at_this_speed, max(_SLOW * self.seconds - (now - self.began), 0.0))
 
 
 def seconds_of(within: str | float | None, quick: bool) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import SpadError
 from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
 from .gauss_newton import Fit, column_of, gauss_newton
-from .joint_fit import fit_all, without_fit
+from .joint_fit import SAME, fit_all, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of
 from .models import Model
@@ -96,6 +96,8 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
 def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
     """The number of checks that fail clearly, wherever the coordinates of the fit are, to first order.
 
+    It is 0 where they are so far away that the first order does not hold.
+
     Args:
         evaluation: of the model without a step that has no coordinates of its own.
     """
@@ -104,10 +106,14 @@ def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
         fit, keys = path.fit, list(residuals)
         slope = np.stack([stacked(column_of(fit, i, evaluation), keys) for i in range(len(fit.coordinates))], axis=1)
         z = stacked(residuals, keys)
-        left = z - slope @ (np.linalg.pinv(slope, rcond=1e-6) @ z)
+        move = np.linalg.pinv(slope, rcond=1e-6) @ z
+        if np.any(np.abs(move) > SAME):
+            return 0
+        left = z - slope @ move
         ends = np.cumsum([len(residuals[k]) for k in keys])[:-1]
         residuals = dict(zip(keys, np.split(left, ends), strict=True))
-    return sum(block.p < _CLEARLY for block in failing(block_checks(path.replicates, evaluation, residuals)))
+    found = failing(block_checks(path.replicates, evaluation, residuals))
+    return sum(block.p < _CLEARLY and block.cell not in evaluation.exact for block in found)
 
 
 def _fit_from_templates(path: ModelPath) -> None:

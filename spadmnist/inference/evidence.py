@@ -9,6 +9,7 @@ scatter.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 from ..statistics import Statistic
@@ -96,25 +97,38 @@ def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
     return (out + [t for t in more if all(t is not one for one in out)]) or list(second[:1])
 
 
-def contests(replicates: Replicates, evaluation: Evaluation, trials: Sequence[Trial]) -> list[list[Trial]]:
+def competing(replicates: Replicates, evaluation: Evaluation, trials: Sequence[Trial]) -> list[list[Trial]]:
     """The trials in groups, in their order: in the first one those that compete with the first trial, and so on.
 
-    Two trials compete if one of them explains a part of what the other one explains. Maps and patterns compete with
-    each other, and random odd pixels with everything, because the squares do not say what they explain. A trial that
-    does not compete with a step needs no fit beside it: a later step finds it.
+    Two trials compete if one of them explains a part of what the other one explains, and with them all that compete
+    with either. Maps and patterns compete with each other. What has a scatter of its own, random odd pixels and
+    fluctuating light, competes with everything, because the squares do not say what it explains. A trial that does
+    not compete with a step needs no fit beside it: a later step finds it.
     """
     groups: list[list[Trial]] = []
     for one in trials:
-        own = next((g for g in groups if any(_compete(replicates, evaluation, one, other) for other in g)), None)
-        if own is None:
+        own = [g for g in groups if any(_compete(replicates, evaluation, one, other) for other in g)]
+        if not own:
             groups.append([one])
-        else:
-            own.append(one)
+            continue
+        own[0] += [*(other for group in own[1:] for other in group), one]
+        groups = [g for g in groups if all(g is not other for other in own[1:])]
     return groups
 
 
+def leads(best: Trial, others: Sequence[Sequence[Trial]]) -> bool:
+    """Whether no trial of other groups promises so much more that it may be the better step."""
+    return best.evidence >= _NEAR * max((one.fall for group in others for one in group), default=-math.inf)
+
+
 def _compete(replicates: Replicates, evaluation: Evaluation, one: Trial, other: Trial) -> bool:
-    if one.chips or other.chips or (_over_the_array(one) and _over_the_array(other)):
+    if (
+        one.chips
+        or other.chips
+        or one.fluctuates
+        or other.fluctuates
+        or (_over_the_array(one) and _over_the_array(other))
+    ):
         return True
     keys = list(evaluation.residuals)
     z = stacked(evaluation.residuals, keys)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .model_path import ModelPath
 
 _AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
-_SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
+SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
 _WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
@@ -62,11 +62,15 @@ def fit_all(
 
 def complete_fit(path: ModelPath) -> None:
     """Fit all coordinates together by a Jacobian at the model with all steps, where the last one was approximate."""
-    if path.approximate:
-        path.replicates.say("fitting all numbers together")
-        known = None if any(candidate.carrier for candidate in path.scan.accepted) else path.evaluation
-        path.values = dict(path.values if known is None else known.values)
-        fit_all(path, known=known)
+    if not path.approximate:
+        return
+    path.replicates.say("fitting all numbers together")
+    before = path.kept()
+    known = None if any(candidate.carrier for candidate in path.scan.accepted) else path.evaluation
+    path.values = dict(path.values if known is None else known.values)
+    fit_all(path, known=known)
+    if path.fit is None:  # the model cannot be simulated around its values
+        path.back_to(before)
 
 
 def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], fits: Sequence[Fit]) -> Fit | None:
@@ -102,8 +106,11 @@ def _gauss_newton(
     """
     replicates, known = path.replicates, _known_jacobian(path)
     fit: Fit | None = None
+    rejected: Fit | None = None  # by known columns, at the values from which they led nowhere
     path.approximate = near is not None
-    for turn in range(_AGAIN + 1):
+    turn = -1
+    while turn < _AGAIN:
+        turn += 1
         here = {d.key: path.values[d.key] for d in coordinates}
         closer = gauss_newton_step(
             replicates,
@@ -117,6 +124,8 @@ def _gauss_newton(
             near,
         )
         if isinstance(closer, str):
+            if rejected is not None:
+                fit, path.approximate = rejected, True
             break
         fit = closer
         if turn == _AGAIN or square(evaluation.residuals) - closer.square < _WORTH:
@@ -132,16 +141,18 @@ def _gauss_newton(
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
             if path.approximate:
-                path.approximate, near = False, None
+                rejected = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
+                path.approximate, near, turn = False, None, -1
                 continue
             fit = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             break
         fell, promised = (square(before[2].residuals) - x for x in (square(evaluation.residuals), closer.square))
         if path.approximate and fell < _KEPT * promised:  # the Jacobian is that of another model
             path.values, maps, evaluation = before
-            path.approximate, near = False, None
+            rejected = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
+            path.approximate, near, turn = False, None, -1
             continue
-        near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < _SAME) else None
+        near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < SAME) else None
         path.approximate = path.approximate and near is not None
     return fit, evaluation, maps
 

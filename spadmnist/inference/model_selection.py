@@ -12,6 +12,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from .. import golden
 from ..errors import UNABLE, InputError, why
@@ -27,7 +28,7 @@ from .conclusion import Limits, Notes, answer, left_over, not_done, outside, riv
 from .elimination import drop_needless, drop_unexplaining, left_in_own_cells, no_step_explains
 from .error_budget import Rung, placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
-from .evidence import best_of, contests, evidence_of, judge_maps_by_odd_pixels, worth_fitting
+from .evidence import best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
 from .findings import mimicked
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import complete_fit
@@ -115,12 +116,12 @@ def _diagnosed(
             keep(so_far(path, start, notes))
     replicates.budget.until = FITS
     if path.steps:
+        with _or_as_before(path, "the fit of all numbers together"):
+            complete_fit(path)
         with _or_as_before(path, "dropping the steps that are no longer needed"):
             drop_needless(path)
         with _or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
-        with _or_as_before(path, "the fit of all numbers together"):
-            complete_fit(path)
     if path.steps and not short:
         with _or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
@@ -221,8 +222,10 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
-    replicates, scan, failed = path.replicates, path.scan, path.failed
-    number = len(path.steps) + 1
+    replicates, scan = path.replicates, path.scan
+    if not path.failed:
+        complete_fit(path)  # what no check shows is decided by the fit of all numbers
+    failed, number = path.failed, len(path.steps) + 1
     if failed and not path.steps and min(b.p for b in failed) > _PLAIN and _few(path):
         path.evaluation = _closer(path)  # lest the scatter of few replicates decide
         failed = path.failed
@@ -297,69 +300,91 @@ def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Ite
 
 def _best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
     replicates, scan, faint = path.replicates, path.scan, not failed
-    number = len(path.steps) + 1
     # a value that a step has set is fitted anew with every other one: it is no finding of its own
     notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
-    replicates.say(f"step {number}: the best of them on all captures")
+    replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
     if not second:
         return False
     worth = worth_fitting(second, faint)
-    groups = [worth] if faint else contests(replicates, path.evaluation, worth)
+    groups = [worth] if faint else competing(replicates, path.evaluation, worth)
+    fitted: list[Trial] = []
+    doubtful: tuple[Any, ...] | None = None  # the path with a step that helps too little to go on from
+    refused = False
     for k, group in enumerate(groups):
-        if _best_of_these_added(path, notes, failed, least, second, group, k + 1 == len(groups)):
+        fitted += _fitted(path, group, faint)
+        found = _best_of(path, notes, second, fitted, faint)
+        if found is None:
+            continue
+        best, significance, p = found
+        # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
+        if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
+            continue
+        earlier = path.kept()
+        if _taken(path, notes, failed, second, best, significance):
             return True
+        refused = True
+        fitted = [one for one in fitted if one is not best]
+        if len(path.steps) > len(earlier[2]):
+            doubtful = doubtful or path.kept()
+            path.back_to(earlier)
+    if not fitted and not refused:
+        raise _NoCandidate({one.candidate.name for one in worth})
+    if doubtful is not None:
+        path.back_to(doubtful)
+    elif not (faint or refused) and _few(path):
+        path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
+        return True
     return False
 
 
-def _best_of_these_added(
-    path: ModelPath,
-    notes: Notes,
-    failed: Sequence[BlockCheck],
-    least: float,
-    second: list[Trial],
-    worth: Sequence[Trial],
-    last: bool,
-) -> bool:
-    """As `_best_added`, of the trials of the second look that are worth fitting.
-
-    Args:
-        last: no others are.
-    """
-    replicates, scan, faint = path.replicates, path.scan, not failed
-    number = len(path.steps) + 1
-    replicates.say(f"step {number}: fitting " + ", ".join(title(t.candidate) for t in worth))
+def _fitted(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]:
+    """The trials with their coordinates fitted and their evidence, without those that cannot be simulated."""
+    path.replicates.say(f"step {len(path.steps) + 1}: fitting " + ", ".join(title(t.candidate) for t in worth))
     fitted = []
     for one in worth:
-        with scan.if_possible(one.candidate, "fitting its numbers"):
-            one = fit_trial(replicates, path.evaluation, one)
+        with path.scan.if_possible(one.candidate, "fitting its numbers"):
+            one = fit_trial(path.replicates, path.evaluation, one)
             if not faint:
-                one.evidence = evidence_of(replicates, path.evaluation, one)
+                one.evidence = evidence_of(path.replicates, path.evaluation, one)
             fitted.append(one)
-    if not fitted:
-        if not last:
-            return False
-        raise _NoCandidate({one.candidate.name for one in worth})
+    return fitted
+
+
+def _best_of(
+    path: ModelPath, notes: Notes, second: Sequence[Trial], fitted: Sequence[Trial], faint: bool
+) -> tuple[Trial, float, float] | None:
+    """(best of the fitted trials, its significance, its p-value); None where there is none."""
+    replicates = path.replicates
     judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in fitted}
     if faint:
         judge_maps_by_odd_pixels(replicates, path.evaluation, fitted, judged)
         for one in fitted:
             one.evidence = judged[id(one)][0] ** 2
         fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
-        if not fitted:
-            return False
+    if not fitted:
+        return None
     pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_EVIDENCE) else None
     if faint:
         best = best_of(fitted, lambda t: -judged[id(t)][1], pattern)
     else:
         best = best_of(fitted, lambda t: t.evidence, pattern, tie)
-    significance, p = judged[id(best)]
-    # squares do not show small differences of many pixels or codes: their p-value is that of a test of their own
-    if p > least or (best.evidence < LEAST_EVIDENCE and not faint):
-        if faint or not last or not _few(path):
-            return False
-        path.evaluation = _closer(path)  # something is wrong: too few replicates may be what hides it
-        return True
+    return best, *judged[id(best)]
+
+
+def _taken(
+    path: ModelPath,
+    notes: Notes,
+    failed: Sequence[BlockCheck],
+    second: list[Trial],
+    best: Trial,
+    significance: float,
+) -> bool:
+    """Whether the model with the best trial is better, so that the search goes on from there.
+
+    The path is as it was where the model is worse. A step that helps too little to go on from stays in it.
+    """
+    scan, faint = path.scan, not failed
     before, earlier, fell = path.evaluation, path.kept(), path.misfit
     with _needed(path, best.candidates, "fitting all numbers together"):
         new = accept(path, best, significance)
@@ -371,7 +396,7 @@ def _best_of_these_added(
     named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
     if notes.placebo is None:
         with contextlib.suppress(*UNABLE):  # no result depends on it
-            notes.placebo = placebo_of(replicates, before, notes.tried, best, named)
+            notes.placebo = placebo_of(path.replicates, before, notes.tried, best, named)
     if not failed and path.failed and _few(path):
         with _needed(path, best.candidates, "a closer look"):
             path.evaluation = _closer(path)  # with as many replicates as the model without the step
@@ -381,7 +406,7 @@ def _best_of_these_added(
     # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
     explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
     if not explains and len(path.failed) >= max(len(failed), 1) and fell - path.misfit < 0.05 * (fell - 1):
-        if path.misfit > fell or not last:
+        if path.misfit > fell:
             path.back_to(earlier)
         return False
     return True

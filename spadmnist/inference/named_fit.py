@@ -26,16 +26,15 @@ from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
-from .joint_fit import edge_errors, fit_all, variances_by_pixels
+from .joint_fit import complete_fit, edge_errors, fit_all, variances_by_pixels
 from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .pixel_maps import HALF_95
 from .replicates import FEW, REPLICATES, Replicates
 from .results import Diagnosis, Step, Value, title
-from .scan import of_other_shapes
 from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of
-from .trial import Trial
+from .trial import Trial, of_other_shapes
 from .trial_fits import fit_trial
 
 
@@ -205,6 +204,9 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             _kept(path, candidate)
             continue
         accept(path, best, math.sqrt(max(best.evidence, 0.0)))
+    if path.approximate:
+        complete_fit(path)
+        path.last_rung()
     with contextlib.suppress(*UNABLE):  # the fit by other chips stands
         if fit_where_hit(path):
             path.last_rung()

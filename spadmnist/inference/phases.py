@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
 from .models import phase_parameters
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Signature, residuals_at, residuals_shifted, signatures
+from .spectral_lines import Line
 
 # factors on the simulated strength: at first, and about the best of these
 TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
@@ -119,6 +121,40 @@ def simulate_phases(
     if len(made) < len(found):
         return next(m for m in found if isinstance(m, str))
     return PeriodicSignature.of(made, turns)
+
+
+class PeriodicSignatures:
+    """The signatures of periodic candidates; each is simulated once."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[str, Mapping[Key, Any], PeriodicSignature]] = []  # candidate's name, values
+
+    def signature(
+        self,
+        replicates: Replicates,
+        evaluation: Evaluation,
+        candidate: Candidate,
+        values: Mapping[Key, Any],
+        line: Line | None,
+    ) -> PeriodicSignature | str:
+        """The signature of a candidate at any phase, or the reason why it cannot be simulated.
+
+        That under an earlier model is used again, also of a frequency that no data distinguish from that of the line:
+        it chooses what is fitted, and the fit simulates it anew.
+
+        Args:
+            values: SI; line: that of the data at its frequency.
+        """
+        within = {d.key: line.error if line and d.kind == "frequency" else 0.0 for d in candidate.shapes}
+        for name, known, found in self._known:
+            if name == candidate.name and all(
+                known[k] == x or (within.get(k) and abs(known[k] - x) <= within[k]) for k, x in values.items()
+            ):
+                return found
+        made = simulate_phases(replicates, evaluation, candidate.phases, values, FEW)
+        if not isinstance(made, str):
+            self._known.append((candidate.name, dict(values), made))
+        return made
 
 
 def choose_phase(

@@ -254,7 +254,8 @@ class Replicates:
 
     def charge(self, sensor: Sensor, id: str, number: int) -> None:
         """Spend the work of replicates that are remembered: an answer does not depend on what is in the cache."""
-        self.budget.spend(number * self._work(sensor, id))
+        work = number * self._work(sensor, id)
+        self.budget.spend(work, remembered=work)
 
     def _work(self, sensor: Sensor, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
@@ -283,7 +284,7 @@ class Replicates:
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | str] = [""] * len(wanted)
         names = [self._name(one, pieces, hasty) for one in wanted]
-        most = work = 0.0  # bytes of a replicate; s of two idle cores
+        most, work = 0.0, [0.0] * len(wanted)  # bytes of a replicate; s of two idle cores
         for k, (sensors, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
@@ -292,7 +293,7 @@ class Replicates:
                 if len(numbers):
                     first = sensors.of(id, int(numbers[0]))
                     most = max(most, self._bytes(first, id, photons))
-                    work += len(numbers) * self._work(first, id)
+                    work[k] = len(numbers) * self._work(first, id)
                 for part in parts:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
                     models = [Packed.of(sensors.of(id, number), self.workers.apart) for number in each]
@@ -300,11 +301,12 @@ class Replicates:
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
                 tasks[k], out[k] = [], why_not(error)
-        self.budget.spend(work)
+        self.budget.spend(sum(work))
         self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
         for k, some in enumerate(tasks):
             if some and self.journal and (before := self.journal.recall(names[k])) is not None:
                 tasks[k], out[k] = [], before
+                self.budget.remembered += work[k]
         owners = [k for k, some in enumerate(tasks) for _ in some]
         given = {f"replicates of {wanted[k][1]} ({n + 1} of {len(owners)})": n for n, k in enumerate(owners)}
         every = [task for some in tasks for task in some]

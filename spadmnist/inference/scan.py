@@ -18,19 +18,30 @@ from .evaluation import Evaluation, block_checks, failing, square
 from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
-from .phases import NEAR, TIMES, PeriodicSignature, simulate_phases
+from .phases import NEAR, TIMES, PeriodicSignatures
 from .replicates import FEW, Replicates
 from .score_test import best_direction, sigmas_of
 from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
 from .spectral_lines import Line, spectral_lines
-from .trial import Trial, frequencies_of, further, is_same, shape_of, stronger, weaker
+from .trial import (
+    BOLDER,
+    Trial,
+    among,
+    faint_of_other_shape,
+    frequencies_of,
+    further,
+    is_same,
+    of_other_shapes,
+    shape_of,
+    stronger,
+    weaker,
+)
 from .trial_fits import STRONG
 
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
 _SCAN = 2  # replicates of each capture for the first look
 _SECOND = 6  # candidates in the second look
 _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
-_BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
 # of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
 _FAR_OFF = 0.4
 # factor on the size of a signature: by more, another model has another scatter, and the signature is simulated anew
@@ -56,8 +67,7 @@ class Scan:
         self.accepted: list[Candidate] = []
         self.phases: dict[tuple[str, Key], float] = {}
         self._lines: tuple[Evaluation, list[Line]] | None = None
-        # candidate, values, and its signature at these
-        self._periodic: list[tuple[str, dict[Key, Any], PeriodicSignature]] = []
+        self._periodic = PeriodicSignatures()
 
         self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
         self._out: set[str] = set()  # names of those that are excluded from now on
@@ -185,7 +195,7 @@ class Scan:
             swing: Any = None
             line = self._line_at(evaluation, candidate, tried)
             with self.if_possible(candidate, _LOOKING, wholly=False):
-                tried, swing = self._periodic_signature(evaluation, candidate, tried, line)
+                swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line)
             if swing is None or isinstance(swing, str):
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
@@ -209,25 +219,6 @@ class Scan:
         """The line of the data at the frequency of a periodic candidate; None where it is at no line."""
         at = [float(tried[coordinate.key]) for coordinate in frequencies_of(candidate)]
         return next((line for line in self.lines(evaluation) if line.frequency in at), None)
-
-    def _periodic_signature(
-        self, evaluation: Evaluation, candidate: Candidate, tried: dict[Key, Any], line: Line | None
-    ) -> tuple[dict[Key, Any], PeriodicSignature | str]:
-        """(values, signature at any phase) of a periodic candidate, or the reason why it cannot be simulated.
-
-        That under an earlier model is used again, at a frequency that no data distinguish from that of the line: it
-        chooses what is fitted, and the fit simulates it anew.
-        """
-        narrow = [coordinate.key for coordinate in frequencies_of(candidate)]
-        within = line.error if line else 0.0
-        for name, values, found in self._periodic:
-            same = all(values.get(k) == x or (k in narrow and abs(values[k] - x) <= within) for k, x in tried.items())
-            if name == candidate.name and same:
-                return values, found
-        made = simulate_phases(self.replicates, evaluation, candidate.phases, tried, FEW)
-        if not isinstance(made, str):
-            self._periodic.append((candidate.name, tried, made))
-        return tried, made
 
     def _simulated(
         self, evaluation: Evaluation, tried: Sequence[Trial], few: int, only: Sequence[str] = ()
@@ -274,9 +265,8 @@ class Scan:
             out = self._by_totals(evaluation, tries)
         else:
             some = [] if everywhere else self.most_informative(evaluation)
-            old = self._completed(
-                evaluation, self._still(evaluation, tries, [t for t in known if t.seen]), some or evaluation.made
-            )
+            still = self._still(evaluation, tries, [t for t in known if t.seen], everywhere)
+            old = self._completed(evaluation, still, some or evaluation.made)
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = old + self._raised(evaluation, self._looked_at(evaluation, tries, some), some)
             out += self._lowered(evaluation, out, some)
@@ -354,18 +344,25 @@ class Scan:
         out: list[Trial] = []
         here = [t for t in tried if wanted(t)]
         for _ in range(_STEPS):
-            on = [(t.candidate, to) for t in here if (to := step(t)) and not _among(tried, t.candidate, to)]
+            on = [(t.candidate, to) for t in here if (to := step(t)) and not among(tried, t.candidate, to)]
             found = self._looked_at(evaluation, on, some) if on else []
             out += found
             here = [t for t in found if wanted(t)]
         return out
 
     def _still(
-        self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]], known: Sequence[Trial]
+        self,
+        evaluation: Evaluation,
+        tries: Sequence[tuple[Candidate, dict[Key, Any]]],
+        known: Sequence[Trial],
+        anew: bool,
     ) -> list[Trial]:
         """The known trials that are still candidates, at their best strength.
 
         Those that the data resemble are left out where their signature, in standard deviations, is not what it was.
+
+        Args:
+            anew: they all are.
         """
         out, promising = [], set()
         for one in known:
@@ -374,12 +371,16 @@ class Scan:
             now = replace(one)
             now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
-            if now.fall >= PROMISING / 4 and self._has_changed(evaluation, now):
+            if now.fall >= PROMISING / 4 and (anew or self._has_changed(evaluation, now)):
                 promising.add((now.candidate.name, shape_of(now)))
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
 
     def _has_changed(self, evaluation: Evaluation, known: Trial) -> bool:
-        """Whether the signature of a known trial may be another one with the steps that the model has now."""
+        """Whether the signature of a known trial is surely another one with the steps that the model has now.
+
+        Its cells may scatter in another way. Another shift does not show: the first look only chooses what the second
+        one simulates anew.
+        """
         if any(known.candidate.effect == candidate.effect for candidate in self.accepted):
             return True
         now = size_of(self.replicates, evaluation, known.signature)
@@ -442,7 +443,7 @@ class Scan:
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
                 alike = [t for t in same if t.fall > _NEARLY * one.fall]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
-                further += _faint_of_other_shape(best[-1], same)
+                further += faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
                 break
         best = [replace(one, others=of_other_shapes(one, tried)) if one.chips else one for one in best + further]
@@ -455,7 +456,7 @@ class Scan:
             # noise hides the shape of a faint signature: it is simulated stronger, unless it is an edge
             size = size_of(self.replicates, evaluation, one.signature)
             edge = any(map(is_edge, one.candidate.strengths))
-            least = 0.0 if edge else min(STRONG / max(size, 1e-9), _BOLDER if faint else 1.0)
+            least = 0.0 if edge else min(STRONG / max(size, 1e-9), BOLDER if faint else 1.0)
             one.times = math.copysign(max(abs(one.times), least), one.times)
             # an edge does not move in proportion: where it was simulated may be nearer to the best than where
             # proportion leads
@@ -500,37 +501,6 @@ class Scan:
         significance, found, times = best_direction(self.replicates, evaluation, one)
         suits = times * found.data / found.size if significance > 0 else one.times
         return replace(one, fall=significance**2, times=one.times if one.fall > 0 and one.times * suits > 0 else suits)
-
-
-def _faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
-    """The best trial of another shape that was simulated far below its best strength; none where there is no such.
-
-    Noise hides a part of a faint signature: the fall that it predicts is too small, that of a strong one is not.
-
-    Args:
-        best: the best trial of a candidate.
-        tried: all trials of that candidate, by the fall.
-    """
-    others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > _BOLDER and t.fall > PROMISING)
-    return list(others)[:1]
-
-
-def of_other_shapes(best: Trial, tried: Sequence[Trial]) -> tuple[Trial, ...]:
-    """The best trial of the same candidate at each other shape.
-
-    Args:
-        tried: all trials, by the fall.
-    """
-    out = {shape_of(best): best}
-    for one in tried:
-        if one.candidate.name == best.candidate.name:
-            out.setdefault(shape_of(one), one)
-    return tuple(out.values())[1:]
-
-
-def _among(tried: Sequence[Trial], candidate: Candidate, values: Mapping[Key, Any]) -> bool:
-    """Whether a candidate has been tried at these values."""
-    return any(t.candidate.name == candidate.name and t.values == values for t in tried)
 
 
 def _opposite(evaluation: Evaluation, one: Trial) -> Model | None:

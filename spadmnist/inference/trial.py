@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +15,13 @@ from .candidates import Candidate
 from .coordinates import Coordinate, Key, is_edge
 from .evaluation import Evaluation
 from .gauss_newton import Fit
-from .levels import COST_OF_A_PARAMETER
+from .levels import COST_OF_A_PARAMETER, PROMISING
 from .models import Model
 from .replicates import TOTALS, Cell
 from .signature import Signature
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
+BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
 _RAISED = 12.0  # the factor on a strength without a signature for another trial
 # in chi square, constant and per root of the evidence: two candidates nearer than that are a tie, because a few
 # replicates blur the difference
@@ -108,6 +109,37 @@ def is_same(one: Trial, candidate: Candidate, tried: Mapping[Key, Any]) -> bool:
 def shape_of(one: Trial) -> tuple[Any, ...]:
     """The values of the shapes, in which the templates of a candidate differ."""
     return tuple(one.values.get(coordinate.key) for coordinate in one.candidate.shapes)
+
+
+def faint_of_other_shape(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
+    """The best trial of another shape that was simulated far below its best strength; none where there is no such.
+
+    Noise hides a part of a faint signature: the fall that it predicts is too small, that of a strong one is not.
+
+    Args:
+        best: the best trial of a candidate.
+        tried: all trials of that candidate, by the fall.
+    """
+    others = (t for t in tried if shape_of(t) != shape_of(best) and abs(t.times) > BOLDER and t.fall > PROMISING)
+    return list(others)[:1]
+
+
+def of_other_shapes(best: Trial, tried: Sequence[Trial]) -> tuple[Trial, ...]:
+    """The best trial of the same candidate at each other shape.
+
+    Args:
+        tried: all trials, by the fall.
+    """
+    out = {shape_of(best): best}
+    for one in tried:
+        if one.candidate.name == best.candidate.name:
+            out.setdefault(shape_of(one), one)
+    return tuple(out.values())[1:]
+
+
+def among(tried: Sequence[Trial], candidate: Candidate, values: Mapping[Key, Any]) -> bool:
+    """Whether a candidate has been tried at these values."""
+    return any(t.candidate.name == candidate.name and t.values == values for t in tried)
 
 
 def weaker(one: Trial) -> dict[Key, Any] | None:
