@@ -259,6 +259,7 @@ def ask(folder: Path, question: str, case: str, args: argparse.Namespace) -> tup
         shutil.rmtree(found, ignore_errors=True)
         answer_file(folder, case, "unseen-found").unlink(missing_ok=True)
         options += ["--output", str(found), *(["--quick"] if args.quick else [])]
+        options += ["--within", args.within] if args.within else []
     kept, said = answered([verb, str(sensor), str(place), *options], told, args.timeout)
     if verb == "diagnose":
         for page in found.glob("*.html"):
@@ -385,6 +386,7 @@ def main(arguments: list[str] | None = None) -> int:
     running.add_argument("folder", metavar="FOLDER")
     running.add_argument("--jobs", type=int, default=2, help="cases at a time [2]")
     running.add_argument("--quick", action="store_true", help="diagnose --quick")
+    running.add_argument("--within", metavar="TIME", help="diagnose --within TIME [its default]")
     running.add_argument("--ask", nargs="+", choices=QUESTIONS, default=QUESTIONS, help="these questions only")
     running.add_argument("--minutes", type=float, default=math.inf, help="ask no new question after so long [no end]")
     running.add_argument("--timeout", type=float, default=1800.0, help="seconds for one answer [1800]")

@@ -223,8 +223,8 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
-    if not path.failed:
-        complete_fit(path)  # what no check shows is decided by the fit of all numbers
+    if all(block.p > _PLAIN for block in path.failed):
+        complete_fit(path)  # what no check shows plainly is decided by the fit of all numbers
     failed, number = path.failed, len(path.steps) + 1
     if failed and not path.steps and min(b.p for b in failed) > _PLAIN and _few(path):
         path.evaluation = _closer(path)  # lest the scatter of few replicates decide
