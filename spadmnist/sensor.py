@@ -33,9 +33,7 @@ _MOST_AT_ONCE = 1e8  # expected events that are simulated at once: 4 GB of memor
 _MOST_EVENTS = 2e9  # of an image that is simulated part by part
 _EVENTS_OF_A_PART = 4e6  # expected events of an image from which on it is simulated part by part, and of each part
 _GENERATIONS = 10_000
-# times the events that they come from: more is a cascade without end. The events of this generation count as well: in a
-# few pixels a cascade without end is few events beside all that there are
-_CHILDREN, _LATER = 200, 32
+_CHILDREN = 200  # times the events that they come from: more is a cascade without end
 _NONE = np.zeros(0)
 _NOBODY = np.zeros(0, np.int64)
 _HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more of them is left out
@@ -789,11 +787,9 @@ class Sensor:
         correlated = self.at("correlated")
         children: list[tuple[np.ndarray, ...]] = []  # times, rows, parents, causes, generation by generation
         current, first, known = events, 0, len(events)  # of which the first is so many in all
-        generation, most = 0, _CHILDREN * (len(events) + _CHILDREN)
+        generation = 0
         while correlated and len(current) and (cascade or generation == 0):
-            if generation == _LATER:
-                most = min(most, known + _CHILDREN * (len(current) + _CHILDREN))
-            if generation == _GENERATIONS or known > most:
+            if generation == _GENERATIONS or known > _CHILDREN * (len(events) + _CHILDREN):
                 raise SpadError(
                     f"the cascade of avalanches does not end ({known - len(events)} of {len(events)} events in "
                     f"{generation} generations); lower the probabilities of the correlated effects"

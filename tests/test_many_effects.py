@@ -16,6 +16,7 @@ from spadmnist.inference.elimination import _drop_unless_missed
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
 from spadmnist.inference.joint_fit import complete_fit
+from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.model_selection import _best_added
@@ -219,3 +220,9 @@ def _afterpulsing():
 def _with_signatures(scan: Scan, trials: list[Trial]) -> list[Trial]:
     found = signatures(scan.replicates, begin(scan.replicates).evaluation, [t.sensors for t in trials if t.sensors])
     return [replace(t, signature=s) for t, s in zip(trials, found, strict=True) if not isinstance(s, str)]
+
+
+def test_a_map_makes_no_cascade_that_does_not_end() -> None:
+    """A pixel without light has any probability of afterpulses: at 1, its recording has 50 million events."""
+    assert bounds_of(PROBABILITY) == (0.0, 0.9)
+    assert bounds_of(("detection", "pdp")) == (0.0, 1.0)

@@ -642,14 +642,14 @@ def test_a_template_of_another_strength_does_not_hide_one_that_promises(lab) -> 
     weak, strong = (
         Trial(candidate, v, m, 0.0, 1.0) for (_, v), m in zip(tries, (like, Signature({}, {}, {})), strict=True)
     )
-    assert [t.values for t in look._still(evaluation, tries, [strong])] == [strong.values]
+    assert [t.values for t in look._still(evaluation, tries, [strong], True)] == [strong.values]
     cells = len(evaluation.residuals[cell])
     evaluation.residuals[cell] = np.full(cells, 4.0)
     usual = np.maximum(evaluation.nulls[cell].expected(replicates.seen["flat"].total)[0], 1.0)
     weak.signature = Signature({cell: 4.0 * np.sqrt(usual)}, {}, {})
     weak.fall, _ = look.line_search(evaluation, weak.signature, weak.signed)
     assert weak.fall > 25
-    assert look._still(evaluation, tries, [weak, strong]) == []
+    assert look._still(evaluation, tries, [weak, strong], True) == []
 
 
 def test_a_time_is_tried_short_and_long(lab) -> None:

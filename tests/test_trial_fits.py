@@ -154,7 +154,7 @@ def test_a_map_goes_unless_a_check_fails_without_it(lab, monkeypatch, without: i
         for name in ("per_pixel dark_counts.rate", "add blinking_dark_counts")
     )
     path.steps, path.scan.accepted = [map_, last], [map_.candidate, last.candidate]
-    monkeypatch.setattr("spadmnist.inference.elimination.fit_all", lambda path: None)
+    monkeypatch.setattr("spadmnist.inference.elimination.fit_all", lambda path, known=None: None)
     monkeypatch.setattr(
         ModelPath, "failed", property(lambda self: ["a check"] * (1 if map_ in self.steps else without))
     )
@@ -195,7 +195,7 @@ def test_numbers_that_were_fitted_since_do_not_move_twice(lab, monkeypatch) -> N
     one = Trial(duration, {DURATION: 60e-9}, NOTHING, 20.0, 1.0, before.sensors)
     seen = []
     monkeypatch.setattr(
-        "spadmnist.inference.model_path.fit_all", lambda path, fit, known: seen.append((path.values, known))
+        "spadmnist.inference.model_path.fit_all", lambda path, fit, known, columns: seen.append((path.values, known))
     )
     accept(path, one, 1.0)
     path.values, path.steps, path.scan.accepted = {CROSSTALK: 0.025}, [], []

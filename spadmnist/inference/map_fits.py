@@ -57,6 +57,8 @@ _LARGEST_STEP = 0.7  # of an estimate in an iteration: a factor of 2, beyond whi
 _LARGEST_FREE_STEP = 2.0  # the same without a prior, for which little holds an estimate back
 _LARGEST_SHIFT = 0.5  # of the mean of all pixels in an iteration
 _LEVEL_STEP = 2.0  # factor: the most that a light level changes in an iteration
+# probability of a child of an avalanche, at most: at 1 a cascade does not end, here it has ten avalanches in the mean
+_CASCADE_ENDS = 0.9
 _FREE_TURNS = 2  # iterations before the prior's width is estimated, so that the maps have their shape by then
 
 
@@ -71,8 +73,11 @@ def base_of(sensor: Sensor, candidate: Candidate) -> float:
 
 
 def bounds_of(carrier: Key) -> tuple[float, float]:
-    """The least and the largest value of a parameter, SI."""
-    low, high = Effect.registry.find(carrier[0]).parameters[carrier[1]].bounds
+    """The least and the largest value of a parameter in a map, SI."""
+    effect = Effect.registry.find(carrier[0])
+    low, high = effect.parameters[carrier[1]].bounds
+    if effect.stage == "correlated" and high == 1:
+        high = _CASCADE_ENDS
     return 0.0 if low is None else low, math.inf if high is None else high
 
 
