@@ -94,9 +94,9 @@ def _drop_unless_missed(path: ModelPath, step: Step) -> None:
 
 
 def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
-    """The number of checks that fail clearly, wherever the coordinates of the fit are, to first order.
+    """The number of checks that fail clearly after the coordinates are fitted anew, to first order.
 
-    It is 0 where they are so far away that the first order does not hold.
+    It is 0 where the coordinates move so far that the first order does not hold.
 
     Args:
         evaluation: of the model without a step that has no coordinates of its own.

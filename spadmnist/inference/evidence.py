@@ -24,7 +24,7 @@ from .trial import Trial, is_pattern
 # the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
 # fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
 _FITTED, _NEAR = 3, 0.4
-# of the score of a trial: if as much remains beside another one, they do not compete. A guess
+# share of a trial's score that remains once another trial is in the model: from it on, the two do not compete
 _UNMOVED = 0.9
 _MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
 
@@ -98,12 +98,12 @@ def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
 
 
 def competing(replicates: Replicates, evaluation: Evaluation, trials: Sequence[Trial]) -> list[list[Trial]]:
-    """The trials in groups, in their order: in the first one those that compete with the first trial, and so on.
+    """Groups of trials that compete with each other, in the order of their first trials.
 
-    Two trials compete if one of them explains a part of what the other one explains, and with them all that compete
-    with either. Maps and patterns compete with each other. What has a scatter of its own, random odd pixels and
-    fluctuating light, competes with everything, because the squares do not say what it explains. A trial that does
-    not compete with a step needs no fit beside it: a later step finds it.
+    Two trials compete if one of them explains a part of what the other one explains. Trials that compete with the same
+    trial are in one group. Maps and patterns compete with each other. Random odd pixels and fluctuating light have a
+    scatter of their own, so that squares do not say what they explain: they compete with all trials. Each group is
+    fitted by itself, because a later step finds what does not compete with an earlier one.
     """
     groups: list[list[Trial]] = []
     for one in trials:
@@ -122,6 +122,7 @@ def leads(best: Trial, others: Sequence[Sequence[Trial]]) -> bool:
 
 
 def _compete(replicates: Replicates, evaluation: Evaluation, one: Trial, other: Trial) -> bool:
+    """Whether the score of either trial falls once the other one is in the model."""
     if (
         one.chips
         or other.chips
@@ -139,6 +140,7 @@ def _compete(replicates: Replicates, evaluation: Evaluation, one: Trial, other: 
 
 
 def _over_the_array(one: Trial) -> bool:
+    """Whether it is a map, or a pattern over the array."""
     return one.maps is not None or is_pattern(one)
 
 

@@ -359,10 +359,10 @@ class Scan:
     ) -> list[Trial]:
         """The known trials that are still candidates, at their best strength.
 
-        Those that the data resemble are left out where their signature, in standard deviations, is not what it was.
+        A trial that the data resemble is left out, to be simulated anew, if its signature has changed.
 
         Args:
-            anew: they all are.
+            anew: every trial that the data resemble is left out.
         """
         out, promising = [], set()
         for one in known:
@@ -376,10 +376,9 @@ class Scan:
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
 
     def _has_changed(self, evaluation: Evaluation, known: Trial) -> bool:
-        """Whether the signature of a known trial is surely another one with the steps that the model has now.
+        """Whether the size of a known signature, in standard deviations, is another one under this model.
 
-        Its cells may scatter in another way. Another shift does not show: the first look only chooses what the second
-        one simulates anew.
+        It shows that the cells have another scatter. It does not show another shift; the second look simulates that.
         """
         if any(known.candidate.effect == candidate.effect for candidate in self.accepted):
             return True
