@@ -174,6 +174,7 @@ class Effect(Plugin, abstract=True):
     on_light: ClassVar[bool] = False  # it acts on the light alone: a common factor is another light level
     is_pattern: ClassVar[bool] = False  # it is a shape over the array, or of the scene
     adds_rate: ClassVar[bool] = False  # it adds events of each pixel, whatever the light
+    has_children: ClassVar[bool] = False  # an event causes others, which may cause more: a cascade
 
     has_mean: ClassVar[bool] = False  # `expected_rate` has the mean of `factor` or `open` to take
     states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
@@ -192,7 +193,12 @@ class Effect(Plugin, abstract=True):
             ways = " or ".join(group.replace("+", " and ") for group in STAGES[chosen])
             raise TypeError(f"{cls.__name__}: an effect at stage {chosen} must define {ways}")
         if "stage" in vars(cls):  # a subclass without a stage of its own keeps what was declared
-            by_stage = {"on_light": ("light", "detection"), "is_pattern": ("light",), "adds_rate": ("dark",)}
+            by_stage = {
+                "on_light": ("light", "detection"),
+                "is_pattern": ("light",),
+                "adds_rate": ("dark",),
+                "has_children": ("correlated",),
+            }
             for name, stages in by_stage.items():
                 if name not in vars(cls):
                     setattr(cls, name, chosen in stages)

@@ -76,7 +76,7 @@ def bounds_of(carrier: Key) -> tuple[float, float]:
     """The least and the largest value of a parameter in a map, SI."""
     effect = Effect.registry.find(carrier[0])
     low, high = effect.parameters[carrier[1]].bounds
-    if effect.stage == "correlated" and high == 1:
+    if effect.has_children and high == 1:
         high = _CASCADE_ENDS
     return 0.0 if low is None else low, math.inf if high is None else high
 
