@@ -182,7 +182,7 @@ def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:
     other = replace(candidate, effect="other", kind="add")
     known = look._periodic
     assert other.name != candidate.name
-    known._known = [("add other", {("other", "rate"): 1.0}, known._known[0][2]), *known._known]
+    known._known = [("add other", {("other", "rate"): 1.0}, *known._known[0][2:]), *known._known]
     far = {**tries[0], key: line.frequency + 2 * line.error}
     assert not isinstance(known.signature(replicates, evaluation, candidate, far, line), str)
     assert replicates.simulations > done

@@ -23,9 +23,9 @@ from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step
 from spadmnist.inference.scan import Scan
-from spadmnist.inference.signature import Signature, captures_showing, residuals_at
+from spadmnist.inference.signature import IGNORED, Signature, captures_showing, residuals_at
 from spadmnist.inference.trial import Trial
-from spadmnist.inference.trial_fits import IGNORED, _fails_own_checks, _probe
+from spadmnist.inference.trial_fits import _fails_own_checks, _probe
 
 NOTHING = Signature({}, {}, {})
 SERVICE = ("readout_loss", "service_time")
@@ -93,10 +93,10 @@ def test_probes_are_for_checks_that_the_candidate_moves(lab, monkeypatch, size: 
     monkeypatch.setattr("spadmnist.inference.trial_fits.template_of", lambda replicates, evaluation, signature: trace)
     one = Trial(change_of(replicates, "add crosstalk"), {}, NOTHING, 0.0, 1.0)
     found: Any = SimpleNamespace(residuals=residuals)
-    assert _fails_own_checks(replicates, evaluation, one, found) == asked
+    assert _fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
     trace[cell][0], trace[TOTALS][:] = 0.0, size
     found.residuals = {**evaluation.residuals, TOTALS: np.full(len(evaluation.residuals[TOTALS]), 20.0)}
-    assert _fails_own_checks(replicates, evaluation, one, found) == asked
+    assert _fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
 
 
 def test_captures_that_show_hardly_anything_of_it_are_left_out() -> None:
@@ -173,7 +173,7 @@ def test_a_model_that_was_simulated_to_be_weighed_is_not_simulated_again(lab) ->
         one = given(path, "add crosstalk", {CROSSTALK: 0.03}, fitted=True)
         before = path.replicates.simulations
         if weighed:
-            evaluation_of(path.replicates, one)
+            evaluation_of(path.replicates, path.evaluation, one)
             assert path.replicates.simulations - before == 2 * 16
             before = path.replicates.simulations
         accept(path, one, 1.0)
@@ -195,9 +195,9 @@ def test_numbers_that_were_fitted_since_do_not_move_twice(lab, monkeypatch) -> N
     one = Trial(duration, {DURATION: 60e-9}, NOTHING, 20.0, 1.0, before.sensors)
     seen = []
     monkeypatch.setattr(
-        "spadmnist.inference.model_path.fit_all", lambda path, fit, known, columns: seen.append((path.values, known))
+        "spadmnist.inference.model_path.fit_all", lambda path, fit, known, *_: seen.append((path.values, known))
     )
-    accept(path, one, 1.0)
+    accept(path, replace(one, maps={}), 1.0)  # the maps are fitted anew, so that the model is simulated anew
     path.values, path.steps, path.scan.accepted = {CROSSTALK: 0.025}, [], []
     accept(path, replace(one, evaluation=before), 1.0)
     assert seen == [
@@ -265,7 +265,7 @@ def test_what_is_fitted_is_looked_at_everywhere(lab, monkeypatch) -> None:
     """Also where its first values did nothing, so that nobody looked there while it was fitted."""
     path = begin(bench_of(lab(dead=55)))
     replicates, evaluation = path.replicates, path.evaluation
-    monkeypatch.setattr("spadmnist.inference.trial_fits.captures_showing", lambda *_: ["dark"])
+    monkeypatch.setattr("spadmnist.inference.trial_fits.captures_informing", lambda *_: ["dark"])
     one = given(path, "set dead_time.duration", {DURATION: 55e-9}, True)
     assert one.there is not None and one.fit is not None and one.residuals is not None
     assert ("flat", "edge_intervals") in one.there.shifts

@@ -6,7 +6,7 @@ Every statistic of every capture is a check. Holm's correction keeps false alarm
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from .light_levels import (
     central_level,
     law_of,
     levels_about,
+    matched_light,
     most_detections,
     of_mean,
     own_totals,
@@ -42,6 +43,7 @@ _NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noi
 # replicates at the stated rates where pixels blink; standard deviations of their totals within which a total is one
 _BLINKING, _SCATTERS = 16, 4.0
 _PILOTS = 5  # rounds of a few replicates in which the level is found that gives the measured total, at most
+_SAME_TOTAL = 1e-5  # of a log: totals that differ by less are the same, far below the noise of any capture
 _FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
 
 
@@ -59,6 +61,7 @@ class Evaluation:
         residuals: (cells,) standard deviations; `TOTALS` is a block of its own.
         replicate_residuals: (replicates, cells), the same of the replicates.
         judgements: p-values and more, by (capture, statistic).
+        borrowed: captures whose replicates are those of another model, from which this one hardly differs there.
     """
 
     values: dict[Key, Any]
@@ -71,6 +74,7 @@ class Evaluation:
     replicate_residuals: dict[Cell, np.ndarray]
     judgements: dict[Cell, Judgement]
     space: tuple[list[str], np.ndarray, np.ndarray, np.ndarray] | None = None  # see `totals_space`
+    borrowed: frozenset[str] = frozenset()
     _kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)  # see `once`
 
     def before(self, cell: Cell, few: int) -> tuple[np.ndarray, np.ndarray]:
@@ -122,6 +126,7 @@ def evaluate(
     number: int | None = None,
     known: Evaluation | None = None,
     remember: bool = False,
+    near: tuple[Evaluation, Collection[str]] | None = None,
 ) -> Evaluation:
     """The evaluation of a model: null distributions of all captures, residuals of the data and of the replicates.
 
@@ -131,11 +136,13 @@ def evaluate(
         number: of replicates of each capture; by default that of `replicates`.
         known: an evaluation of the same model by fewer replicates, which are the first of these.
         remember: the cache on disk is read and written.
+        near: the evaluation of another model, and the captures in which this one differs from it. The replicates of the
+            other captures are borrowed from it, where the closed forms give the total.
     Raises:
         SpadError: where the model cannot be simulated.
     """
     try:
-        return _evaluate(replicates, values, sensors, number, known, remember)
+        return _evaluate(replicates, values, sensors, number, known, remember, near)
     except SpadError:
         raise
     except UNABLE as error:
@@ -149,18 +156,24 @@ def _evaluate(
     number: int | None,
     known: Evaluation | None,
     remember: bool,
+    near: tuple[Evaluation, Collection[str]] | None,
 ) -> Evaluation:
     sensors = sensors or Model.same(with_values(replicates.start, values))
     n = number or replicates.number
     # evenly spread for any number of them, for the first of them, and for every fourth
     spread = 2 * np.modf((np.arange(n) + 0.5) * _GOLDEN)[0] - 1
     about, wanted, entries = {}, [], dict[str, str | None]()
-    before = dict(known.made) if known else {}
-    evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {})
-    centres = _centres(replicates, sensors)
+    before = {id: made for id, made in known.made.items() if id not in known.borrowed} if known else {}
+    same = _same_level(replicates, sensors, n, *near) if near else {}
+    evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {}, borrowed=frozenset(same))
+    centres = _centres(replicates, sensors, same)
     for id, seen in replicates.seen.items():
         if seen.counts is None:
             evaluation.rates[id], evaluation.factors[id] = of_mean(sensors.mean_sensor(id), seen.capture, seen.total, n)
+            continue
+        if near and id in same:
+            about[id] = *same[id], near[0].factors[id][:n]
+            before[id] = near[0].made[id].first(n)
             continue
         centre, stated, expected, half = centres[id]
         factors = np.exp(half * spread)
@@ -214,7 +227,31 @@ def _evaluate(
 _Centre = tuple[float, float | None, Callable[[float], float], float]  # see `central_level`
 
 
-def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
+def _same_level(
+    replicates: Replicates, sensors: Model, number: int, near: Evaluation, differs: Collection[str]
+) -> dict[str, tuple[float, float | None, Callable[[float], float]]]:
+    """(level, stated level, level -> detections) of each capture whose replicates can be borrowed.
+
+    At that level the model gives as many detections as the other one gave at its own level.
+
+    Args:
+        number: of replicates.
+        near: the evaluation of the other model.
+        differs: the captures in which the two differ.
+    """
+    out = {}
+    for id, made in near.made.items():
+        sensor, null = sensors.mean_sensor(id), near.rates[id]
+        if id in differs or len(made.numbers) < number or not all(effect.states_mean for effect in sensor.effects):
+            continue
+        level = null.level * matched_light(replicates, near, sensor, id)
+        _, stated, expected, _ = central_level(replicates, sensor, replicates.seen[id])
+        if abs(math.log(expected(level) / null.expected(null.level))) < _SAME_TOTAL:
+            out[id] = level, stated, expected
+    return out
+
+
+def _centres(replicates: Replicates, sensors: Model, without: Collection[str] = ()) -> dict[str, _Centre]:
     """Of each capture that is simulated, the result of `central_level`.
 
     Where an effect does not say what it does to the mean, a few replicates do: at another brightness than the measured
@@ -223,7 +260,7 @@ def _centres(replicates: Replicates, sensors: Model) -> dict[str, _Centre]:
     out = {
         id: central_level(replicates, sensors.mean_sensor(id), seen)
         for id, seen in replicates.seen.items()
-        if seen.counts is not None
+        if seen.counts is not None and id not in without
     }
     some = [id for id in out if not all(effect.states_mean for effect in sensors.mean_sensor(id).effects)]
     numbers = np.arange(FEW, dtype=np.uint64)

@@ -18,7 +18,7 @@ from .evaluation import Evaluation, evaluate, log_likelihood_ratio, stacked
 from .levels import OPTIMISM_OF_A_PARAMETER, PROMISING
 from .replicates import TOTALS, Replicates
 from .score_test import sigmas_of
-from .signature import Signature, residuals_at, template_of
+from .signature import IGNORED, Signature, captures_showing, residuals_at, template_of
 from .trial import Trial, is_pattern
 
 # the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
@@ -44,7 +44,7 @@ def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> f
     if one.faint and not (one.chips or one.fluctuates):
         return one.fall - optimism(one)
     template = template_of(replicates, evaluation, (one.there or one.signature).at(one.times))
-    return log_likelihood_ratio(evaluation, evaluation_of(replicates, one), template) - optimism(one)
+    return log_likelihood_ratio(evaluation, evaluation_of(replicates, evaluation, one), template) - optimism(one)
 
 
 def _evidence_of_map(one: Trial) -> float:
@@ -67,11 +67,17 @@ def optimism(one: Trial) -> float:
     return phases + held_out.optimism(one.fit.residuals, one.fit)
 
 
-def evaluation_of(replicates: Replicates, one: Trial) -> Evaluation:
-    """The evaluation of a trial's model, made once."""
+def evaluation_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> Evaluation:
+    """The evaluation of a trial's model, made once; captures that do not show the trial are not simulated.
+
+    Args:
+        evaluation: of the model without the trial.
+    """
     if one.evaluation is None:
         assert one.sensors is not None
-        one.evaluation = evaluate(replicates, {}, one.sensors)
+        template = template_of(replicates, evaluation, (one.there or one.signature).at(one.times))
+        near = None if one.fluctuates else (evaluation, captures_showing(template, *IGNORED))
+        one.evaluation = evaluate(replicates, {}, one.sensors, near=near)
     return one.evaluation
 
 

@@ -221,6 +221,7 @@ def gauss_newton_step(
     errors: Mapping[Key, float] | None = None,
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
     before: Fit | None = None,
+    only: Callable[[Key], Collection[str]] = lambda key: (),
 ) -> Fit | str:
     """One Gauss-Newton step from an evaluation, with its full number of replicates; a reason where there is none.
 
@@ -235,6 +236,8 @@ def gauss_newton_step(
         known: columns of the Jacobian, (cells,) by block, of which only the size is uncertain; the noise of a faint
             effect hides its shape.
         before: a fit from an evaluation near by, whose Jacobian still holds.
+        only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
+            the others.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -244,7 +247,8 @@ def gauss_newton_step(
     if before is not None and before.coordinates == coordinates:
         jacobian = np.stack([stacked(column_of(before, i, evaluation), keys) for i in range(len(coordinates))], axis=1)
     else:
-        jacobian = _jacobian(replicates, evaluation, coordinates, u, values, sensors_of, few, errors or {}, known or {})
+        given = replicates, evaluation, coordinates, u, values, sensors_of, few
+        jacobian = _jacobian(*given, errors or {}, known or {}, [only(d.key) for d in coordinates])
     if isinstance(jacobian, str):
         return jacobian
     covariance = covariance_of(jacobian, own)
@@ -276,11 +280,13 @@ def _jacobian(
     few: int,
     errors: Mapping[Key, float],
     known: Mapping[Key, Mapping[Cell, np.ndarray]],
+    only: Sequence[Collection[str]],
 ) -> np.ndarray | str:
     """The Jacobian of the residuals at an evaluation, (cells, coordinates), or a reason.
 
     Args:
         u: (coordinates,) the point of the evaluation; the others as in `gauss_newton_step`.
+        only: of each coordinate, as there.
     """
     keys = list(evaluation.residuals)
     cells = sum(len(evaluation.residuals[key]) for key in keys)
@@ -296,7 +302,12 @@ def _jacobian(
     for bare in (False, True):
         some = [k for k in range(len(points)) if (k // 2 in columns) == bare]
         made = signatures(
-            replicates, evaluation, [sensors_of(values_there[k]) for k in some], few, kept="all" if bare else "likely"
+            replicates,
+            evaluation,
+            [sensors_of(values_there[k]) for k in some],
+            few,
+            kept="all" if bare else "likely",
+            only_of=[only[k // 2] for k in some],
         )
         for k, m in zip(some, made, strict=True):
             if isinstance(m, str):

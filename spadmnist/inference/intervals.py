@@ -17,8 +17,8 @@ from .model_path import ModelPath, keys_of
 from .pixel_maps import HALF_95
 from .replicates import FEW
 from .results import Value
-from .signature import captures_showing, residuals_at, signatures
-from .trial_fits import EXCLUDED, IGNORED
+from .signature import IGNORED, captures_showing, residuals_at, signatures
+from .trial_fits import EXCLUDED
 
 _MOVED = 0.5  # standard deviations: a larger move of a coordinate needs another evaluation
 

@@ -17,16 +17,17 @@ from .evaluation import Evaluation, evaluate, square, stacked
 from .gauss_newton import Fit, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
-from .replicates import FEW, TOTALS, Cell
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value
-from .signature import residuals_at, signatures
+from .signature import IGNORED, captures_showing, residuals_at, signatures
 
 if TYPE_CHECKING:
     from .model_path import ModelPath
 
 _AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
 SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
-_WORTH = 6.0  # in chi square: a fall beyond which the fitted model is simulated
+# in chi square: a fall beyond which the fitted model is simulated; and beyond which it is at once, before the last step
+_WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
@@ -36,7 +37,11 @@ _LOST = 30.0  # in chi square: a rise beyond which a fitted step is not taken
 
 
 def fit_all(
-    path: ModelPath, fit: Fit | None = None, known: Evaluation | None = None, columns: Sequence[Fit] = ()
+    path: ModelPath,
+    fit: Fit | None = None,
+    known: Evaluation | None = None,
+    columns: Sequence[Fit] = (),
+    roughly: bool = False,
 ) -> None:
     """Fit the model with all its steps: the maps, then all coordinates together.
 
@@ -45,32 +50,49 @@ def fit_all(
         known: an evaluation of the model with it.
         columns: fits near by that hold a column of the Jacobian for every coordinate together; the Jacobian is made
             of these while the squares fall as it says, and `path.approximate` is set. It is simulated without them.
+        roughly: the maps stay as they are, and captures in which the coordinates move nothing are not simulated again;
+            `complete_fit` does both. It needs an evaluation of the model.
     """
-    sensors, maps = model_of(path)
+    if roughly and known is not None:
+        maps = {step.candidate.carrier: step.map for step in path.steps if step.candidate.carrier and step.map}
+    else:
+        sensors, maps = model_of(path)
     evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
     coordinates = path.free
     found: Fit | None = None
     path.approximate = False
     if coordinates:
         near = _side_by_side(evaluation, coordinates, columns)
-        found, evaluation, maps = _gauss_newton(path, evaluation, maps, coordinates, edge_errors(path, fit), near)
+        given = evaluation, maps, coordinates, edge_errors(path, fit), near, roughly
+        found, evaluation, maps = _gauss_newton(path, *given)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
+    path.approximate = path.approximate or (roughly and bool(maps))
     path.evaluation = evaluation
     path.fit = found = None if found is None else _bounded(path, found)
     _write_values(path, found, maps)
 
 
 def complete_fit(path: ModelPath) -> None:
-    """Fit all coordinates together by a Jacobian at the model with all steps, where the last one was approximate."""
-    if not path.approximate:
+    """Fit the maps and all coordinates together at the model with all steps, where the last fit was a rough one."""
+    if not (path.approximate or path.evaluation.borrowed):
         return
     path.replicates.say("fitting all numbers together")
     before = path.kept()
-    known = None if any(candidate.carrier for candidate in path.scan.accepted) else path.evaluation
+    maps = any(candidate.carrier for candidate in path.scan.accepted)
+    known = None if maps and path.approximate else completed(path.replicates, path.evaluation)
     path.values = dict(path.values if known is None else known.values)
-    fit_all(path, known=known)
-    if path.fit is None:  # the model cannot be simulated around its values
+    fit_all(path, known=known, columns=[path.fit] if path.fit is not None and not path.approximate else ())
+    path.approximate = False
+    if path.fit is None and before[4] is not None:  # the model cannot be simulated around its values
         path.back_to(before)
+
+
+def completed(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
+    """The evaluation with replicates of its own in all captures."""
+    if not evaluation.borrowed:
+        return evaluation
+    number = len(evaluation.replicate_residuals[TOTALS])
+    return evaluate(replicates, evaluation.values, evaluation.sensors, number, evaluation)
 
 
 def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], fits: Sequence[Fit]) -> Fit | None:
@@ -96,6 +118,7 @@ def _gauss_newton(
     coordinates: tuple[Coordinate, ...],
     errors: Mapping[Key, float],
     near: Fit | None = None,
+    roughly: bool = False,
 ) -> tuple[Fit | None, Evaluation, dict[Key, pixel_maps.PixelMap]]:
     """(fit of all coordinates, evaluation of the model, its maps), from values near the best ones.
 
@@ -103,6 +126,7 @@ def _gauss_newton(
 
     Args:
         near: a fit whose Jacobian is taken at first.
+        roughly: see `fit_all`.
     """
     replicates, known = path.replicates, _known_jacobian(path)
     fit: Fit | None = None
@@ -122,21 +146,30 @@ def _gauss_newton(
             errors,
             known,
             near,
+            functools.partial(_shown, path),
         )
         if isinstance(closer, str):
             if rejected is not None:
                 fit, path.approximate = rejected, True
             break
         fit = closer
-        if turn == _AGAIN or square(evaluation.residuals) - closer.square < _WORTH:
+        worth = _WORTH_AT_ONCE if roughly else _WORTH
+        if turn == _AGAIN or square(evaluation.residuals) - closer.square < worth:
             break
         before = path.values, maps, evaluation
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
             path.values = {**before[0], **step.values}
-            sensors, maps = model_of(path)
-            evaluation = evaluate(replicates, path.values, sensors)
+            if roughly:
+                move = step.point - point_of(coordinates, here)
+                shown = captures_showing({cell: x @ move for cell, x in closer.jacobian.items()}, *IGNORED)
+                sensors = path.model_at(before[2], step.values)
+                evaluation = evaluate(replicates, path.values, sensors, near=(before[2], shown))
+            else:
+                sensors, maps = model_of(path)
+                evaluation = evaluate(replicates, path.values, sensors)
             risen = square(evaluation.residuals) - square(before[2].residuals)
-            if risen <= _RISEN * _noise_of_square(before[2]):
+            noise = _noise_of_square(before[2])
+            if risen <= _RISEN * noise:
                 break
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
@@ -146,8 +179,8 @@ def _gauss_newton(
                 continue
             fit = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             break
-        fell, promised = (square(before[2].residuals) - x for x in (square(evaluation.residuals), closer.square))
-        if path.approximate and fell < _KEPT * promised:  # the Jacobian is that of another model
+        promised = square(before[2].residuals) - closer.square
+        if path.approximate and -risen < _KEPT * promised - noise:  # the Jacobian is that of another model
             path.values, maps, evaluation = before
             rejected = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             path.approximate, near, turn = False, None, -1
@@ -290,6 +323,14 @@ def _known_jacobian(path: ModelPath) -> dict[Key, dict[Cell, np.ndarray]]:
         for i, coordinate in enumerate(step.coordinates if step.jacobian else ()):
             out[coordinate.key] = {cell: x[:, i] for cell, x in step.jacobian.items()}
     return out
+
+
+def _shown(path: ModelPath, key: Key) -> list[str]:
+    """The captures that show the step with this coordinate; none where that is not known."""
+    for step in path.steps:
+        if any(d.key == key for d in step.coordinates) and not (step.chips or step.fluctuates):
+            return captures_showing(step.template, *IGNORED)
+    return []
 
 
 def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from . import held_out
+from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key
 from .error_budget import HeldMaps, Rung, physical_errors
 from .evaluation import BlockCheck, Evaluation, block_checks, failing, mean_misfit
+from .evidence import evaluation_of
 from .gauss_newton import Fit
 from .joint_fit import fit_all
 from .models import Model
@@ -22,12 +23,16 @@ from .random_pixels import PixelsHit, of_pixels, pixels_hit
 from .replicates import Cell, Replicates
 from .results import Step, title
 from .scan import Scan
-from .signature import template_of
+from .score_test import PIXELS
+from .signature import IGNORED, template_of
 from .trial import Trial
 
 # of a coordinate (a logarithm, mostly): a move by which it is decided whether the coordinate changes the model. Any
 # that is not rounded off does
 _ASIDE = 0.01
+_INFORMS = (
+    0.05  # of the largest mean information of a capture on a map: with less of it, a capture hardly moves the map
+)
 
 
 @dataclass
@@ -48,7 +53,7 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
-    approximate: bool = False  # the Jacobian of `fit` is that of fits near by
+    approximate: bool = False  # the Jacobian of `fit`, or the maps, are those of models near by
     # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
     located: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -192,6 +197,7 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
         significance: of the candidate, standard deviations.
     """
     replicates, before = path.replicates, path.evaluation
+    roughly = not (best.fluctuates or before.fluctuates) and _moves_no_map(path, best)
     new = [
         Step(
             candidate,
@@ -213,14 +219,38 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     path.scan.accepted += best.candidates
     path.scan.phases.update(best.phases)
     path.steps += new
-    known = best.evaluation if not any(candidate.carrier for candidate in path.scan.accepted) else None
+    known = evaluation_of(replicates, before, best) if roughly and best.sensors is not None else None
+    if known is None and not any(candidate.carrier for candidate in path.scan.accepted):
+        known = best.evaluation
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
     path.values = {**(path.values if known is None else before.values), **best.values}
     # a later step makes all be fitted again: the columns as they were fitted do until then
     likely = len(path.steps) > len(new) and not (best.chips or best.fluctuates)
-    fit_all(path, best.fit, known, [fit for fit in (path.fit, best.fit) if fit is not None] if likely else ())
+    columns = [fit for fit in (path.fit, best.fit) if fit is not None] if likely else []
+    fit_all(path, best.fit, known, columns, roughly)
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new
+
+
+def _moves_no_map(path: ModelPath, best: Trial) -> bool:
+    """Whether the maps of the model stay as they are with a trial: the captures that inform them hardly show it."""
+    if best.maps is not None:
+        return False
+    replicates, evaluation = path.replicates, path.evaluation
+    template = template_of(replicates, evaluation, (best.there or best.signature).at(best.times))
+    levels = count_model.light_levels_of(replicates, evaluation)
+    for candidate in path.scan.accepted:
+        if not candidate.carrier:
+            continue
+        if candidate.per != "code" and not pixel_maps.by_counts(candidate):
+            return False
+        name = pixel_maps.CODES if candidate.per == "code" else PIXELS
+        known = map_models.information(replicates, evaluation.values, candidate, levels)
+        most = max(float(np.mean(x)) for x in known.values())
+        some = [id for id, x in known.items() if float(np.mean(x)) > _INFORMS * most]
+        if sum(float(t @ t) for cell, t in template.items() if cell[0] in some and cell[1] == name) > IGNORED[1]:
+            return False
+    return True
 
 
 def material(one: Trial) -> str:

@@ -31,7 +31,7 @@ from .evaluation import BlockCheck, Evaluation, evaluate, misfit_null_95
 from .evidence import best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
 from .findings import mimicked
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
-from .joint_fit import complete_fit
+from .joint_fit import complete_fit, completed
 from .journal import Journal
 from .levels import FALSE_ALARM, LEAST_EVIDENCE
 from .map_trials import patterns_first, random_map_trials
@@ -132,8 +132,9 @@ def _diagnosed(
     with _or_as_before(path, "the intervals"):
         open_ends(path)
     replicates.budget.until = math.inf
-    if path.steps:
-        with _or_as_before(path, "the last comparison"):
+    with _or_as_before(path, "the last comparison"):
+        path.evaluation = completed(replicates, path.evaluation)  # where the budget has ended the fit of all numbers
+        if path.steps:
             path.last_rung()
     verdict = verdict_of(path, left_over(path, notes), notes)
     if not path.steps:

@@ -127,7 +127,8 @@ class PeriodicSignatures:
     """The signatures of periodic candidates; each is simulated once."""
 
     def __init__(self) -> None:
-        self._known: list[tuple[str, Mapping[Key, Any], PeriodicSignature]] = []  # candidate's name, values
+        # candidate's name, values, replicates
+        self._known: list[tuple[str, Mapping[Key, Any], int, PeriodicSignature]] = []
 
     def signature(
         self,
@@ -136,6 +137,7 @@ class PeriodicSignatures:
         candidate: Candidate,
         values: Mapping[Key, Any],
         line: Line | None,
+        few: int = FEW,
     ) -> PeriodicSignature | str:
         """The signature of a candidate at any phase, or the reason why it cannot be simulated.
 
@@ -144,16 +146,17 @@ class PeriodicSignatures:
 
         Args:
             values: SI; line: that of the data at its frequency.
+            few: replicates of each capture, at least.
         """
         within = {d.key: line.error if line and d.kind == "frequency" else 0.0 for d in candidate.shapes}
-        for name, known, found in self._known:
-            if name == candidate.name and all(
+        for name, known, number, found in self._known:
+            if (name == candidate.name and number >= few) and all(
                 known[k] == x or (within.get(k) and abs(known[k] - x) <= within[k]) for k, x in values.items()
             ):
                 return found
-        made = simulate_phases(replicates, evaluation, candidate.phases, values, FEW)
+        made = simulate_phases(replicates, evaluation, candidate.phases, values, few)
         if not isinstance(made, str):
-            self._known.append((candidate.name, dict(values), made))
+            self._known.append((candidate.name, dict(values), few, made))
         return made
 
 

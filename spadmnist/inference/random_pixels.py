@@ -27,7 +27,7 @@ from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelih
 from .gauss_newton import Fit, gauss_newton_step
 from .models import Model
 from .replicates import FEW, Replicates
-from .signature import residuals_at, signatures, template_of
+from .signature import IGNORED, captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 
 _OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: few, for there may be a dozen shapes
@@ -49,10 +49,15 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
         SpadError: where it cannot be simulated.
     """
     assert one.fit is not None and one.sensors is not None
-    one.evaluation = evaluate(replicates, {}, one.sensors)
+    template = template_of(replicates, evaluation, one.signature)
+    some = captures_showing(template, *IGNORED)
+
+    def evaluated(sensors: Model, number: int | None = None) -> Evaluation:
+        return evaluate(replicates, {}, sensors, number, near=(evaluation, some))
+
+    one.evaluation = evaluated(one.sensors)
     if not failing(block_checks(replicates, one.evaluation, one.evaluation.residuals)):
         return one
-    template = template_of(replicates, evaluation, one.signature)
 
     def model(values: Mapping[Key, Any]) -> Model:
         return evaluation.sensors.changed(values, one.phases, chips=True)
@@ -62,10 +67,10 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
 
     coordinates, given = one.fit.coordinates, ratio(one.evaluation)
     here, there = dict(one.values), one.evaluation
-    values = _of_the_best_shape(replicates, one, model, ratio)
+    values = _of_the_best_shape(one, lambda values: ratio(evaluated(model(values), _OF_A_SHAPE)))
     if values is not None:
         try:
-            other = evaluate(replicates, {}, model(values))
+            other = evaluated(model(values))
             here, there = (values, other) if ratio(other) > given else (here, there)
         except SpadError:
             pass  # with more replicates there is no such model
@@ -73,7 +78,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     vain = 0
     for _ in range(_TURNS):
         try:
-            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW)
+            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW, only=lambda key: some)
             if isinstance(found, str):
                 break
             at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)
@@ -83,7 +88,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
                 vain += 1
             if vain == _VAIN or square(there.residuals) - found.square < _PROMISED * len(coordinates):
                 break
-            here, there = dict(found.values), evaluate(replicates, {}, model(found.values))
+            here, there = dict(found.values), evaluated(model(found.values))
         except OutOfBudget:
             if best is None:
                 raise
@@ -93,7 +98,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     if best is None:
         return one
     _, there, fit = best
-    (signature,) = signatures(replicates, evaluation, [there.sensors])
+    (signature,) = signatures(replicates, evaluation, [there.sensors], only=some)
     if isinstance(signature, str):
         raise SpadError(signature)
     residuals = residuals_at(replicates, evaluation, signature)
@@ -104,14 +109,16 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     return one
 
 
-def _of_the_best_shape(
-    replicates: Replicates, one: Trial, model: Callable[[Values], Model], ratio: Callable[[Evaluation], float]
-) -> dict[Key, Any] | None:
-    """The values of another shape that is likelier than the fitted one, by a few replicates of each; None: none is."""
+def _of_the_best_shape(one: Trial, ratio: Callable[[Values], float]) -> dict[Key, Any] | None:
+    """The values of another shape that is likelier than the fitted one; None where there is none.
+
+    Args:
+        ratio: of the likelihoods, by a few replicates of each.
+    """
     likeliest: tuple[float, dict[Key, Any] | None] | None = None
     for values in ([dict(one.values)] if one.others else []) + [other.scaled() for other in one.others]:
         try:
-            found = ratio(evaluate(replicates, {}, model(values), _OF_A_SHAPE))
+            found = ratio(values)
         except SpadError:
             continue  # there is no such model at this strength
         if likeliest is None or found > likeliest[0]:

@@ -254,10 +254,10 @@ class Replicates:
 
     def charge(self, sensor: Sensor, id: str, number: int) -> None:
         """Spend the work of replicates that are remembered: an answer does not depend on what is in the cache."""
-        work = number * self._work(sensor, id)
+        work = number * self.work_of(sensor, id)
         self.budget.spend(work, remembered=work)
 
-    def _work(self, sensor: Sensor, id: str) -> float:
+    def work_of(self, sensor: Sensor, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
         seen = self.seen[id]
         capture = seen.capture if seen.half_of is None else seen.half_of[0]
@@ -293,7 +293,7 @@ class Replicates:
                 if len(numbers):
                     first = sensors.of(id, int(numbers[0]))
                     most = max(most, self._bytes(first, id, photons))
-                    work[k] = len(numbers) * self._work(first, id)
+                    work[k] = len(numbers) * self.work_of(first, id)
                 for part in parts:
                     each = [0] if sensors.alike else [int(numbers[i]) for i in part]
                     models = [Packed.of(sensors.of(id, number), self.workers.apart) for number in each]

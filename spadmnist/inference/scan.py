@@ -41,6 +41,9 @@ from .trial_fits import STRONG
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
 _SCAN = 2  # replicates of each capture for the first look
 _SECOND = 6  # candidates in the second look
+# of the largest fall: with less of it a candidate has no second look. A first look at some captures has missed a factor
+# of a few, and a later step finds it again
+_HOPELESS = 0.05
 _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
 # of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
 _FAR_OFF = 0.4
@@ -195,7 +198,8 @@ class Scan:
             swing: Any = None
             line = self._line_at(evaluation, candidate, tried)
             with self.if_possible(candidate, _LOOKING, wholly=False):
-                swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line)
+                few = _SCAN if only else FEW  # a look at some captures chooses what is fitted, which simulates anew
+                swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line, few)
             if swing is None or isinstance(swing, str):
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
@@ -436,8 +440,10 @@ class Scan:
         further: list[Trial] = []
         if faint:
             tried = sorted((self._with_score(evaluation, t) for t in tried), key=lambda t: -t.fall)
+        most = 0.0 if faint else max((t.fall for t in tried if not t.chips), default=0.0)
         for one in tried:
-            if one.fall > 9 and all(b.candidate.name != one.candidate.name for b in best):
+            known = any(other.candidate.name == one.candidate.name for other in best)
+            if one.fall > max(9.0, _HOPELESS * most) and not known:
                 # of those with nearly the largest fall, the one simulated nearest to its best strength
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
                 alike = [t for t in same if t.fall > _NEARLY * one.fall]

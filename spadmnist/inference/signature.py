@@ -27,6 +27,11 @@ _SAME_SCATTER = 1.5
 _P_TOTALS = 2.3e-4  # one-sided p-value (3.5 sigma) below which totals deviate from the closed form
 _SURE_SQUARE = 30.0  # in variances: the square of a shift that is never noise
 _NEIGHBOURS = 9  # neighbouring powers, the median of which holds no line
+# of the square of a signature, as a share and in variances: captures with so little are not simulated
+IGNORED = 0.01, 4.0
+# of the square of a signature: captures with as much of it give the values of a first fit. Their error is 1.15 times
+# that of all captures, which costs a third of a chi square for each coordinate until all are fitted together
+_MOST_OF_IT = 0.75
 _SURELY = 8  # replicates of each capture where the totals of a few deviate from the closed form
 Kept = Literal["sure", "likely", "all"]  # which shifts are kept of what a few replicates show
 
@@ -378,10 +383,7 @@ def captures_showing(template: Mapping[tuple[str, str], np.ndarray], share: floa
         share: of the square that may be left out.
         most: the same in variances.
     """
-    squares: dict[str, float] = {}
-    for (id, _), t in template.items():
-        if id:
-            squares[id] = squares.get(id, 0.0) + float(t @ t)
+    squares = _squares(template)
     spare = min(share * sum(squares.values()), most)
     out = []
     for id in sorted(squares, key=lambda id: squares[id]):
@@ -389,3 +391,31 @@ def captures_showing(template: Mapping[tuple[str, str], np.ndarray], share: floa
         if spare < 0:
             out.append(id)
     return out
+
+
+def captures_informing(
+    replicates: Replicates, evaluation: Evaluation, template: Mapping[tuple[str, str], np.ndarray]
+) -> list[str]:
+    """The captures that hold most of the square of a signature for the least work of simulating them.
+
+    Args:
+        template: (cells,) standard deviations, by (capture, statistic).
+    """
+    squares = _squares(template)
+    work = {id: replicates.work_of(evaluation.sensors.mean_sensor(id), id) for id in squares}
+    wanted, out = _MOST_OF_IT * sum(squares.values()), list[str]()
+    for id in sorted(squares, key=lambda id: -squares[id] / work[id]):
+        if wanted <= 0:
+            break
+        out.append(id)
+        wanted -= squares[id]
+    return out
+
+
+def _squares(template: Mapping[tuple[str, str], np.ndarray]) -> dict[str, float]:
+    """The square of a signature in each capture, without the totals."""
+    squares: dict[str, float] = {}
+    for (id, _), t in template.items():
+        if id:
+            squares[id] = squares.get(id, 0.0) + float(t @ t)
+    return squares

@@ -16,12 +16,10 @@ from .gauss_newton import Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
 from .replicates import FEW, TOTALS, Replicates
-from .signature import captures_showing, residuals_at, signatures, size_of, template_of
+from .signature import IGNORED, captures_informing, captures_showing, residuals_at, signatures, size_of, template_of
 from .trial import Trial
 
 _ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
-# of the square of a signature, as a share and in variances: captures with so little are not simulated
-IGNORED = 0.01, 4.0
 STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
@@ -53,7 +51,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     coordinates = [d for d in one.candidate.coordinates if d.key in given and not d.whole]
     boost, power = _boost(replicates, evaluation, one, given)
     template = template_of(replicates, evaluation, one.signature.at(one.times))
-    some = captures_showing(template, *IGNORED)
+    # the squares that a faint effect leaves are those of this fit
+    some = captures_showing(template, *IGNORED) if boost > 1 else captures_informing(replicates, evaluation, template)
 
     def fit(values: Mapping[Key, Any], rounds: int = rounds) -> Fit | str:
         return gauss_newton(
@@ -74,7 +73,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         if coordinate.whole and coordinate.key in given:
             found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
             one.intervals |= intervals
-    if boost == 1 and _fails_own_checks(replicates, evaluation, one, found):
+    if boost == 1 and _fails_own_checks(replicates, evaluation, one, found, some):
         found = _probe(replicates, evaluation, one, found, some)
     one.faint = boost > 1
     one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
@@ -91,11 +90,17 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     return one
 
 
-def _fails_own_checks(replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit) -> bool:
-    """Whether a check fails at the fitted values, of those with a signature."""
+def _fails_own_checks(
+    replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit, only: Collection[str]
+) -> bool:
+    """Whether a check fails at the fitted values, of those with a signature.
+
+    Args:
+        only: the captures that were simulated in the fit.
+    """
     template = template_of(replicates, evaluation, one.signature.at(one.times))
     failed = failing(block_checks(replicates, evaluation, found.residuals))
-    own = {TOTALS if block.cell[0] == "" else block.cell for block in failed}
+    own = {TOTALS if block.cell[0] == "" else block.cell for block in failed if block.cell[0] in ("", *only)}
     return any(float(template[cell] @ template[cell]) > 1 for cell in own if cell in template)
 
 
