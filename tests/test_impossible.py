@@ -14,6 +14,7 @@ from spadmnist.errors import SpadError
 from spadmnist.inference import (
     alternatives,
     experiment_design,
+    forward_step,
     map_models,
     model_path,
     model_selection,
@@ -23,9 +24,10 @@ from spadmnist.inference import (
 )
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.evaluation import evaluate
+from spadmnist.inference.forward_step import or_as_before
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import begin
-from spadmnist.inference.model_selection import _or_as_before, diagnose
+from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.results import Step, Value, canonical, table
 from spadmnist.inference.scan import Scan
@@ -109,9 +111,9 @@ def test_a_closed_form_that_fails_is_told_by_the_bench(error: Exception, lab, mo
 STAGES: dict[str, tuple[Any, str, bool]] = {
     "scoring": (Scan, "scan", True),
     "looking again": (Scan, "again", True),
-    "refining": (model_selection, "fit_trial", True),
+    "refining": (forward_step, "fit_trial", True),
     "settling": (trial_fits, "gauss_newton", True),
-    "accepting": (model_selection, "accept", True),
+    "accepting": (forward_step, "accept", True),
     "all together": (model_path, "fit_all", True),
     "taking out": (model_selection, "drop_needless", False),
     "likelihood": (model_selection, "sharpen", False),
@@ -156,9 +158,9 @@ def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) 
 
 FAILING: dict[str, tuple[Any, str, bool]] = {
     "alternative": (alternatives, "_alternative", True),
-    "placebo": (model_selection, "placebo_of", True),
-    "chance": (model_selection, "p_of_best", False),
-    "evidence": (model_selection, "evidence_of", False),
+    "placebo": (forward_step, "placebo_of", True),
+    "chance": (forward_step, "p_of_best", False),
+    "evidence": (forward_step, "evidence_of", False),
     "advice": (experiment_design, "between", True),
 }
 
@@ -234,7 +236,7 @@ def test_steps_are_as_they_were_where_a_later_stage_fails(lab) -> None:
     candidate = next(c for c in candidates(replicates.start) if c.name == "add crosstalk")
     step = Step(candidate, {"probability": Value(0.01, 0.0, 0.02)}, 1.0, 9.0, "")
     path.steps, before = [step], dict(step.values)
-    with _or_as_before(path, "the intervals"):
+    with or_as_before(path, "the intervals"):
         step.values["probability"] = Value(0.5, 0.4, 0.6)
         path.steps = []
         raise OverflowError("too large")

@@ -15,11 +15,12 @@ from spadmnist.inference.coordinates import is_edge
 from spadmnist.inference.elimination import _drop_unless_missed
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
+from spadmnist.inference.forward_step import _best_of_scan_added
 from spadmnist.inference.joint_fit import complete_fit
 from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin
-from spadmnist.inference.model_selection import _best_added
+from spadmnist.inference.model_selection import _another
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
 from spadmnist.inference.trial import Trial
@@ -110,7 +111,7 @@ def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeyp
     edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
     cross = given(path, "add crosstalk", {CROSSTALK: 0.1}, fitted=False)
     trials = [replace(edge, fall=500.0), replace(cross, fall=400.0)]
-    module = "spadmnist.inference.model_selection."
+    module = "spadmnist.inference.forward_step."
 
     def taken_or_not(path: ModelPath, notes, failed, second, best, significance) -> bool:
         asked.append(best.candidate.name)
@@ -125,14 +126,14 @@ def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeyp
     monkeypatch.setattr(module + "p_of_best", lambda *_: (9.0, 1e-20))
     monkeypatch.setattr(module + "patterns_first", lambda scan, evaluation, second: second)
     monkeypatch.setattr(path.scan, "again", lambda *_: trials)
-    assert _best_added(path, Notes([], False), path.failed, 0.01) is helps
+    assert _best_of_scan_added(path, Notes([], False), path.failed, 0.01) is helps
     assert asked == ["set dead_time.duration", "add crosstalk"]
     assert [step.name for step in path.steps] == [asked[1] if helps else asked[0]]
     # a group of which the squares promise far more is fitted before one of little evidence is taken
     path.steps.clear()
     asked.clear()
     trials[1].fall = 2000.0
-    _best_added(path, Notes([], False), path.failed, 0.01)
+    _best_of_scan_added(path, Notes([], False), path.failed, 0.01)
     assert asked[0] == "add crosstalk"
 
 
@@ -226,3 +227,15 @@ def test_a_map_makes_no_cascade_that_does_not_end() -> None:
     """A pixel without light has any probability of afterpulses: at 1, its recording has 50 million events."""
     assert bounds_of(PROBABILITY) == (0.0, 0.9)
     assert bounds_of(("detection", "pdp")) == (0.0, 1.0)
+
+
+def test_what_does_not_compete_is_added_without_another_scan(lab, monkeypatch) -> None:
+    """Its signature is that of the second look; a new scan would find the same trial."""
+    path = begin(bench_of(lab(BOTH + FLICKER, light=400), 16))
+    notes, scans = Notes([], False), []
+    scan = Scan.scan
+    monkeypatch.setattr(Scan, "scan", lambda self, *a, **k: (scans.append(len(path.steps)), scan(self, *a, **k))[1])
+    while len(path.steps) < 3 and _another(path, notes):
+        pass
+    assert sorted(names(path)) == ["add afterpulsing", "add crosstalk", "add flicker"]
+    assert len(scans) < 3

@@ -17,11 +17,12 @@ from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import _share_of_counts, best_of, evidence_of, judge_maps_by_odd_pixels
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
 from spadmnist.inference.findings import mimicked
+from spadmnist.inference.forward_step import best_added
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.intervals import sharpen
 from spadmnist.inference.joint_fit import _bounded
 from spadmnist.inference.model_path import ModelPath, begin
-from spadmnist.inference.model_selection import _added, _another, _or_confused
+from spadmnist.inference.model_selection import _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, mimic
@@ -85,7 +86,7 @@ def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monk
     path = ModelPath(replicates, look, evaluation, {}, [], [])
     monkeypatch.setattr("spadmnist.inference.model_selection._by_setup", lambda *_: pytest.fail("the set-up was asked"))
     monkeypatch.setattr(look, "scan", lambda *_, **__: [])
-    monkeypatch.setattr("spadmnist.inference.model_selection._added", lambda *_: False)
+    monkeypatch.setattr("spadmnist.inference.model_selection.best_added", lambda *_: False)
     assert not _another(path, Notes([], False))
 
 
@@ -191,7 +192,7 @@ def looked_closer(path: ModelPath, monkeypatch: pytest.MonkeyPatch, added: Any) 
         return True
 
     monkeypatch.setattr("spadmnist.inference.model_selection._stands_out", stands_out)
-    monkeypatch.setattr("spadmnist.inference.model_selection._added", added)
+    monkeypatch.setattr("spadmnist.inference.model_selection.best_added", added)
     monkeypatch.setattr(path.scan, "scan", lambda *_, **__: [])
     return before, closer, _another(path, Notes([], False))
 
@@ -283,16 +284,16 @@ def test_where_something_is_wrong_few_recordings_do_not_hide_what_it_is(lab, mon
     path = begin(bench_of(lab()))
     one = Trial(change_of(path.replicates, "add crosstalk"), {CROSSTALK: 0.01}, Signature({}, {}, {}), 50.0, 1.0)
     monkeypatch.setattr(path.scan, "again", lambda *_: [one])
-    monkeypatch.setattr("spadmnist.inference.model_selection.worth_fitting", lambda *_: [one])
-    monkeypatch.setattr("spadmnist.inference.model_selection.evidence_of", lambda *_: 50.0)
-    monkeypatch.setattr("spadmnist.inference.model_selection.patterns_first", lambda scan, evaluation, tried: tried)
-    monkeypatch.setattr("spadmnist.inference.model_selection.fit_trial", lambda replicates, evaluation, one: one)
-    monkeypatch.setattr("spadmnist.inference.model_selection.p_of_best", lambda *_: (3.0, 0.2))
+    monkeypatch.setattr("spadmnist.inference.forward_step.worth_fitting", lambda *_: [one])
+    monkeypatch.setattr("spadmnist.inference.forward_step.evidence_of", lambda *_: 50.0)
+    monkeypatch.setattr("spadmnist.inference.forward_step.patterns_first", lambda scan, evaluation, tried: tried)
+    monkeypatch.setattr("spadmnist.inference.forward_step.fit_trial", lambda replicates, evaluation, one: one)
+    monkeypatch.setattr("spadmnist.inference.forward_step.p_of_best", lambda *_: (3.0, 0.2))
     failed: Any = [object()] if fails else []
     beside = Notes([], False)
-    assert _added(path, beside, failed) == fails
+    assert best_added(path, beside, failed) == fails
     assert (len(path.evaluation.replicate_residuals[TOTALS]) > 16) == fails
-    assert not _added(path, beside, failed)  # and not again and again
+    assert not best_added(path, beside, failed)  # and not again and again
     assert not path.steps
 
 
@@ -302,13 +303,13 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         Trial(change_of(path.replicates, name), {}, Signature({}, {}, {}), gain, 1.0)
         for name, gain in (("per_pixel dark_counts.rate", -3.0), ("add slow_afterpulsing", 37.0))
     )
-    monkeypatch.setattr("spadmnist.inference.model_selection.evidence_of", lambda replicates, evaluation, one: one.fall)
+    monkeypatch.setattr("spadmnist.inference.forward_step.evidence_of", lambda replicates, evaluation, one: one.fall)
     monkeypatch.setattr(path.scan, "again", lambda *_: [map_, other])
-    monkeypatch.setattr("spadmnist.inference.model_selection.worth_fitting", lambda *_: [map_, other])
-    monkeypatch.setattr("spadmnist.inference.model_selection.patterns_first", lambda scan, evaluation, tried: tried)
-    monkeypatch.setattr("spadmnist.inference.model_selection.fit_trial", lambda replicates, evaluation, one: one)
+    monkeypatch.setattr("spadmnist.inference.forward_step.worth_fitting", lambda *_: [map_, other])
+    monkeypatch.setattr("spadmnist.inference.forward_step.patterns_first", lambda scan, evaluation, tried: tried)
+    monkeypatch.setattr("spadmnist.inference.forward_step.fit_trial", lambda replicates, evaluation, one: one)
     monkeypatch.setattr(
-        "spadmnist.inference.model_selection.p_of_best",
+        "spadmnist.inference.forward_step.p_of_best",
         lambda replicates, evaluation, tried, one, large: (4.0, 1e-5 if one is map_ else 1e-3),
     )
     taken: list[Trial] = []
@@ -317,10 +318,10 @@ def test_of_what_is_faint_the_least_likely_is_chosen_and_not_the_largest(lab, mo
         taken.append(best)
         raise StopIteration
 
-    monkeypatch.setattr("spadmnist.inference.model_selection.accept", accept)
+    monkeypatch.setattr("spadmnist.inference.forward_step.accept", accept)
     for failed in ([object()], []):
         with pytest.raises(StopIteration):
-            _added(path, Notes([], False), failed)  # type: ignore[arg-type]
+            best_added(path, Notes([], False), failed)  # type: ignore[arg-type]
     assert taken == [other, map_]
     assert map_.evidence == 16.0  # the square of its score, however the squares fall
 

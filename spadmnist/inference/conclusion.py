@@ -33,6 +33,7 @@ class Notes:
         placebo: the row of the placebo.
         tried: the last trials of the candidates.
         looked: the evaluation under which they were tried in all captures.
+        waiting: groups of trials of the last second look that do not compete with the step that was added.
     """
 
     setup: list[dict[str, Any]]
@@ -43,6 +44,7 @@ class Notes:
     placebo: Rung | None = None
     tried: list[Trial] = field(default_factory=list)
     looked: Evaluation | None = None
+    waiting: list[list[Trial]] = field(default_factory=list)
 
 
 def left_over(path: ModelPath, notes: Notes) -> list[BlockCheck]:

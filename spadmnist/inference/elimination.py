@@ -23,6 +23,7 @@ _MOSTLY = 0.95  # of the excess misfit: a step that explains as much is kept, wh
 _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
 _VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
 _CLEARLY = 1e-6  # p-value of a check that fails clearly: noise of a fit to first order does not make it
+_NEEDED = 90.0  # in chi square: a step is kept if a fit to first order without it is worse by more
 _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
 
 
@@ -51,6 +52,9 @@ def drop_needless(path: ModelPath) -> None:
         z = residuals_at(replicates, path.evaluation, signature)
         loss = square(z) - square(path.evaluation.residuals)
         if loss > 30 and not others:
+            continue
+        at_first_order = _fitted_anew(path, z, without=step)
+        if at_first_order is not None and square(at_first_order) - square(path.evaluation.residuals) > _NEEDED:
             continue
         point = {d.key: rest[d.key] for d in others}
         closer = gauss_newton(replicates, path.evaluation, others, point, sensors.changed, 2) if others else None
@@ -101,19 +105,38 @@ def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
     Args:
         evaluation: of the model without a step that has no coordinates of its own.
     """
-    residuals = evaluation.residuals
-    if path.fit is not None:
-        fit, keys = path.fit, list(residuals)
-        slope = np.stack([stacked(column_of(fit, i, evaluation), keys) for i in range(len(fit.coordinates))], axis=1)
-        z = stacked(residuals, keys)
-        move = np.linalg.pinv(slope, rcond=1e-6) @ z
-        if np.any(np.abs(move) > SAME):
-            return 0
-        left = z - slope @ move
-        ends = np.cumsum([len(residuals[k]) for k in keys])[:-1]
-        residuals = dict(zip(keys, np.split(left, ends), strict=True))
+    residuals = _fitted_anew(path, evaluation.residuals, evaluation)
+    if residuals is None:
+        return 0
     found = failing(block_checks(path.replicates, evaluation, residuals))
     return sum(block.p < _CLEARLY and block.cell not in evaluation.exact for block in found)
+
+
+def _fitted_anew(
+    path: ModelPath,
+    residuals: dict[Cell, np.ndarray],
+    evaluation: Evaluation | None = None,
+    without: Step | None = None,
+) -> dict[Cell, np.ndarray] | None:
+    """Residuals after the coordinates are fitted anew, to first order; None where they move farther than it holds.
+
+    Args:
+        residuals: (cells,) by block.
+        evaluation: the model that they belong to; by default that of the path.
+        without: a step whose coordinates are not fitted.
+    """
+    fit, keys = path.fit, list(residuals)
+    held = [d.key for d in without.coordinates] if without is not None else []
+    moving = [i for i, d in enumerate(fit.coordinates) if d.key not in held] if fit is not None else []
+    if fit is None or not moving:
+        return residuals
+    slope = np.stack([stacked(column_of(fit, i, evaluation or path.evaluation), keys) for i in moving], axis=1)
+    z = stacked(residuals, keys)
+    move = np.linalg.pinv(slope, rcond=1e-6) @ z
+    if np.any(np.abs(move) > SAME):
+        return None
+    ends = np.cumsum([len(residuals[k]) for k in keys])[:-1]
+    return dict(zip(keys, np.split(z - slope @ move, ends), strict=True))
 
 
 def _fit_from_templates(path: ModelPath) -> None:

@@ -16,6 +16,7 @@ from .models import Model
 from .replicates import FEW, Cell, Replicates
 from .signature import residuals_at, signatures
 
+Shown = tuple[Collection[str], Collection[str]]  # the captures and the statistics that show a coordinate
 _ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian
 _CLOSE = 0.02  # the least such step
 _KNOWN_ASIDE = (0.1, 0.7)  # (least, most) of that step for a column that is known but for its size
@@ -24,6 +25,9 @@ _SAME = 0.35  # of a logarithm, or of the search range: how far a Jacobian holds
 # of the root of the fall so far: a smaller promised fall ends the fit; it is far less than what separates two
 # candidates
 _PROMISING = 0.1
+# in chi square: a smaller promised fall asks for no new Jacobian; and what the noise of the column of each further
+# coordinate promises
+_WORTH_ANEW, _NOISE = 4.0, 2.0
 _VAIN = 2  # steps in a row without a fall, the second one shorter, after which the rest is noise
 _BLIND = 0.05  # squared norm of a column of the Jacobian below which the coordinate is not informed
 
@@ -67,6 +71,7 @@ def gauss_newton(
     few: int = FEW,
     stronger: tuple[float, float] = (1.0, 1.0),
     only: Collection[str] = (),
+    names: Collection[str] = (),
 ) -> Fit | str:
     """A Gauss-Newton fit to the residuals of all cells, damped; a reason where the model cannot be simulated.
 
@@ -80,7 +85,8 @@ def gauss_newton(
         few: replicates of each capture.
         stronger: (factor, power). A faint effect is simulated `factor` times as strong, and its signature divided by
             factor^power.
-        only: the captures that are simulated; the cells of the others are taken as constant.
+        only, names: the captures that are simulated, and the statistics that are reduced, all where they are empty;
+            all other cells are taken as constant.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -90,7 +96,8 @@ def gauss_newton(
         return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}}
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | str]:
-        found = signatures(replicates, evaluation, [sensors_of(boosted(at(u))) for u in points], few, only)
+        models = [sensors_of(boosted(at(u))) for u in points]
+        found = signatures(replicates, evaluation, models, few, only, names_of=[names] * len(points))
         times = stronger[0] ** -stronger[1]
         return [
             m if isinstance(m, str) else stacked(residuals_at(replicates, evaluation, m, times), keys) for m in found
@@ -106,7 +113,7 @@ def gauss_newton(
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)  # (replicates, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    begun = 0.0
+    begun, noise = 0.0, _NOISE * max(len(coordinates) - 1, 0)
     jacobian, there, damping, promised, vain = np.zeros((0, len(coordinates))), u, 0.0, 0.0, 0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in coordinates])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in coordinates])
@@ -121,7 +128,7 @@ def gauss_newton(
         z = found[0]
         cost = float(z @ z)
         if best is not None and not anew and best[0] - cost < 0.3 * promised:
-            if promised < 4:
+            if promised < _WORTH_ANEW + noise:
                 break
             found = [z, *evaluate(_points_aside(coordinates, u, steps, seen))]
             anew = True
@@ -150,7 +157,8 @@ def gauss_newton(
         steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in coordinates], 0.5)
         begun = cost if turn == 0 else begun
         if turn and (
-            promised < 1.0 + _PROMISING * math.sqrt(max(begun - cost, 0.0)) or np.all(np.abs(u - u0) < 0.3 * error)
+            promised < 1.0 + noise + _PROMISING * math.sqrt(max(begun - cost, 0.0))
+            or np.all(np.abs(u - u0) < 0.3 * error)
         ):
             break
     assert best is not None
@@ -221,7 +229,7 @@ def gauss_newton_step(
     errors: Mapping[Key, float] | None = None,
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
     before: Fit | None = None,
-    only: Callable[[Key], Collection[str]] = lambda key: (),
+    only: Callable[[Key], Shown] = lambda key: ((), ()),
 ) -> Fit | str:
     """One Gauss-Newton step from an evaluation, with its full number of replicates; a reason where there is none.
 
@@ -236,8 +244,8 @@ def gauss_newton_step(
         known: columns of the Jacobian, (cells,) by block, of which only the size is uncertain; the noise of a faint
             effect hides its shape.
         before: a fit from an evaluation near by, whose Jacobian still holds.
-        only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
-            the others.
+        only: the captures that are simulated for the column of a coordinate, and the statistics that are reduced; all
+            where they are empty. The column is 0 in all other cells.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -280,7 +288,7 @@ def _jacobian(
     few: int,
     errors: Mapping[Key, float],
     known: Mapping[Key, Mapping[Cell, np.ndarray]],
-    only: Sequence[Collection[str]],
+    only: Sequence[Shown],
 ) -> np.ndarray | str:
     """The Jacobian of the residuals at an evaluation, (cells, coordinates), or a reason.
 
@@ -307,7 +315,8 @@ def _jacobian(
             [sensors_of(values_there[k]) for k in some],
             few,
             kept="all" if bare else "likely",
-            only_of=[only[k // 2] for k in some],
+            only_of=[only[k // 2][0] for k in some],
+            names_of=[only[k // 2][1] for k in some],
         )
         for k, m in zip(some, made, strict=True):
             if isinstance(m, str):

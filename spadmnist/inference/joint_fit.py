@@ -14,12 +14,12 @@ from ..effects import Effect
 from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
-from .gauss_newton import Fit, column_of, gauss_newton_step
+from .gauss_newton import Fit, Shown, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value
-from .signature import IGNORED, captures_showing, residuals_at, signatures
+from .signature import IGNORED, captures_showing, residuals_at, signatures, statistics_showing
 
 if TYPE_CHECKING:
     from .model_path import ModelPath
@@ -28,6 +28,8 @@ _AGAIN = 4  # iterations: further fits of all coordinates at the model with the 
 SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
 # in chi square: a fall beyond which the fitted model is simulated; and beyond which it is at once, before the last step
 _WORTH, _WORTH_AT_ONCE = 6.0, 30.0
+# of a rough fit: moves at most; and in chi square the promised fall for which a rejected Jacobian is simulated anew
+_MOVES, _WORTH_A_JACOBIAN = 2, 300.0
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
@@ -153,8 +155,9 @@ def _gauss_newton(
                 fit, path.approximate = rejected, True
             break
         fit = closer
-        worth = _WORTH_AT_ONCE if roughly else _WORTH
-        if turn == _AGAIN or square(evaluation.residuals) - closer.square < worth:
+        promised = square(evaluation.residuals) - closer.square
+        later = roughly and path.approximate  # what a Jacobian of other models promises little of can wait
+        if turn == (_MOVES if later else _AGAIN) or promised < (_WORTH_AT_ONCE if later else _WORTH):
             break
         before = path.values, maps, evaluation
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
@@ -173,16 +176,18 @@ def _gauss_newton(
                 break
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
-            if path.approximate:
+            if path.approximate and (not roughly or promised > _WORTH_A_JACOBIAN):
                 rejected = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
                 path.approximate, near, turn = False, None, -1
                 continue
             fit = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
             break
-        promised = square(before[2].residuals) - closer.square
         if path.approximate and -risen < _KEPT * promised - noise:  # the Jacobian is that of another model
             path.values, maps, evaluation = before
             rejected = replace(fit, point=point_of(coordinates, here), residuals=evaluation.residuals)
+            if roughly and promised < _WORTH_A_JACOBIAN:
+                fit = rejected
+                break
             path.approximate, near, turn = False, None, -1
             continue
         near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < SAME) else None
@@ -325,12 +330,12 @@ def _known_jacobian(path: ModelPath) -> dict[Key, dict[Cell, np.ndarray]]:
     return out
 
 
-def _shown(path: ModelPath, key: Key) -> list[str]:
-    """The captures that show the step with this coordinate; none where that is not known."""
+def _shown(path: ModelPath, key: Key) -> Shown:
+    """The captures and the statistics that show the step with this coordinate; none where that is not known."""
     for step in path.steps:
         if any(d.key == key for d in step.coordinates) and not (step.chips or step.fluctuates):
-            return captures_showing(step.template, *IGNORED)
-    return []
+            return captures_showing(step.template, *IGNORED), statistics_showing(step.template, *IGNORED)
+    return [], []
 
 
 def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:

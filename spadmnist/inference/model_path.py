@@ -224,9 +224,8 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
         known = best.evaluation
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
     path.values = {**(path.values if known is None else before.values), **best.values}
-    # a later step makes all be fitted again: the columns as they were fitted do until then
-    likely = len(path.steps) > len(new) and not (best.chips or best.fluctuates)
-    columns = [fit for fit in (path.fit, best.fit) if fit is not None] if likely else []
+    # all is fitted again once no check fails plainly: the columns as they were fitted do until then
+    columns = [] if best.chips or best.fluctuates else [fit for fit in (path.fit, best.fit) if fit is not None]
     fit_all(path, best.fit, known, columns, roughly)
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new

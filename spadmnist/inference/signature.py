@@ -143,6 +143,7 @@ def signatures(
     hasty: bool = True,
     kept: Kept = "likely",
     only_of: Sequence[Collection[str]] | None = None,
+    names_of: Sequence[Collection[str]] | None = None,
 ) -> list[Signature | str]:
     """The signature of each model, or the reason why it cannot be simulated.
 
@@ -154,10 +155,11 @@ def signatures(
         kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
             hardly all noise (a derivative, which would otherwise be too small). "all": all.
         only_of: as `only`, for each model by itself.
+        names_of: the statistics that are reduced, for each model; all where it is empty.
     """
     numbers = np.arange(few, dtype=np.uint64)
     ids_of = [[id for id in evaluation.made if not some or id in some] for some in only_of or [only] * len(models)]
-    wanted, unable = [], dict[int, str]()
+    wanted, unable, names = [], dict[int, str](), list[Collection[str]]()
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         own = []
         try:
@@ -167,9 +169,10 @@ def signatures(
         except UNABLE as error:
             unable[k], own = why_not(error), []
         wanted += own
-    simulated = replicates.simulate(wanted, hasty=hasty)
+        names += [names_of[k] if names_of else ()] * len(own)
+    simulated = replicates.simulate(wanted, hasty=hasty, names=names)
     if kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
-        simulated = _more_replicates(replicates, evaluation, wanted, simulated, hasty)
+        simulated = _more_replicates(replicates, evaluation, wanted, simulated, hasty, names)
     results = iter(simulated)
     out: list[Signature | str] = []
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
@@ -191,6 +194,7 @@ def _more_replicates(
     wanted: Sequence[tuple[Model, str, np.ndarray, np.ndarray]],
     made: list[CaptureReplicates | str],
     hasty: bool,
+    names: Sequence[Collection[str]],
 ) -> list[CaptureReplicates | str]:
     """The replicates, and more of them where the totals of a few deviate from the closed form.
 
@@ -211,7 +215,9 @@ def _more_replicates(
         level = photons[0] / evaluation.factors[id][0]
         again.append((sensors, id, level * evaluation.factors[id][more.astype(int)], more))
     out = list(made)
-    for k, more_of in zip(doubtful, replicates.simulate(again, hasty=hasty) if again else [], strict=True):
+    some = [names[k] for k in doubtful]
+    found = replicates.simulate(again, hasty=hasty, names=some) if again else []
+    for k, more_of in zip(doubtful, found, strict=True):
         first = out[k]
         out[k] = (
             joined([first, more_of])
@@ -383,7 +389,20 @@ def captures_showing(template: Mapping[tuple[str, str], np.ndarray], share: floa
         share: of the square that may be left out.
         most: the same in variances.
     """
-    squares = _squares(template)
+    return _showing(_squares(template), share, most)
+
+
+def statistics_showing(template: Mapping[tuple[str, str], np.ndarray], share: float, most: float = np.inf) -> list[str]:
+    """As `captures_showing`, the smallest set of statistics."""
+    squares: dict[str, float] = {}
+    for (id, name), t in template.items():
+        if id:
+            squares[name] = squares.get(name, 0.0) + float(t @ t)
+    return _showing(squares, share, most)
+
+
+def _showing(squares: Mapping[str, float], share: float, most: float) -> list[str]:
+    """The smallest set of names that hold all but a share of some squares, or all but `most` in variances."""
     spare = min(share * sum(squares.values()), most)
     out = []
     for id in sorted(squares, key=lambda id: squares[id]):

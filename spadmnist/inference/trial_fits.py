@@ -16,9 +16,19 @@ from .gauss_newton import Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
 from .replicates import FEW, TOTALS, Replicates
-from .signature import IGNORED, captures_informing, captures_showing, residuals_at, signatures, size_of, template_of
+from .signature import (
+    IGNORED,
+    captures_informing,
+    captures_showing,
+    residuals_at,
+    signatures,
+    size_of,
+    statistics_showing,
+    template_of,
+)
 from .trial import Trial
 
+_HARDLY = 1e-3, 1.0  # of the square of a signature, as a share and in variances: statistics with so little are left out
 _ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
 STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
@@ -54,6 +64,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     # the squares that a faint effect leaves are those of this fit
     some = captures_showing(template, *IGNORED) if boost > 1 else captures_informing(replicates, evaluation, template)
 
+    names = _statistics_of(replicates, evaluation, template) if boost == 1 else []
+
     def fit(values: Mapping[Key, Any], rounds: int = rounds) -> Fit | str:
         return gauss_newton(
             replicates,
@@ -64,6 +76,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
             rounds,
             stronger=(boost, power),
             only=some,
+            names=names,
         )
 
     found = fit(given)
@@ -74,7 +87,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
             found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
             one.intervals |= intervals
     if boost == 1 and _fails_own_checks(replicates, evaluation, one, found, some):
-        found = _probe(replicates, evaluation, one, found, some)
+        found = _probe(replicates, evaluation, one, found, some, names)
     one.faint = boost > 1
     one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
     if not one.faint:  # the signature at the fitted values may differ from that of the trial
@@ -88,6 +101,17 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     if one.chips and not one.faint and found.coordinates:
         return fit_by_own_scatter(replicates, evaluation, one)
     return one
+
+
+def _statistics_of(
+    replicates: Replicates, evaluation: Evaluation, template: Mapping[tuple[str, str], np.ndarray]
+) -> list[str]:
+    """The statistics by which a trial is fitted: those that show it, and those that fail.
+
+    At another shape it may show in others than at that of its template.
+    """
+    failed = {block.cell[1] for block in failing(block_checks(replicates, evaluation, evaluation.residuals))}
+    return sorted(failed.union(statistics_showing(template, *_HARDLY)))
 
 
 def _fails_own_checks(
@@ -134,24 +158,31 @@ def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Ma
     return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
 
 
-def _probe(replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit, only: Collection[str]) -> Fit:
+def _probe(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    one: Trial,
+    found: Fit,
+    only: Collection[str],
+    names: Collection[str] = (),
+) -> Fit:
     """The fit, improved by probes near by where no gradient leads: a line, an edge.
 
     Args:
-        only: the captures that are simulated.
+        only, names: the captures that are simulated, and the statistics that are reduced, as in `gauss_newton`.
     """
     for coordinate in one.candidate.coordinates:
         if coordinate not in found.coordinates or not coordinate.log:
             continue
         if coordinate in one.candidate.shapes:
-            found, _ = _nearest(replicates, evaluation, one, found, coordinate, _PROBES, only)
+            found, _ = _nearest(replicates, evaluation, one, found, coordinate, _PROBES, only, names)
         elif is_edge(coordinate):
             for _ in range(_MOVES):  # an edge is not seen from afar: step by step, long ones first
-                found, better = _nearest(replicates, evaluation, one, found, coordinate, _FAR, only)
+                found, better = _nearest(replicates, evaluation, one, found, coordinate, _FAR, only, names)
                 if not better:
                     break
             for probes in (_PROBES, _FINE):
-                found, _ = _nearest(replicates, evaluation, one, found, coordinate, probes, only)
+                found, _ = _nearest(replicates, evaluation, one, found, coordinate, probes, only, names)
     return found
 
 
@@ -163,6 +194,7 @@ def _nearest(
     coordinate: Coordinate,
     probes: Sequence[float],
     only: Collection[str],
+    names: Collection[str],
 ) -> tuple[Fit, bool]:
     """(best of the probes on both sides of a coordinate, or the fit itself; whether it is a probe)."""
     at, before = float(found.values[coordinate.key]), found
@@ -170,7 +202,8 @@ def _nearest(
     tries = [{**found.values, coordinate.key: coordinate.value(coordinate.coordinate(at) + x)} for x in steps]
     models = [evaluation.sensors.changed(t, one.phases, one.chips) for t in tries]
     best = found.square - 6
-    for tried, x, signature in zip(tries, steps, signatures(replicates, evaluation, models, FEW, only), strict=True):
+    made = signatures(replicates, evaluation, models, FEW, only, names_of=[names] * len(models))
+    for tried, x, signature in zip(tries, steps, made, strict=True):
         if isinstance(signature, str):
             continue
         residuals = residuals_at(replicates, evaluation, signature)

@@ -1,0 +1,258 @@
+"""A step of the forward selection: the best trial of a scan is fitted, and added where the model is better with it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ..errors import UNABLE, why
+from .alternatives import alternatives
+from .budget import OutOfBudget
+from .candidates import Candidate
+from .conclusion import Notes, not_done
+from .elimination import left_in_own_cells
+from .error_budget import placebo_of
+from .evaluation import BlockCheck, Evaluation, evaluate
+from .evidence import best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
+from .levels import FALSE_ALARM, LEAST_EVIDENCE, PROMISING
+from .map_trials import patterns_first, random_map_trials
+from .model_path import ModelPath, accept
+from .replicates import REPLICATES, TOTALS
+from .results import title
+from .score_test import explains_its_signature, p_of_best
+from .trial import Trial, is_pattern, tie
+from .trial_fits import fit_trial
+
+CLOSER = REPLICATES  # replicates of each capture for a closer look
+
+
+@contextlib.contextmanager
+def or_as_before(path: ModelPath, where: str) -> Iterator[None]:
+    """A context that restores the steps where a model in it cannot be simulated, or the budget is spent."""
+    before = path.kept()
+    try:
+        yield
+    except OutOfBudget:
+        path.back_to(before)
+        record_end(path, where)
+    except UNABLE as error:
+        path.back_to(before)
+        for candidate in [step.candidate for step in path.steps[-1:]]:
+            path.scan.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
+
+
+def record_end(path: ModelPath, where: str) -> None:
+    """Record what the budget has ended."""
+    path.finished = False
+    path.scan.untried.append(not_done(where, "the budget of work was spent; give a longer --within, or none"))
+
+
+class _NoCandidate(Exception):
+    """The best candidate cannot be simulated, so that it is excluded."""
+
+
+def best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float = FALSE_ALARM) -> bool:
+    """Whether the best candidate was added, or another attempt is worth it.
+
+    A candidate that cannot be simulated makes room for the next best.
+
+    Args:
+        failed: the checks that fail.
+        least: the largest p-value of a step.
+    """
+    while True:
+        before = path.kept()
+        try:
+            return _best_of_scan_added(path, notes, failed, least)
+        except _NoCandidate as none:
+            names = none.args[0]
+        except UNABLE as error:  # not attributable to one candidate: the one with the largest fall is excluded
+            most = max(notes.tried, key=lambda t: t.fall, default=None)
+            if most is None:
+                raise
+            path.scan.exclude(most.candidate, "choosing the best", why(error))
+            names = {most.candidate.name}
+        path.back_to(before)
+        notes.tried = [t for t in notes.tried if t.candidate.name not in names]
+
+
+@contextlib.contextmanager
+def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Iterator[None]:
+    """A context without which candidates are excluded.
+
+    Raises:
+        _NoCandidate: where they cannot be simulated.
+    """
+    try:
+        yield
+    except UNABLE as error:
+        for candidate in candidates:
+            path.scan.exclude(candidate, where, why(error))
+        raise _NoCandidate({candidate.name for candidate in candidates}) from error
+
+
+def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
+    replicates, scan, faint = path.replicates, path.scan, not failed
+    # a value that a step has set is fitted anew with every other one: it is no finding of its own
+    notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
+    replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
+    second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
+    if not second:
+        return False
+    worth = worth_fitting(second, faint)
+    groups = [worth] if faint else competing(replicates, path.evaluation, worth)
+    fitted: list[Trial] = []
+    doubtful: tuple[Any, ...] | None = None  # the path with a step that helps too little to go on from
+    refused = False
+    for k, group in enumerate(groups):
+        fitted += _fitted(path, group, faint)
+        while found := _best_of(path, notes, second, fitted, faint):
+            best, significance, p = found
+            # squares do not show small differences of many pixels or codes: their p-value is that of their own test
+            if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
+                break
+            earlier = path.kept()
+            # a map and random pixels explain by a scatter, not by a signature that stays as it is
+            notes.waiting = [
+                g for g in groups[k + 1 :] if not (faint or any(t.maps or t.chips or t.fluctuates for t in g))
+            ]
+            if _taken(path, notes, failed, second, best, significance):
+                return True
+            notes.waiting, refused = [], True
+            fitted = [one for one in fitted if one is not best]
+            if len(path.steps) > len(earlier[2]):
+                doubtful = doubtful or path.kept()
+                path.back_to(earlier)
+    if not fitted and not refused:
+        raise _NoCandidate({one.candidate.name for one in worth})
+    if doubtful is not None:
+        path.back_to(doubtful)
+    elif not (faint or refused) and has_few_replicates(path):
+        path.evaluation = with_more_replicates(path)  # something is wrong: too few replicates may be what hides it
+        return True
+    return False
+
+
+def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], waiting: Sequence[list[Trial]]) -> bool:
+    """Whether a step was added from groups of trials that do not compete with the last step, without a new scan.
+
+    Their signatures are those of the model before that step.
+    """
+    groups = [group for one in waiting if (group := _still_promising(path, one))]
+    groups.sort(key=lambda group: -group[0].fall)
+    for k, group in enumerate(groups):
+        earlier, notes.waiting = path.kept(), groups[k + 1 :]
+        with contextlib.suppress(_NoCandidate, *UNABLE):  # the scan that follows records what cannot be simulated
+            found = _best_of(path, notes, group, _fitted(path, group, False), False)
+            if found is not None and found[2] <= FALSE_ALARM and found[0].evidence >= LEAST_EVIDENCE:
+                best, significance, _ = found
+                if leads(best, notes.waiting) and _taken(path, notes, failed, group, best, significance):
+                    return True
+        path.back_to(earlier)
+    notes.waiting = []
+    return False
+
+
+def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
+    """The trials of an earlier model at their best strength under this one; none where the data resemble none of them.
+
+    What a step has set or added is no candidate any more.
+    """
+    evaluation, added = path.evaluation, {step.candidate.effect for step in path.steps}
+    out = []
+    for one in group:
+        if one.candidate.effect in added:
+            continue
+        now = replace(one)
+        now.fall, now.times = path.scan.line_search(evaluation, one.signature, one.signed)
+        now.sensors = evaluation.sensors.changed(one.values, one.phases, one.chips)
+        out.append(now)
+    out.sort(key=lambda t: -t.fall)
+    return out if out and out[0].fall > PROMISING else []
+
+
+def _fitted(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]:
+    """The trials with their coordinates fitted and their evidence, without those that cannot be simulated."""
+    path.replicates.say(f"step {len(path.steps) + 1}: fitting " + ", ".join(title(t.candidate) for t in worth))
+    fitted = []
+    for one in worth:
+        with path.scan.if_possible(one.candidate, "fitting its numbers"):
+            one = fit_trial(path.replicates, path.evaluation, one)
+            if not faint:
+                one.evidence = evidence_of(path.replicates, path.evaluation, one)
+            fitted.append(one)
+    return fitted
+
+
+def _best_of(
+    path: ModelPath, notes: Notes, second: Sequence[Trial], fitted: Sequence[Trial], faint: bool
+) -> tuple[Trial, float, float] | None:
+    """(best of the fitted trials, its significance, its p-value); None where there is none."""
+    replicates = path.replicates
+    judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in fitted}
+    if faint:
+        judge_maps_by_odd_pixels(replicates, path.evaluation, fitted, judged)
+        for one in fitted:
+            one.evidence = judged[id(one)][0] ** 2
+        fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
+    if not fitted:
+        return None
+    pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_EVIDENCE) else None
+    if faint:
+        best = best_of(fitted, lambda t: -judged[id(t)][1], pattern)
+    else:
+        best = best_of(fitted, lambda t: t.evidence, pattern, tie)
+    return best, *judged[id(best)]
+
+
+def _taken(
+    path: ModelPath,
+    notes: Notes,
+    failed: Sequence[BlockCheck],
+    second: list[Trial],
+    best: Trial,
+    significance: float,
+) -> bool:
+    """Whether the model with the best trial is better, so that the search goes on from there.
+
+    The path is as it was where the model is worse. A step that helps too little to go on from stays in it.
+    """
+    scan, faint = path.scan, not failed
+    before, earlier, fell = path.evaluation, path.kept(), path.misfit
+    with _needed(path, best.candidates, "fitting all numbers together"):
+        new = accept(path, best, significance)
+    if best.maps is None and not best.phases:
+        with or_as_before(path, "trying random maps with the same signature"):
+            random_maps = random_map_trials(scan, before, path.values, best, faint)
+            second = second + random_maps
+    new[0].alternatives = alternatives(scan, before, best, second)
+    named = {s.candidate.effect for s in path.steps} | {a["effect"] for a in new[0].alternatives}
+    if notes.placebo is None:
+        with contextlib.suppress(*UNABLE):  # no result depends on it
+            notes.placebo = placebo_of(path.replicates, before, notes.tried, best, named)
+    if not failed and path.failed and has_few_replicates(path):
+        with _needed(path, best.candidates, "a closer look"):
+            path.evaluation = with_more_replicates(path)  # with as many replicates as the model without the step
+    if not failed and path.failed:
+        path.back_to(earlier)  # no check failed before, now one does
+        return False
+    # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
+    explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
+    if not explains and len(path.failed) >= max(len(failed), 1) and fell - path.misfit < 0.05 * (fell - 1):
+        if path.misfit > fell:
+            path.back_to(earlier)
+        return False
+    return True
+
+
+def has_few_replicates(path: ModelPath) -> bool:
+    """Whether the model has fewer replicates than a closer look."""
+    return len(path.evaluation.replicate_residuals[TOTALS]) < CLOSER
+
+
+def with_more_replicates(path: ModelPath) -> Evaluation:
+    """The evaluation of the model with more replicates."""
+    path.replicates.say(f"more replicates of the model: {CLOSER} of each capture")
+    return evaluate(path.replicates, path.evaluation.values, path.evaluation.sensors, CLOSER, path.evaluation)
