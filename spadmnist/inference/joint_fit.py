@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -44,6 +44,7 @@ def fit_all(
     known: Evaluation | None = None,
     columns: Sequence[Fit] = (),
     roughly: bool = False,
+    near: tuple[Evaluation, Collection[str]] | None = None,
 ) -> None:
     """Fit the model with all its steps: the maps, then all coordinates together.
 
@@ -54,18 +55,22 @@ def fit_all(
             of these while the squares fall as it says, and `path.approximate` is set. It is simulated without them.
         roughly: the maps stay as they are, and captures in which the coordinates move nothing are not simulated again;
             `complete_fit` does both. It needs an evaluation of the model.
+        near: of the model without the last step, see `evaluate`.
     """
     if roughly and known is not None:
         maps = {step.candidate.carrier: step.map for step in path.steps if step.candidate.carrier and step.map}
     else:
         sensors, maps = model_of(path)
-    evaluation = replace(known, values=dict(path.values)) if known else evaluate(path.replicates, path.values, sensors)
+    if known is not None:
+        evaluation = replace(known, values=dict(path.values))
+    else:
+        evaluation = evaluate(path.replicates, path.values, sensors, near=near)
     coordinates = path.free
     found: Fit | None = None
     path.approximate = False
     if coordinates:
-        near = _side_by_side(evaluation, coordinates, columns)
-        given = evaluation, maps, coordinates, edge_errors(path, fit), near, roughly
+        beside = _side_by_side(evaluation, coordinates, columns)
+        given = evaluation, maps, coordinates, edge_errors(path, fit), beside, roughly
         found, evaluation, maps = _gauss_newton(path, *given)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))

@@ -24,7 +24,7 @@ from .replicates import Cell, Replicates
 from .results import Step, title
 from .scan import Scan
 from .score_test import PIXELS
-from .signature import IGNORED, template_of
+from .signature import IGNORED, captures_showing, template_of
 from .trial import Trial
 
 # of a coordinate (a logarithm, mostly): a move by which it is decided whether the coordinate changes the model. Any
@@ -222,11 +222,17 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     known = evaluation_of(replicates, before, best) if roughly and best.sensors is not None else None
     if known is None and not any(candidate.carrier for candidate in path.scan.accepted):
         known = best.evaluation
+    near = None
+    if best.maps is not None and len(best.maps) == len(
+        best.candidates
+    ):  # the first maps: no earlier one moves with them
+        template = template_of(replicates, before, best.signature.at(best.times))
+        near = before, captures_showing(template, *IGNORED)
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
-    path.values = {**(path.values if known is None else before.values), **best.values}
+    path.values = {**(path.values if known is None and near is None else before.values), **best.values}
     # all is fitted again once no check fails plainly: the columns as they were fitted do until then
     columns = [] if best.chips or best.fluctuates else [fit for fit in (path.fit, best.fit) if fit is not None]
-    fit_all(path, best.fit, known, columns, roughly)
+    fit_all(path, best.fit, known, columns, roughly, near)
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new
 
