@@ -195,7 +195,7 @@ def test_numbers_that_were_fitted_since_do_not_move_twice(lab, monkeypatch) -> N
     one = Trial(duration, {DURATION: 60e-9}, NOTHING, 20.0, 1.0, before.sensors)
     seen = []
     monkeypatch.setattr(
-        "spadmnist.inference.model_path.fit_all", lambda path, fit, known, *_: seen.append((path.values, known))
+        "spadmnist.inference.model_path.fit_all", lambda path, fit, known, *_, **__: seen.append((path.values, known))
     )
     accept(path, replace(one, maps={}), 1.0)  # the maps are fitted anew, so that the model is simulated anew
     path.values, path.steps, path.scan.accepted = {CROSSTALK: 0.025}, [], []

@@ -57,7 +57,8 @@ def drop_needless(path: ModelPath) -> None:
         if at_first_order is not None and square(at_first_order) - square(path.evaluation.residuals) > _NEEDED:
             continue
         point = {d.key: rest[d.key] for d in others}
-        closer = gauss_newton(replicates, path.evaluation, others, point, sensors.changed, 2) if others else None
+        given = replicates, path.evaluation, others, point, sensors.changed, 2
+        closer = gauss_newton(*given, thorough=True) if others else None
         if isinstance(closer, Fit):
             loss = closer.square - square(path.evaluation.residuals)
         if loss < _NEEDLESS:
@@ -118,7 +119,9 @@ def _fitted_anew(
     evaluation: Evaluation | None = None,
     without: Step | None = None,
 ) -> dict[Cell, np.ndarray] | None:
-    """Residuals after the coordinates are fitted anew, to first order; None where they move farther than it holds.
+    """Residuals after the coordinates are fitted anew, to first order; as they are where there are none.
+
+    None where the coordinates move farther than the first order holds.
 
     Args:
         residuals: (cells,) by block.

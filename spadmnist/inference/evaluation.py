@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,13 @@ class Evaluation:
         """
         return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
 
+    def without_replicates(self) -> Evaluation:
+        """The evaluation of a model from which the search has gone on: without its replicates and null distributions.
+
+        They take tens of MB. Its residuals, and those of its replicates, are what a row of the error budget needs.
+        """
+        return replace(self, made={}, nulls={})
+
     def square(self, cell: Cell) -> float:
         """The sum of squared residuals of the data in one statistic."""
         return self.once(("square", cell), lambda: float(self.residuals[cell] @ self.residuals[cell]))
@@ -137,7 +144,7 @@ def evaluate(
         known: an evaluation of the same model by fewer replicates, which are the first of these.
         remember: the cache on disk is read and written.
         near: the evaluation of another model, and the captures in which this one differs from it. The replicates of the
-            other captures are borrowed from it, where the closed forms give the total.
+            other captures are borrowed from it, where every effect states its mean and a level gives the same total.
     Raises:
         SpadError: where the model cannot be simulated.
     """

@@ -34,7 +34,7 @@ def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> f
 
     Three ways lead to the likelihood ratio, each where its noise is least. A map has a likelihood of its own, in which
     its values are a random effect. A faint effect changes no scatter, and its own replicates would hide it: the
-    squares fall as its signature, simulated stronger, says. All others are simulated as they are.
+    squares fall as its signature, simulated stronger, says. All others are simulated as they are, where they show.
 
     Raises:
         SpadError: where the model with it cannot be simulated.
@@ -76,7 +76,9 @@ def evaluation_of(replicates: Replicates, evaluation: Evaluation, one: Trial) ->
     if one.evaluation is None:
         assert one.sensors is not None
         template = template_of(replicates, evaluation, (one.there or one.signature).at(one.times))
-        near = None if one.fluctuates else (evaluation, captures_showing(template, *IGNORED))
+        # a change of the scatter alone is in no template
+        whole = one.fluctuates or one.chips or one.fit is None
+        near = None if whole else (evaluation, captures_showing(template, *IGNORED))
         one.evaluation = evaluate(replicates, {}, one.sensors, near=near)
     return one.evaluation
 

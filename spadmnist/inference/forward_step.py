@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ..errors import UNABLE, why
+from ..errors import UNABLE, SpadError, why
 from .alternatives import alternatives
 from .budget import OutOfBudget
 from .candidates import Candidate
@@ -16,6 +16,7 @@ from .elimination import left_in_own_cells
 from .error_budget import placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate
 from .evidence import best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
+from .joint_fit import complete_fit
 from .levels import FALSE_ALARM, LEAST_EVIDENCE, PROMISING
 from .map_trials import patterns_first, random_map_trials
 from .model_path import ModelPath, accept
@@ -95,6 +96,7 @@ def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Ite
 
 def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
     replicates, scan, faint = path.replicates, path.scan, not failed
+    notes.waiting = []
     # a value that a step has set is fitted anew with every other one: it is no finding of its own
     notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
     replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
@@ -114,7 +116,7 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
             if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
                 break
             earlier = path.kept()
-            # a map and random pixels explain by a scatter, not by a signature that stays as it is
+            # a map and random pixels fit by their scatter, which an earlier signature does not predict
             notes.waiting = [
                 g for g in groups[k + 1 :] if not (faint or any(t.maps or t.chips or t.fluctuates for t in g))
             ]
@@ -163,12 +165,15 @@ def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
     evaluation, added = path.evaluation, {step.candidate.effect for step in path.steps}
     out = []
     for one in group:
-        if one.candidate.effect in added:
+        line = path.scan.line_at(evaluation, one.candidate, one.values) if one.phases else None
+        if one.candidate.effect in added or path.scan.is_excluded(one.candidate) or (one.phases and line is None):
             continue
-        now = replace(one)
+        now = replace(one, p_value=line.p if line else one.p_value)
         now.fall, now.times = path.scan.line_search(evaluation, one.signature, one.signed)
-        now.sensors = evaluation.sensors.changed(one.values, one.phases, one.chips)
-        out.append(now)
+        now.fall -= 2 * len(one.phases)
+        with contextlib.suppress(SpadError):  # the scan that follows records what cannot be set in this model
+            now.sensors = evaluation.sensors.changed(one.values, one.phases, one.chips)
+            out.append(now)
     out.sort(key=lambda t: -t.fall)
     return out if out and out[0].fall > PROMISING else []
 
@@ -232,6 +237,9 @@ def _taken(
     if notes.placebo is None:
         with contextlib.suppress(*UNABLE):  # no result depends on it
             notes.placebo = placebo_of(path.replicates, before, notes.tried, best, named)
+    if faint:
+        with _needed(path, best.candidates, "fitting all numbers together"):
+            complete(path)  # what no check shows is decided by the fit of all numbers
     if not failed and path.failed and has_few_replicates(path):
         with _needed(path, best.candidates, "a closer look"):
             path.evaluation = with_more_replicates(path)  # with as many replicates as the model without the step
@@ -245,6 +253,24 @@ def _taken(
             path.back_to(earlier)
         return False
     return True
+
+
+def complete(path: ModelPath) -> bool:
+    """Fit all numbers together where the last fit was a rough one, and renew the last row of the error budget.
+
+    Returns:
+        Whether that was done; not where it was done before, or the model cannot be simulated around its values.
+    """
+
+    def is_rough() -> bool:
+        return path.approximate or bool(path.evaluation.borrowed)
+
+    if not is_rough():
+        return False
+    complete_fit(path)
+    if path.steps:
+        path.last_rung()
+    return not is_rough()
 
 
 def has_few_replicates(path: ModelPath) -> bool:

@@ -25,8 +25,8 @@ _SAME = 0.35  # of a logarithm, or of the search range: how far a Jacobian holds
 # of the root of the fall so far: a smaller promised fall ends the fit; it is far less than what separates two
 # candidates
 _PROMISING = 0.1
-# in chi square: a smaller promised fall asks for no new Jacobian; and what the noise of the column of each further
-# coordinate promises
+# in chi square: a smaller promised fall asks for no new Jacobian; and the fall that noise alone promises, for each
+# further coordinate
 _WORTH_ANEW, _NOISE = 4.0, 2.0
 _VAIN = 2  # steps in a row without a fall, the second one shorter, after which the rest is noise
 _BLIND = 0.05  # squared norm of a column of the Jacobian below which the coordinate is not informed
@@ -72,6 +72,7 @@ def gauss_newton(
     stronger: tuple[float, float] = (1.0, 1.0),
     only: Collection[str] = (),
     names: Collection[str] = (),
+    thorough: bool = False,
 ) -> Fit | str:
     """A Gauss-Newton fit to the residuals of all cells, damped; a reason where the model cannot be simulated.
 
@@ -87,6 +88,7 @@ def gauss_newton(
             factor^power.
         only, names: the captures that are simulated, and the statistics that are reduced, all where they are empty;
             all other cells are taken as constant.
+        thorough: it goes on where the promised fall may be that of noise.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -113,7 +115,7 @@ def gauss_newton(
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)  # (replicates, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    begun, noise = 0.0, _NOISE * max(len(coordinates) - 1, 0)
+    begun, noise = 0.0, 0.0 if thorough else _NOISE * max(len(coordinates) - 1, 0)
     jacobian, there, damping, promised, vain = np.zeros((0, len(coordinates))), u, 0.0, 0.0, 0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in coordinates])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in coordinates])
@@ -256,7 +258,9 @@ def gauss_newton_step(
         jacobian = np.stack([stacked(column_of(before, i, evaluation), keys) for i in range(len(coordinates))], axis=1)
     else:
         given = replicates, evaluation, coordinates, u, values, sensors_of, few
-        jacobian = _jacobian(*given, errors or {}, known or {}, [only(d.key) for d in coordinates])
+        # the size of a known column is compared with all of it
+        where = [((), ()) if d.key in (known or {}) else only(d.key) for d in coordinates]
+        jacobian = _jacobian(*given, errors or {}, known or {}, where)
     if isinstance(jacobian, str):
         return jacobian
     covariance = covariance_of(jacobian, own)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
 SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
-# in chi square: a fall beyond which the fitted model is simulated; and beyond which it is at once, before the last step
+# in chi square: a fall beyond which the fitted model is simulated; and that beyond which a rough fit does so
 _WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 # of a rough fit: moves at most; and in chi square the promised fall for which a rejected Jacobian is simulated anew
 _MOVES, _WORTH_A_JACOBIAN = 2, 300.0
@@ -45,6 +45,7 @@ def fit_all(
     columns: Sequence[Fit] = (),
     roughly: bool = False,
     near: tuple[Evaluation, Collection[str]] | None = None,
+    where_shown: bool = False,
 ) -> None:
     """Fit the model with all its steps: the maps, then all coordinates together.
 
@@ -53,9 +54,11 @@ def fit_all(
         known: an evaluation of the model with it.
         columns: fits near by that hold a column of the Jacobian for every coordinate together; the Jacobian is made
             of these while the squares fall as it says, and `path.approximate` is set. It is simulated without them.
-        roughly: the maps stay as they are, and captures in which the coordinates move nothing are not simulated again;
-            `complete_fit` does both. It needs an evaluation of the model.
+        roughly: the maps stay as they are, and captures that do not show what has moved are not simulated again, until
+            `complete_fit`. `known` is given.
         near: of the model without the last step, see `evaluate`.
+        where_shown: the Jacobian is simulated where the steps showed when they were added. Since then no shape has
+            moved to another minimum.
     """
     if roughly and known is not None:
         maps = {step.candidate.carrier: step.map for step in path.steps if step.candidate.carrier and step.map}
@@ -70,7 +73,7 @@ def fit_all(
     path.approximate = False
     if coordinates:
         beside = _side_by_side(evaluation, coordinates, columns)
-        given = evaluation, maps, coordinates, edge_errors(path, fit), beside, roughly
+        given = evaluation, maps, coordinates, edge_errors(path, fit), beside, roughly, where_shown
         found, evaluation, maps = _gauss_newton(path, *given)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))
@@ -80,15 +83,16 @@ def fit_all(
 
 
 def complete_fit(path: ModelPath) -> None:
-    """Fit the maps and all coordinates together at the model with all steps, where the last fit was a rough one."""
+    """Fit the maps and all coordinates together, where the last fit was a rough one, or replicates are borrowed."""
     if not (path.approximate or path.evaluation.borrowed):
         return
     path.replicates.say("fitting all numbers together")
     before = path.kept()
     maps = any(candidate.carrier for candidate in path.scan.accepted)
-    known = None if maps and path.approximate else completed(path.replicates, path.evaluation)
+    known = None if maps else completed(path.replicates, path.evaluation)
     path.values = dict(path.values if known is None else known.values)
-    fit_all(path, known=known, columns=[path.fit] if path.fit is not None and not path.approximate else ())
+    columns = [path.fit] if path.fit is not None and not path.approximate else []
+    fit_all(path, known=known, columns=columns, where_shown=True)
     path.approximate = False
     if path.fit is None and before[4] is not None:  # the model cannot be simulated around its values
         path.back_to(before)
@@ -126,6 +130,7 @@ def _gauss_newton(
     errors: Mapping[Key, float],
     near: Fit | None = None,
     roughly: bool = False,
+    where_shown: bool = False,
 ) -> tuple[Fit | None, Evaluation, dict[Key, pixel_maps.PixelMap]]:
     """(fit of all coordinates, evaluation of the model, its maps), from values near the best ones.
 
@@ -133,7 +138,7 @@ def _gauss_newton(
 
     Args:
         near: a fit whose Jacobian is taken at first.
-        roughly: see `fit_all`.
+        roughly, where_shown: see `fit_all`.
     """
     replicates, known = path.replicates, _known_jacobian(path)
     fit: Fit | None = None
@@ -153,7 +158,7 @@ def _gauss_newton(
             errors,
             known,
             near,
-            functools.partial(_shown, path),
+            functools.partial(_shown, path) if where_shown else lambda key: ((), ()),
         )
         if isinstance(closer, str):
             if rejected is not None:
@@ -168,10 +173,11 @@ def _gauss_newton(
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
             path.values = {**before[0], **step.values}
             if roughly:
-                move = step.point - point_of(coordinates, here)
-                shown = captures_showing({cell: x @ move for cell, x in closer.jacobian.items()}, *IGNORED)
+                moved = [d for d, x in zip(coordinates, step.point - point_of(coordinates, here), strict=True) if x]
+                shown = [_shown(path, d.key)[0] for d in moved]
+                some = (before[2], set().union(*shown)) if all(shown) else None
                 sensors = path.model_at(before[2], step.values)
-                evaluation = evaluate(replicates, path.values, sensors, near=(before[2], shown))
+                evaluation = evaluate(replicates, path.values, sensors, near=some)
             else:
                 sensors, maps = model_of(path)
                 evaluation = evaluate(replicates, path.values, sensors)
@@ -338,7 +344,8 @@ def _known_jacobian(path: ModelPath) -> dict[Key, dict[Cell, np.ndarray]]:
 def _shown(path: ModelPath, key: Key) -> Shown:
     """The captures and the statistics that show the step with this coordinate; none where that is not known."""
     for step in path.steps:
-        if any(d.key == key for d in step.coordinates) and not (step.chips or step.fluctuates):
+        said = Effect.registry.find(step.candidate.effect).states_mean and not (step.chips or step.fluctuates)
+        if said and any(d.key == key for d in step.coordinates):
             return captures_showing(step.template, *IGNORED), statistics_showing(step.template, *IGNORED)
     return [], []
 

@@ -20,7 +20,7 @@ from .joint_fit import fit_all
 from .models import Model
 from .phases import evaluate_start
 from .random_pixels import PixelsHit, of_pixels, pixels_hit
-from .replicates import Cell, Replicates
+from .replicates import TOTALS, Cell, Replicates
 from .results import Step, title
 from .scan import Scan
 from .score_test import PIXELS
@@ -138,6 +138,8 @@ class ModelPath:
         held = [c for c in self.scan.accepted if c.carrier]
         chips = any(step.chips for step in self.steps)
         maps = HeldMaps(dict(self.values), held, dict(self.scan.phases), chips) if held else None
+        for rung in self.ladder[1:]:
+            rung.evaluation = rung.evaluation.without_replicates()
         self.ladder.append(Rung(name, self.evaluation, misfit, errors, left, self.fit, list(steps), maps))
 
     @property
@@ -230,9 +232,9 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
         near = before, captures_showing(template, *IGNORED)
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
     path.values = {**(path.values if known is None and near is None else before.values), **best.values}
-    # all is fitted again once no check fails plainly: the columns as they were fitted do until then
+    # all is fitted again once no check fails plainly: until then the columns of the separate fits are good enough
     columns = [] if best.chips or best.fluctuates else [fit for fit in (path.fit, best.fit) if fit is not None]
-    fit_all(path, best.fit, known, columns, roughly, near)
+    fit_all(path, best.fit, known, columns, roughly, near, where_shown=True)
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new
 
@@ -244,9 +246,12 @@ def _moves_no_map(path: ModelPath, best: Trial) -> bool:
     replicates, evaluation = path.replicates, path.evaluation
     template = template_of(replicates, evaluation, (best.there or best.signature).at(best.times))
     levels = count_model.light_levels_of(replicates, evaluation)
+    totals = float(template[TOTALS] @ template[TOTALS])
     for candidate in path.scan.accepted:
         if not candidate.carrier:
             continue
+        if totals > IGNORED[1] and not pixel_maps.acts_on_light(evaluation.sensors.one, candidate):
+            return False  # the mean of the map is that of the totals
         if candidate.per != "code" and not pixel_maps.by_counts(candidate):
             return False
         name = pixel_maps.CODES if candidate.per == "code" else PIXELS

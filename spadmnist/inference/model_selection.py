@@ -25,7 +25,15 @@ from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
 from .evaluation import misfit_null_95
 from .findings import mimicked
-from .forward_step import added_from, best_added, has_few_replicates, or_as_before, record_end, with_more_replicates
+from .forward_step import (
+    added_from,
+    best_added,
+    complete,
+    has_few_replicates,
+    or_as_before,
+    record_end,
+    with_more_replicates,
+)
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import complete_fit, completed
 from .journal import Journal
@@ -104,7 +112,7 @@ def _diagnosed(
         raise InputError(nothing_to_compare(replicates))
     start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
-    while len(path.steps) < max_steps and not no_step_explains(path, not notes.explained) and _possible(path, notes):
+    while len(path.steps) < max_steps and not _in_vain(path, notes) and _possible(path, notes):
         if path.steps:
             keep(so_far(path, start, notes))
     replicates.budget.until = FITS
@@ -175,6 +183,15 @@ def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:
     return misfit_null_95(rungs[0].evaluation.replicate_residuals)
 
 
+def _in_vain(path: ModelPath, notes: Notes) -> bool:
+    """As `no_step_explains`, by the fit of all numbers."""
+    if not no_step_explains(path, not notes.explained):
+        return False
+    with or_as_before(path, "the fit of all numbers together"):
+        complete(path)
+    return no_step_explains(path, not notes.explained)
+
+
 def _possible(path: ModelPath, notes: Notes) -> bool:
     """As `_another`; False where the steps so far cannot be simulated often enough."""
     before = path.kept()
@@ -196,11 +213,12 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
-    if all(block.p > _PLAIN for block in path.failed):
-        complete_fit(path)  # what no check shows plainly is decided by the fit of all numbers
+    if all(block.p > _PLAIN for block in path.failed) or scan.only_rates(path.evaluation):
+        complete(path)  # what no check shows plainly, and what the set-up may explain, is decided by the whole fit
     failed, number = path.failed, len(path.steps) + 1
     waiting, notes.waiting = notes.waiting, []
-    if any(block.p <= _PLAIN for block in failed) and added_from(path, notes, failed, waiting):
+    plainly = any(block.p <= _PLAIN for block in failed) and not scan.only_rates(path.evaluation)
+    if waiting and plainly and added_from(path, notes, failed, waiting):
         return True
     if failed and not path.steps and min(b.p for b in failed) > _PLAIN and has_few_replicates(path):
         path.evaluation = with_more_replicates(path)  # lest the scatter of few replicates decide
@@ -227,7 +245,9 @@ def _another(path: ModelPath, notes: Notes) -> bool:
     first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
     notes.tried = scan.scan(path.evaluation, known=notes.tried)
-    return best_added(path, notes, failed)
+    steps = len(path.steps)
+    # where nothing explains what a rough fit leaves, the whole fit may leave something else
+    return best_added(path, notes, failed) or (len(path.steps) == steps and complete(path))
 
 
 def _stands_out(path: ModelPath, tried: Sequence[Trial], largest_p: float) -> bool:

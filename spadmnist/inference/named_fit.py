@@ -204,7 +204,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             _kept(path, candidate)
             continue
         accept(path, best, math.sqrt(max(best.evidence, 0.0)))
-    if path.approximate:
+    if path.approximate or path.evaluation.borrowed:
         complete_fit(path)
         path.last_rung()
     with contextlib.suppress(*UNABLE):  # the fit by other chips stands

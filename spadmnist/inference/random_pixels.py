@@ -50,7 +50,8 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     """
     assert one.fit is not None and one.sensors is not None
     template = template_of(replicates, evaluation, one.signature)
-    some = captures_showing(template, *IGNORED)
+    tried = [template_of(replicates, evaluation, other.signature.at(other.times)) for other in one.others]
+    some = set().union(*(captures_showing(each, *IGNORED) for each in (template, *tried)))
 
     def evaluated(sensors: Model, number: int | None = None) -> Evaluation:
         return evaluate(replicates, {}, sensors, number, near=(evaluation, some))

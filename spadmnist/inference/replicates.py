@@ -37,8 +37,8 @@ FEW = 4  # replicates of each capture that give the difference between two model
 REPLICATES = 96  # replicates of each capture, by default
 _EVENTS_AT_ONCE = 4_000_000  # detections that are simulated at a time, in as many replicates as hold them
 _FEW_EVENTS = 100_000  # detections and bits of frames, of which a replicate takes little memory
-# of the work of a recording: its simulation; the rest are its statistics. Measured: 40 of 170 to 320 ns a detection in
-# time stamps, 100 to 220 of 270 to 350 ns in first stamps
+# of the work of a recording: its simulation; the rest are its statistics. Measured: 40 of 200 to 320 ns a detection in
+# time stamps (0.13 to 0.24), 100 to 220 of 270 to 350 ns in first stamps (0.3 to 0.63); a value between the two
 _SIMULATING = 0.4
 _SCALES = 8  # replicates whose scales are averaged, however many there are
 

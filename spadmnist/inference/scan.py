@@ -30,6 +30,7 @@ from .trial import (
     faint_of_other_shape,
     frequencies_of,
     further,
+    is_pattern,
     is_same,
     of_other_shapes,
     shape_of,
@@ -41,8 +42,8 @@ from .trial_fits import STRONG
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
 _SCAN = 2  # replicates of each capture for the first look
 _SECOND = 6  # candidates in the second look
-# of the largest fall: with less of it a candidate has no second look. A first look at some captures has missed a factor
-# of a few, and a later step finds it again
+# of the largest fall: with less of it a candidate has no second look. By a first look at some captures it may be too
+# small by a factor of a few; a later step finds it again
 _HOPELESS = 0.05
 _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
 # of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
@@ -93,6 +94,10 @@ class Scan:
         """Exclude a candidate: it cannot be simulated with this model, or at its best values."""
         self._out.add(candidate.name)
         self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why)
+
+    def is_excluded(self, candidate: Candidate) -> bool:
+        """Whether a candidate is excluded."""
+        return candidate.name in self._out
 
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """The candidates of a sensor without those that are excluded."""
@@ -196,7 +201,7 @@ class Scan:
             if not candidate.phases:
                 continue
             swing: Any = None
-            line = self._line_at(evaluation, candidate, tried)
+            line = self.line_at(evaluation, candidate, tried)
             with self.if_possible(candidate, _LOOKING, wholly=False):
                 few = _SCAN if only else FEW  # a look at some captures chooses what is fitted, which simulates anew
                 swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line, few)
@@ -219,7 +224,7 @@ class Scan:
             out.append(one)
         return out
 
-    def _line_at(self, evaluation: Evaluation, candidate: Candidate, tried: Mapping[Key, Any]) -> Line | None:
+    def line_at(self, evaluation: Evaluation, candidate: Candidate, tried: Mapping[Key, Any]) -> Line | None:
         """The line of the data at the frequency of a periodic candidate; None where it is at no line."""
         at = [float(tried[coordinate.key]) for coordinate in frequencies_of(candidate)]
         return next((line for line in self.lines(evaluation) if line.frequency in at), None)
@@ -443,7 +448,8 @@ class Scan:
         most = 0.0 if faint else max((t.fall for t in tried if not t.chips), default=0.0)
         for one in tried:
             known = any(other.candidate.name == one.candidate.name for other in best)
-            if one.fall > max(9.0, _HOPELESS * most) and not known:
+            least = 0.0 if is_pattern(one) else _HOPELESS * most  # a map would take up a pattern
+            if one.fall > max(9.0, least) and not known:
                 # of those with nearly the largest fall, the one simulated nearest to its best strength
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
                 alike = [t for t in same if t.fall > _NEARLY * one.fall]

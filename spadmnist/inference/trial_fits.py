@@ -61,9 +61,11 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     coordinates = [d for d in one.candidate.coordinates if d.key in given and not d.whole]
     boost, power = _boost(replicates, evaluation, one, given)
     template = template_of(replicates, evaluation, one.signature.at(one.times))
-    # the squares that a faint effect leaves are those of this fit
-    some = captures_showing(template, *IGNORED) if boost > 1 else captures_informing(replicates, evaluation, template)
-
+    # the squares that a faint effect leaves are those of this fit, and a whole number is not fitted again
+    if boost > 1 or any(coordinate.whole for coordinate in one.candidate.coordinates):
+        some = captures_showing(template, *IGNORED)
+    else:
+        some = captures_informing(replicates, evaluation, template)
     names = _statistics_of(replicates, evaluation, template) if boost == 1 else []
 
     def fit(values: Mapping[Key, Any], rounds: int = rounds) -> Fit | str:
@@ -110,7 +112,8 @@ def _statistics_of(
 
     At another shape it may show in others than at that of its template.
     """
-    failed = {block.cell[1] for block in failing(block_checks(replicates, evaluation, evaluation.residuals))}
+    checks = failing(block_checks(replicates, evaluation, evaluation.residuals))
+    failed = {block.cell[1] for block in checks if block.cell[0]}
     return sorted(failed.union(statistics_showing(template, *_HARDLY)))
 
 
