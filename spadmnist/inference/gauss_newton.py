@@ -16,7 +16,6 @@ from .models import Model
 from .replicates import FEW, Cell, Replicates
 from .signature import residuals_at, signatures
 
-Shown = tuple[Collection[str], Collection[str]]  # the captures and the statistics that show a coordinate
 _ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian
 _CLOSE = 0.02  # the least such step
 _KNOWN_ASIDE = (0.1, 0.7)  # (least, most) of that step for a column that is known but for its size
@@ -231,7 +230,7 @@ def gauss_newton_step(
     errors: Mapping[Key, float] | None = None,
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
     before: Fit | None = None,
-    only: Callable[[Key], Shown] = lambda key: ((), ()),
+    only: Callable[[Key], Collection[str]] = lambda key: (),
 ) -> Fit | str:
     """One Gauss-Newton step from an evaluation, with its full number of replicates; a reason where there is none.
 
@@ -246,8 +245,8 @@ def gauss_newton_step(
         known: columns of the Jacobian, (cells,) by block, of which only the size is uncertain; the noise of a faint
             effect hides its shape.
         before: a fit from an evaluation near by, whose Jacobian still holds.
-        only: the captures that are simulated for the column of a coordinate, and the statistics that are reduced; all
-            where they are empty. The column is 0 in all other cells.
+        only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
+            the others.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -259,7 +258,7 @@ def gauss_newton_step(
     else:
         given = replicates, evaluation, coordinates, u, values, sensors_of, few
         # the size of a known column is compared with all of it
-        where = [((), ()) if d.key in (known or {}) else only(d.key) for d in coordinates]
+        where = [() if d.key in (known or {}) else only(d.key) for d in coordinates]
         jacobian = _jacobian(*given, errors or {}, known or {}, where)
     if isinstance(jacobian, str):
         return jacobian
@@ -292,7 +291,7 @@ def _jacobian(
     few: int,
     errors: Mapping[Key, float],
     known: Mapping[Key, Mapping[Cell, np.ndarray]],
-    only: Sequence[Shown],
+    only: Sequence[Collection[str]],
 ) -> np.ndarray | str:
     """The Jacobian of the residuals at an evaluation, (cells, coordinates), or a reason.
 
@@ -319,8 +318,7 @@ def _jacobian(
             [sensors_of(values_there[k]) for k in some],
             few,
             kept="all" if bare else "likely",
-            only_of=[only[k // 2][0] for k in some],
-            names_of=[only[k // 2][1] for k in some],
+            only_of=[only[k // 2] for k in some],
         )
         for k, m in zip(some, made, strict=True):
             if isinstance(m, str):

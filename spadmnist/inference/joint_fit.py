@@ -14,12 +14,12 @@ from ..effects import Effect
 from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
-from .gauss_newton import Fit, Shown, column_of, gauss_newton_step
+from .gauss_newton import Fit, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value
-from .signature import IGNORED, captures_showing, residuals_at, signatures, statistics_showing
+from .signature import IGNORED, captures_showing, residuals_at, signatures
 
 if TYPE_CHECKING:
     from .model_path import ModelPath
@@ -72,8 +72,8 @@ def fit_all(
     found: Fit | None = None
     path.approximate = False
     if coordinates:
-        beside = _side_by_side(evaluation, coordinates, columns)
-        given = evaluation, maps, coordinates, edge_errors(path, fit), beside, roughly, where_shown
+        known_columns = _side_by_side(evaluation, coordinates, columns)
+        given = evaluation, maps, coordinates, edge_errors(path, fit), known_columns, roughly, where_shown
         found, evaluation, maps = _gauss_newton(path, *given)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))
@@ -158,7 +158,7 @@ def _gauss_newton(
             errors,
             known,
             near,
-            functools.partial(_shown, path) if where_shown else lambda key: ((), ()),
+            functools.partial(_shown, path) if where_shown else lambda key: (),
         )
         if isinstance(closer, str):
             if rejected is not None:
@@ -174,7 +174,7 @@ def _gauss_newton(
             path.values = {**before[0], **step.values}
             if roughly:
                 moved = [d for d, x in zip(coordinates, step.point - point_of(coordinates, here), strict=True) if x]
-                shown = [_shown(path, d.key)[0] for d in moved]
+                shown = [_shown(path, d.key) for d in moved]
                 some = (before[2], set().union(*shown)) if all(shown) else None
                 sensors = path.model_at(before[2], step.values)
                 evaluation = evaluate(replicates, path.values, sensors, near=some)
@@ -341,13 +341,13 @@ def _known_jacobian(path: ModelPath) -> dict[Key, dict[Cell, np.ndarray]]:
     return out
 
 
-def _shown(path: ModelPath, key: Key) -> Shown:
-    """The captures and the statistics that show the step with this coordinate; none where that is not known."""
+def _shown(path: ModelPath, key: Key) -> list[str]:
+    """The captures that show the step with this coordinate, as it was added; none where that is not known."""
     for step in path.steps:
         said = Effect.registry.find(step.candidate.effect).states_mean and not (step.chips or step.fluctuates)
         if said and any(d.key == key for d in step.coordinates):
-            return captures_showing(step.template, *IGNORED), statistics_showing(step.template, *IGNORED)
-    return [], []
+            return captures_showing(step.template, *IGNORED)
+    return []
 
 
 def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:

@@ -225,13 +225,12 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     if known is None and not any(candidate.carrier for candidate in path.scan.accepted):
         known = best.evaluation
     near = None
-    if best.maps is not None and len(best.maps) == len(
-        best.candidates
-    ):  # the first maps: no earlier one moves with them
+    # the first maps, before any coordinate: nothing else moves with them
+    if best.maps is not None and path.fit is None and len(best.maps) == len(best.candidates):
         template = template_of(replicates, before, best.signature.at(best.times))
         near = before, captures_showing(template, *IGNORED)
     # the evaluated model has the earlier values where they were simulated, one step before the fitted ones
-    path.values = {**(path.values if known is None and near is None else before.values), **best.values}
+    path.values = {**(path.values if known is None else before.values), **best.values}
     # all is fitted again once no check fails plainly: until then the columns of the separate fits are good enough
     columns = [] if best.chips or best.fluctuates else [fit for fit in (path.fit, best.fit) if fit is not None]
     fit_all(path, best.fit, known, columns, roughly, near, where_shown=True)

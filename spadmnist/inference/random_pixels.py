@@ -79,7 +79,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     vain = 0
     for _ in range(_TURNS):
         try:
-            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW, only=lambda key: (some, ()))
+            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW, only=lambda key: some)
             if isinstance(found, str):
                 break
             at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)

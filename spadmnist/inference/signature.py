@@ -381,8 +381,8 @@ def _mean_shift(apart: np.ndarray, scatter: float) -> float:
 def captures_showing(template: Mapping[tuple[str, str], np.ndarray], share: float, most: float = np.inf) -> list[str]:
     """The smallest set of captures that holds all but a share of the square of a signature.
 
-    Whole captures are kept: a statistic that hardly shows a parameter still informs it, and intervals without it have
-    been too narrow.
+    For a Jacobian whole captures are kept: a statistic that hardly shows a parameter still informs it, and intervals
+    without it have been too narrow.
 
     Args:
         template: (cells,) standard deviations, by (capture, statistic).
