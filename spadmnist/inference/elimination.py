@@ -30,9 +30,12 @@ _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is wor
 def drop_needless(path: ModelPath) -> None:
     """Drop the steps that later ones made needless."""
     replicates = path.replicates
-    for step in list(path.steps[:-1]):
+    last = path.steps[-1]
+    for step in list(path.steps):
         if len(path.steps) < 2 or step.phased:
             continue
+        if step is last and (step.candidate.carrier or step.fluctuates or step.chips or step.jacobian):
+            continue  # it was added to a model of which all coordinates were fitted
         if step.candidate.carrier:
             if not path.steps[-1].candidate.carrier:  # a later map may be what makes the pixels differ
                 _drop_unless_missed(path, step)

@@ -32,6 +32,7 @@ _WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 _MOVES, _WORTH_A_JACOBIAN = 2, 300.0
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
+_INFORMING = 0.01  # of the squared norm of a column of the Jacobian: a block with more of it informs the coordinate
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
 _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
 _KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
@@ -181,9 +182,9 @@ def _gauss_newton(
             else:
                 sensors, maps = model_of(path)
                 evaluation = evaluate(replicates, path.values, sensors)
-            risen = square(evaluation.residuals) - square(before[2].residuals)
-            noise = _noise_of_square(before[2])
-            if risen <= _RISEN * noise:
+            risen, noise = _rise(before[2], evaluation, list(evaluation.residuals))
+            clearer = _rise(before[2], evaluation, _informing(closer))
+            if risen <= _RISEN * noise and clearer[0] <= _RISEN * clearer[1]:
                 break
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
@@ -226,15 +227,27 @@ def _strengths_alone(path: ModelPath, fit: Fit, evaluation: Evaluation, here: Ma
     yield replace(fit, point=point_of(fit.coordinates, held), values={**fit.values, **held})
 
 
-def _noise_of_square(evaluation: Evaluation) -> float:
-    """The standard deviation of the sum of squared residuals by the noise of the replicates, between two evaluations.
+def _informing(fit: Fit) -> list[Cell]:
+    """The blocks that inform the coordinates of a fit: the others hardly change, and have noise only."""
+    blocks: set[Cell] = set()
+    for i in range(len(fit.coordinates)):
+        norms = {cell: float(x[:, i] @ x[:, i]) for cell, x in fit.jacobian.items()}
+        blocks.update(cell for cell, norm in norms.items() if norm > _INFORMING * sum(norms.values()))
+    return sorted(blocks)
+
+
+def _rise(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tuple[float, float]:
+    """(rise of the sum of squared residuals of some blocks, its standard deviation by the noise of the replicates).
 
     Each expectation has the noise of the mean of its replicates, e, which moves the sum by 2 z e.
     """
-    keys = [k for k in evaluation.residuals if k in evaluation.replicate_residuals]
-    own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
-    projection = own @ stacked(evaluation.residuals, keys)
-    return 2 * math.sqrt(2 / len(own)) * float(np.std(projection))
+    keys = [k for k in keys if k in before.replicate_residuals and k in after.residuals]
+    if not keys:
+        return 0.0, 0.0
+    rise = sum(float(after.residuals[k] @ after.residuals[k]) - before.square(k) for k in keys)
+    own = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
+    projection = own @ stacked(before.residuals, keys)
+    return rise, 2 * math.sqrt(2 / len(own)) * float(np.std(projection))
 
 
 def _recordings(evaluation: Evaluation) -> int:

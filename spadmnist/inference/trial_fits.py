@@ -32,6 +32,7 @@ _HARDLY = 1e-3, 1.0  # of the square of a signature, as a share and in variances
 _ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
 STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
+_ROUNDS_AFTER_PROBES = 2  # see `gauss_newton`: of the fit from the best probe
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
 # of a logarithm: the first distances of an edge; how often they are repeated
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6
@@ -68,7 +69,9 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         some = captures_informing(replicates, evaluation, template)
     names = _statistics_of(replicates, evaluation, template) if boost == 1 else []
 
-    def fit(values: Mapping[Key, Any], rounds: int = rounds) -> Fit | str:
+    def fit(
+        values: Mapping[Key, Any], rounds: int = rounds, coordinates: Sequence[Coordinate] = coordinates
+    ) -> Fit | str:
         return gauss_newton(
             replicates,
             evaluation,
@@ -89,7 +92,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
             found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
             one.intervals |= intervals
     if boost == 1 and _fails_own_checks(replicates, evaluation, one, found, some):
-        found = _probe(replicates, evaluation, one, found, some, names)
+        probed = _probe(replicates, evaluation, one, found, some, names)
+        found = probed if probed is found else _strengths_anew(one, probed, fit)
     one.faint = boost > 1
     one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
     if not one.faint:  # the signature at the fitted values may differ from that of the trial
@@ -187,6 +191,40 @@ def _probe(
             for probes in (_PROBES, _FINE):
                 found, _ = _nearest(replicates, evaluation, one, found, coordinate, probes, only, names)
     return found
+
+
+def _strengths_anew(
+    one: Trial, found: Fit, fit: Callable[[Mapping[Key, Any], int, Sequence[Coordinate]], Fit | str]
+) -> Fit:
+    """The fit with its strengths fitted once more at the shapes and edges of the best probes.
+
+    The strengths before are those of another minimum.
+
+    Args:
+        found: the fit at the best probes.
+        fit: (values, rounds, coordinates) -> fit of these coordinates.
+    """
+    moving = [i for i, d in enumerate(found.coordinates) if d not in one.candidate.shapes and not is_edge(d)]
+    if not moving:
+        return found
+    again = fit(found.values, _ROUNDS_AFTER_PROBES, [found.coordinates[i] for i in moving])
+    if isinstance(again, str) or again.square >= found.square:
+        return found
+    covariance, jacobian = found.covariance.copy(), {cell: x.copy() for cell, x in found.jacobian.items()}
+    covariance[moving, :] = covariance[:, moving] = 0.0
+    covariance[np.ix_(moving, moving)] = again.covariance
+    for cell, x in again.jacobian.items():
+        jacobian[cell][:, moving] = x
+    return Fit(
+        found.coordinates,
+        point_of(found.coordinates, again.values),
+        covariance,
+        again.residuals,
+        jacobian,
+        again.square,
+        again.values,
+        found.phases,
+    )
 
 
 def _nearest(
