@@ -11,6 +11,7 @@ import pytest
 
 from spadmnist.inference import joint_fit
 from spadmnist.inference.coordinates import Coordinate, Key
+from spadmnist.inference.evaluation import Evaluation
 from spadmnist.inference.gauss_newton import Fit
 
 STRENGTH = Coordinate("any", "share", "", 1e-4, 1.0, 0.0)
@@ -78,3 +79,20 @@ def test_a_strength_is_fitted_beside_a_line_to_which_no_gradient_leads(monkeypat
     found = fitted(monkeypatch, -0.05, np.zeros(CELLS))
     assert found[SHAPE.key] == pytest.approx(TRUE[SHAPE.key], rel=1e-9)
     assert found[STRENGTH.key] == pytest.approx(TRUE[STRENGTH.key], rel=0.15)  # five standard errors of 1/30
+
+
+def test_a_line_that_a_step_misses_is_seen_beside_the_noise_of_many_other_cells() -> None:
+    """A rise of 160 in the block that informs the delay is noise among 60,000 cells, and none in that block."""
+    many = ("bright", "pairs")
+    slope = {BLOCK: SLOPE, many: np.zeros((60_000, 2))}
+    z = {BLOCK: CHANCE, many: RNG.standard_normal(60_000)}
+    missed = {BLOCK: CHANCE.copy(), many: z[many]}
+    missed[BLOCK][-10:] += 4.0 * np.sign(CHANCE[-10:])
+    own = {BLOCK: OWN, many: RNG.standard_normal((REPLICATES, 60_000))}
+    before, after = (Evaluation({}, None, {}, {}, {}, {}, one, own, {}) for one in (z, missed))  # type: ignore[arg-type]
+    fit = Fit((STRENGTH, SHAPE), np.zeros(2), np.eye(2), {}, slope, 0.0, {})
+    assert joint_fit._informing(fit) == [BLOCK]
+    rise, noise = joint_fit._rise(before, after, [BLOCK, many])
+    assert 160 < rise < 3 * noise
+    rise, noise = joint_fit._rise(before, after, joint_fit._informing(fit))
+    assert rise > 3 * noise

@@ -244,7 +244,7 @@ def _rise(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tuple[
     keys = [k for k in keys if k in before.replicate_residuals and k in after.residuals]
     if not keys:
         return 0.0, 0.0
-    rise = sum(float(after.residuals[k] @ after.residuals[k]) - before.square(k) for k in keys)
+    rise = square({k: after.residuals[k] for k in keys}) - square({k: before.residuals[k] for k in keys})
     own = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
     projection = own @ stacked(before.residuals, keys)
     return rise, 2 * math.sqrt(2 / len(own)) * float(np.std(projection))
