@@ -12,14 +12,14 @@ from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import is_edge
-from spadmnist.inference.elimination import _drop_unless_missed
+from spadmnist.inference.elimination import _drop_unless_missed, drop_needless
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
-from spadmnist.inference.forward_step import _best_of_scan_added
+from spadmnist.inference.forward_step import _best_of_scan_added, added_from
 from spadmnist.inference.joint_fit import complete_fit
 from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
-from spadmnist.inference.model_path import ModelPath, accept, begin
+from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
 from spadmnist.inference.model_selection import _another
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
@@ -239,3 +239,39 @@ def test_what_does_not_compete_is_added_without_another_scan(lab, monkeypatch) -
         pass
     assert sorted(names(path)) == ["add afterpulsing", "add crosstalk", "add flicker"]
     assert len(scans) < 3
+
+
+def test_a_step_stays_while_another_one_changes_a_number_of_its_effect(lab) -> None:
+    """Without the effect, the number is that of none."""
+    path = begin(bench_of(lab("    jitter: {sigma: 2 ns, tail_weight: 0.3, tail: 4 ns}\n", light=400), 16))
+    sigma, weight, tail = (("jitter", name) for name in ("sigma", "tail_weight", "tail"))
+    taken(path, "add jitter", {sigma: 2e-9, tail: 4e-9})
+    taken(path, "set jitter.tail_weight", {weight: 0.3})
+    first, second = path.steps
+    assert rests_on(second, first) and not rests_on(first, second)
+    assert sigma in keys_of(first.candidate, path) and weight not in keys_of(first.candidate, path)
+    path.values = {**path.values, sigma: 5e-12}  # it explains nothing any more
+    path.evaluation = evaluate(path.replicates, path.values)
+    drop_needless(path)
+    assert path.steps[0] is first
+
+
+def test_a_group_that_waited_is_fitted_with_what_competes_with_it_now(lab, monkeypatch) -> None:
+    """Beside the step that was added, its rival promised too little to be fitted."""
+    path, asked = begin(bench_of(lab("    crosstalk: {probability: 10 %}\n", dead=60, light=1000), 16)), []
+    recovery = change_of(path.replicates, "add slow_recovery")
+    edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
+    slow = given(path, "add slow_recovery", {d.key: 1.5e-8 for d in recovery.coordinates}, fitted=False)
+    monkeypatch.setattr(
+        "spadmnist.inference.forward_step._fitted", lambda path, group, faint: asked.append(group) or []
+    )
+    notes = Notes([], False)
+    notes.second = [edge, slow]
+    assert not added_from(path, notes, path.failed, [[edge]])
+    assert [sorted(t.candidate.name for t in group) for group in asked] == [
+        ["add slow_recovery", "set dead_time.duration"]
+    ]
+    # what has a scatter of its own is predicted by no earlier signature: a scan is needed
+    asked.clear()
+    notes.second = [edge, replace(slow, chips=True)]
+    assert not added_from(path, notes, path.failed, [[edge]]) and not asked

@@ -33,7 +33,8 @@ class Notes:
         placebo: the row of the placebo.
         tried: the last trials of the candidates.
         looked: the evaluation under which they were tried in all captures.
-        waiting: groups of trials of the last second look that do not compete with the step that was added.
+        second: the trials of the last second look.
+        waiting: groups of them that do not compete with the step that was added.
     """
 
     setup: list[dict[str, Any]]
@@ -44,6 +45,7 @@ class Notes:
     placebo: Rung | None = None
     tried: list[Trial] = field(default_factory=list)
     looked: Evaluation | None = None
+    second: list[Trial] = field(default_factory=list)
     waiting: list[list[Trial]] = field(default_factory=list)
 
 

@@ -12,7 +12,7 @@ from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio,
 from .gauss_newton import Fit, column_of, gauss_newton
 from .joint_fit import SAME, fit_all, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
-from .model_path import ModelPath, keys_of
+from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
 from .replicates import FEW, TOTALS, Cell
 from .results import Step, title
@@ -28,14 +28,17 @@ _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is wor
 
 
 def drop_needless(path: ModelPath) -> None:
-    """Drop the steps that later ones made needless."""
+    """Drop the steps that are needless in the fit of all coordinates.
+
+    The last one is weighed if the fit of the model that it was added to was a rough one.
+    """
     replicates = path.replicates
     last = path.steps[-1]
     for step in list(path.steps):
-        if len(path.steps) < 2 or step.phased:
+        if len(path.steps) < 2 or step.phased or any(rests_on(other, step) for other in path.steps):
             continue
-        if step is last and (step.candidate.carrier or step.fluctuates or step.chips or step.jacobian):
-            continue  # it was added to a model of which all coordinates were fitted
+        if step is last and not step.on_rough_fit:
+            continue
         if step.candidate.carrier:
             if not path.steps[-1].candidate.carrier:  # a later map may be what makes the pixels differ
                 _drop_unless_missed(path, step)
@@ -53,17 +56,19 @@ def drop_needless(path: ModelPath) -> None:
             continue
         others = tuple(d for s in path.steps if s is not step for d in s.coordinates)
         z = residuals_at(replicates, path.evaluation, signature)
-        loss = square(z) - square(path.evaluation.residuals)
+        # the evaluation is that of the values before the last step of the fit
+        now = min(square(x) for x in (path.evaluation.residuals, *([path.fit.residuals] if path.fit else [])))
+        loss = square(z) - now
         if loss > 30 and not others:
             continue
         at_first_order = _fitted_anew(path, z, without=step)
-        if at_first_order is not None and square(at_first_order) - square(path.evaluation.residuals) > _NEEDED:
+        if at_first_order is not None and square(at_first_order) - now > _NEEDED:
             continue
         point = {d.key: rest[d.key] for d in others}
         given = replicates, path.evaluation, others, point, sensors.changed, 2
         closer = gauss_newton(*given, thorough=True) if others else None
         if isinstance(closer, Fit):
-            loss = closer.square - square(path.evaluation.residuals)
+            loss = closer.square - now
         if loss < _NEEDLESS:
             replicates.say(f"{title(step.candidate)} is no longer needed")
             path.steps.remove(step)
@@ -153,6 +158,8 @@ def _fit_from_templates(path: ModelPath) -> None:
     for step in path.steps:
         if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates or step.chips:
             continue
+        if any(rests_on(other, step) for other in path.steps):
+            continue
         before, steps = path.kept(), path.steps
         path.steps = [other for other in steps if other is not step]
         path.scan.accepted = [c for c in path.scan.accepted if c is not step.candidate]
@@ -190,7 +197,7 @@ def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:
             mean_misfit(evaluation.replicate_residuals, evaluation.residuals) for evaluation in (path.evaluation, start)
         )
         mostly = len(path.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
-        kept = [s for s in path.steps if s is not worst or left[id(s)] < 1 or mostly]
+        kept = [s for s in path.steps if not (s is worst or rests_on(s, worst)) or left[id(worst)] < 1 or mostly]
         if now > then:
             kept = []
         if len(kept) == len(path.steps):

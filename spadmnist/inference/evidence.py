@@ -23,7 +23,7 @@ from .trial import Trial, is_pattern
 
 # the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
 # fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
-_FITTED, _NEAR = 3, 0.4
+_FITTED, NEAR = 3, 0.4
 # share of a trial's score that remains once another trial is in the model: from it on, the two do not compete
 _UNMOVED = 0.9
 _MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
@@ -97,9 +97,9 @@ def worth_fitting(second: Sequence[Trial], faint: bool = False) -> list[Trial]:
     odd = [] if faint else [t for t in second if t.chips]
     rivals = [t for t in second if all(t is not one for one in odd)]
     most = max((t.fall for t in rivals), default=0.0)
-    out = [t for k, t in enumerate(rivals) if k == 0 or t.fall > _NEAR * most][:_FITTED]
+    out = [t for k, t in enumerate(rivals) if k == 0 or t.fall > NEAR * most][:_FITTED]
     maps = any(map(is_map_of_pixels, out))
-    out += [t for t in odd if t.fall > PROMISING and (maps or t.fall > _NEAR * most)]
+    out += [t for t in odd if t.fall > PROMISING and (maps or t.fall > NEAR * most)]
     chips = any(t.chips for t in out)
     more = [t for t in second if (chips and is_map_of_pixels(t)) or (faint and maps and t.chips and t.fall > PROMISING)]
     return (out + [t for t in more if all(t is not one for one in out)]) or list(second[:1])
@@ -126,7 +126,7 @@ def competing(replicates: Replicates, evaluation: Evaluation, trials: Sequence[T
 
 def leads(best: Trial, others: Sequence[Sequence[Trial]]) -> bool:
     """Whether no trial of other groups promises so much more that it may be the better step."""
-    return best.evidence >= _NEAR * max((one.fall for group in others for one in group), default=-math.inf)
+    return best.evidence >= NEAR * max((one.fall for group in others for one in group), default=-math.inf)
 
 
 def _compete(replicates: Replicates, evaluation: Evaluation, one: Trial, other: Trial) -> bool:

@@ -15,7 +15,7 @@ from .conclusion import Notes, not_done
 from .elimination import left_in_own_cells
 from .error_budget import placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate
-from .evidence import best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
+from .evidence import NEAR, best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
 from .joint_fit import complete_fit
 from .levels import FALSE_ALARM, LEAST_EVIDENCE, PROMISING
 from .map_trials import patterns_first, random_map_trials
@@ -27,6 +27,8 @@ from .trial import Trial, is_pattern, tie
 from .trial_fits import fit_trial
 
 CLOSER = REPLICATES  # replicates of each capture for a closer look
+# of the excess misfit: a step that leaves as many failing checks, and does not explain its own cells, falls short below
+_LEAST_FALL_OF_MISFIT = 0.05
 
 
 @contextlib.contextmanager
@@ -101,6 +103,7 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
     replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
+    notes.second = second
     if not second:
         return False
     worth = worth_fitting(second, faint)
@@ -144,8 +147,13 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
     """
     groups = [group for one in waiting if (group := _still_promising(path, one))]
     groups.sort(key=lambda group: -group[0].fall)
+    waited = {trial.candidate.name for one in waiting for trial in one}
+    others = [one for one in notes.second if one.candidate.name not in waited]
     for k, group in enumerate(groups):
         earlier, notes.waiting = path.kept(), groups[k + 1 :]
+        group = _with_rivals(path, group, others)
+        if not group:
+            break
         with contextlib.suppress(_NoCandidate, *UNABLE):  # the scan that follows records what cannot be simulated
             found = _best_of(path, notes, group, _fitted(path, group, False), False)
             if found is not None and found[2] <= FALSE_ALARM and found[0].evidence >= LEAST_EVIDENCE:
@@ -155,6 +163,22 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
         path.back_to(earlier)
     notes.waiting = []
     return False
+
+
+def _with_rivals(path: ModelPath, group: list[Trial], others: Sequence[Trial]) -> list[Trial]:
+    """The trials of a group, and those of others that compete with them under this model, which are worth fitting.
+
+    None where one of these has a map or a scatter of its own, which an earlier signature does not predict.
+
+    Args:
+        others: of the same second look, that promised too little beside the step that was added.
+    """
+    plain = [one for one in others if not (one.maps or one.chips or one.fluctuates)]
+    rest = [one for one in others if one.maps or one.chips or one.fluctuates]
+    near = worth_fitting([*group, *_still_promising(path, plain)])
+    worth = next(one for one in competing(path.replicates, path.evaluation, near) if one[0] is group[0])
+    falls = [path.scan.line_search(path.evaluation, one.signature, one.signed)[0] for one in rest]
+    return [] if max(falls, default=0.0) > NEAR * group[0].fall else worth
 
 
 def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
@@ -246,12 +270,20 @@ def _taken(
     if not failed and path.failed:
         path.back_to(earlier)  # no check failed before, now one does
         return False
+
     # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
-    explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
-    if not explains and len(path.failed) >= max(len(failed), 1) and fell - path.misfit < 0.05 * (fell - 1):
-        if path.misfit > fell:
-            path.back_to(earlier)
-        return False
+    def helps_too_little() -> bool:
+        explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
+        more = len(path.failed) >= max(len(failed), 1)
+        return not explains and more and fell - path.misfit < _LEAST_FALL_OF_MISFIT * (fell - 1)
+
+    if helps_too_little():
+        with _needed(path, best.candidates, "fitting all numbers together"):
+            complete(path)  # a rough fit may be all that is wrong with it
+        if helps_too_little():
+            if path.misfit > fell:
+                path.back_to(earlier)
+            return False
     return True
 
 
@@ -261,16 +293,12 @@ def complete(path: ModelPath) -> bool:
     Returns:
         Whether that was done; not where it was done before, or the model cannot be simulated around its values.
     """
-
-    def is_rough() -> bool:
-        return path.approximate or bool(path.evaluation.borrowed)
-
-    if not is_rough():
+    if not path.is_rough:
         return False
     complete_fit(path)
     if path.steps:
         path.last_rung()
-    return not is_rough()
+    return not path.is_rough
 
 
 def has_few_replicates(path: ModelPath) -> bool:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..effects import Effect
+from ..errors import SpadError
 from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
@@ -32,7 +33,9 @@ _WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 _MOVES, _WORTH_A_JACOBIAN = 2, 300.0
 _MANY = 32  # replicates for a Jacobian where they fluctuate
 _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
-_INFORMING = 0.01  # of the squared norm of a column of the Jacobian: a block with more of it informs the coordinate
+_INFORMING = (
+    0.99  # of the squared norm of a column of the Jacobian: the largest blocks with so much inform a coordinate
+)
 _RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
 _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
 _KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
@@ -80,12 +83,12 @@ def fit_all(
     path.approximate = path.approximate or (roughly and bool(maps))
     path.evaluation = evaluation
     path.fit = found = None if found is None else _bounded(path, found)
-    _write_values(path, found, maps)
+    _write_values(path, found or fit, maps)
 
 
 def complete_fit(path: ModelPath) -> None:
     """Fit the maps and all coordinates together, where the last fit was a rough one, or replicates are borrowed."""
-    if not (path.approximate or path.evaluation.borrowed):
+    if not path.is_rough or path.not_completed is path.evaluation:
         return
     path.replicates.say("fitting all numbers together")
     before = path.kept()
@@ -97,6 +100,10 @@ def complete_fit(path: ModelPath) -> None:
     path.approximate = False
     if path.fit is None and before[4] is not None:  # the model cannot be simulated around its values
         path.back_to(before)
+        path.not_completed = path.evaluation
+        for one in (step.candidate for step in path.steps[-1:]):
+            reason = "the model cannot be simulated around its values: they are those of an approximate fit"
+            path.scan.not_tried(one.kind, one.effect, one.parameter, "the fit of all numbers together", reason)
 
 
 def completed(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
@@ -173,15 +180,18 @@ def _gauss_newton(
         before = path.values, maps, evaluation
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):
             path.values = {**before[0], **step.values}
-            if roughly:
-                moved = [d for d, x in zip(coordinates, step.point - point_of(coordinates, here), strict=True) if x]
-                shown = [_shown(path, d.key) for d in moved]
-                some = (before[2], set().union(*shown)) if all(shown) else None
-                sensors = path.model_at(before[2], step.values)
-                evaluation = evaluate(replicates, path.values, sensors, near=some)
-            else:
-                sensors, maps = model_of(path)
-                evaluation = evaluate(replicates, path.values, sensors)
+            try:
+                if roughly:
+                    moved = [d for d, x in zip(coordinates, step.point - point_of(coordinates, here), strict=True) if x]
+                    shown = [_shown(path, d.key) for d in moved]
+                    some = (before[2], set().union(*shown)) if all(shown) else None
+                    sensors = path.model_at(before[2], step.values)
+                    evaluation = evaluate(replicates, path.values, sensors, near=some)
+                else:
+                    sensors, maps = model_of(path)
+                    evaluation = evaluate(replicates, path.values, sensors)
+            except SpadError:  # there is no such model so far off
+                continue
             risen, noise = _rise(before[2], evaluation, list(evaluation.residuals))
             clearer = _rise(before[2], evaluation, _informing(closer))
             if risen <= _RISEN * noise and clearer[0] <= _RISEN * clearer[1]:
@@ -202,6 +212,7 @@ def _gauss_newton(
                 break
             path.approximate, near, turn = False, None, -1
             continue
+        fit = replace(step, residuals=evaluation.residuals)
         near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < SAME) else None
         path.approximate = path.approximate and near is not None
     return fit, evaluation, maps
@@ -232,7 +243,9 @@ def _informing(fit: Fit) -> list[Cell]:
     blocks: set[Cell] = set()
     for i in range(len(fit.coordinates)):
         norms = {cell: float(x[:, i] @ x[:, i]) for cell, x in fit.jacobian.items()}
-        blocks.update(cell for cell, norm in norms.items() if norm > _INFORMING * sum(norms.values()))
+        order = sorted(norms, key=lambda cell: -norms[cell])
+        sums = np.cumsum([norms[cell] for cell in order])
+        blocks.update(order[: int(np.searchsorted(sums, _INFORMING * sums[-1])) + 1] if sums[-1:].any() else ())
     return sorted(blocks)
 
 
@@ -241,13 +254,14 @@ def _rise(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tuple[
 
     Each expectation has the noise of the mean of its replicates, e, which moves the sum by 2 z e.
     """
-    keys = [k for k in keys if k in before.replicate_residuals and k in after.residuals]
+    keys = [k for k in keys if k in before.replicate_residuals and k in after.replicate_residuals]
     if not keys:
         return 0.0, 0.0
     rise = square({k: after.residuals[k] for k in keys}) - square({k: before.residuals[k] for k in keys})
     own = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
     projection = own @ stacked(before.residuals, keys)
-    return rise, 2 * math.sqrt(2 / len(own)) * float(np.std(projection))
+    variance = 1 / len(own) + 1 / len(after.replicate_residuals[keys[0]])
+    return rise, 2 * math.sqrt(variance) * float(np.std(projection))
 
 
 def _recordings(evaluation: Evaluation) -> int:

@@ -53,9 +53,15 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
+    not_completed: Evaluation | None = None  # the last one of which a fit of all numbers together was not possible
     approximate: bool = False  # the Jacobian of `fit`, or the maps, are those of models near by
     # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
     located: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether the last fit was a rough one, or captures have the replicates of another model."""
+        return self.approximate or bool(self.evaluation.borrowed)
 
     @property
     def free(self) -> tuple[Coordinate, ...]:
@@ -116,12 +122,12 @@ class ModelPath:
         own = (self.evaluation, dict(self.values), list(self.steps), list(self.ladder), self.fit)
         fitted = [(step, dict(step.values), step.map) for step in self.steps]  # a fit writes into the steps
         scan = list(self.scan.accepted), dict(self.scan.phases)
-        return (*own, *scan, fitted, dict(self.located), self.approximate)
+        return (*own, *scan, fitted, dict(self.located), self.approximate, list(self.nearest))
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """Restore the state that `kept` returned."""
         self.evaluation, self.values, self.steps, self.ladder, self.fit = kept[:5]
-        self.scan.accepted, self.scan.phases, fitted, self.located, self.approximate = kept[5:]
+        self.scan.accepted, self.scan.phases, fitted, self.located, self.approximate, self.nearest = kept[5:]
         for step, values, map_ in fitted:
             step.values, step.map = values, map_
 
@@ -164,16 +170,20 @@ class ModelPath:
     def pixels_hit(self, step: Step) -> PixelsHit | None:
         """The pixels of the chip that a step's effect has hit; None where that is not known."""
         effect = step.candidate.effect
-        if effect in self.located:
-            sensor, hit = with_values(self.replicates.start, self.values), self.located[effect]
-            return PixelsHit(hit, of_pixels(sensor, effect, hit))
 
-        def made() -> PixelsHit | None:
+        def made() -> np.ndarray | None:
             with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
-                return pixels_hit(self.replicates, self.evaluation, self.values, effect)
+                found = pixels_hit(self.replicates, self.evaluation, self.values, effect)
+                return None if found is None else found.hit
             return None
 
-        return self.evaluation.once(("pixels hit", effect), made) if step.chips else None
+        hit = self.located.get(effect)
+        if hit is None and step.chips:
+            hit = self.evaluation.once(("pixels hit", effect), made)
+        if hit is None:
+            return None
+        sensor = with_values(self.replicates.start, self.values)  # its other values may have moved since
+        return PixelsHit(hit, of_pixels(sensor, effect, hit))
 
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""
@@ -215,6 +225,7 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
             chips=best.chips,
             fluctuates=best.fluctuates,
             intervals=dict(best.intervals),
+            on_rough_fit=path.is_rough,
         )
         for candidate in best.candidates
     ]
@@ -269,7 +280,13 @@ def material(one: Trial) -> str:
 
 
 def keys_of(candidate: Candidate, path: ModelPath) -> set[Key]:
-    """The parameters that a candidate changes in the model of a path."""
+    """The parameters that a candidate changes in the model of a path, without those that a later step changes."""
     if candidate.kind == "add":
-        return {k for k in path.values if k[0] == candidate.effect}
+        later = {(c.effect, c.parameter) for c in path.scan.accepted if c.kind != "add"}
+        return {k for k in path.values if k[0] == candidate.effect and k not in later}
     return {(candidate.effect, candidate.parameter or "")}
+
+
+def rests_on(step: Step, other: Step) -> bool:
+    """Whether a step changes a parameter of the effect that the other one has added: without it, it says nothing."""
+    return step is not other and other.candidate.kind == "add" and step.candidate.effect == other.candidate.effect

@@ -35,7 +35,7 @@ from .forward_step import (
     with_more_replicates,
 )
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
-from .joint_fit import complete_fit, completed
+from .joint_fit import completed
 from .journal import Journal
 from .model_path import ModelPath, begin
 from .replicates import REPLICATES, TOTALS, Replicates
@@ -118,9 +118,16 @@ def _diagnosed(
     replicates.budget.until = FITS
     if path.steps:
         with or_as_before(path, "the fit of all numbers together"):
-            complete_fit(path)
-        with or_as_before(path, "dropping the steps that are no longer needed"):
-            drop_needless(path)
+            complete(path)
+        if path.evaluation.borrowed:  # the budget has ended it: the steps are still judged by replicates of their own
+            replicates.budget.until = math.inf
+            with or_as_before(path, "the last comparison"):
+                path.evaluation = completed(replicates, path.evaluation)
+                path.last_rung()
+            replicates.budget.until = FITS
+        if not path.approximate:
+            with or_as_before(path, "dropping the steps that are no longer needed"):
+                drop_needless(path)
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
     if path.steps and not short:

@@ -91,6 +91,7 @@ class Step:
         intervals: 95 % intervals of coordinates that the fit does not hold, by (effect, parameter), SI.
         template: (cells,) its expected residuals under the model before it, by block.
         before: (cells,) residuals of the data under the model before it, by block.
+        on_rough_fit: the numbers of the model before it were not all fitted.
     """
 
     candidate: Candidate
@@ -110,6 +111,7 @@ class Step:
     jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
     hit: np.ndarray | None = field(default=None, repr=False)  # (pixels,) bool: which ones an effect has hit at random
+    on_rough_fit: bool = False
 
     @property
     def where(self) -> str:

@@ -371,7 +371,7 @@ class Scan:
         A trial that the data resemble is left out, to be simulated anew, if its signature has changed.
 
         Args:
-            anew: every trial that the data resemble is left out.
+            anew: every trial that the data resemble is left out, and of the others those whose signature has changed.
         """
         out, promising = [], set()
         for one in known:
@@ -380,7 +380,8 @@ class Scan:
             now = replace(one)
             now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
-            if now.fall >= PROMISING / 4 and (anew or self._has_changed(evaluation, now)):
+            resembled = now.fall >= PROMISING / 4
+            if (resembled and anew) or ((resembled or anew) and self._has_changed(evaluation, now)):
                 promising.add((now.candidate.name, shape_of(now)))
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
 

@@ -210,15 +210,13 @@ def _strengths_anew(
     again = fit(found.values, _ROUNDS_AFTER_PROBES, [found.coordinates[i] for i in moving])
     if isinstance(again, str) or again.square >= found.square:
         return found
-    covariance, jacobian = found.covariance.copy(), {cell: x.copy() for cell, x in found.jacobian.items()}
-    covariance[moving, :] = covariance[:, moving] = 0.0
-    covariance[np.ix_(moving, moving)] = again.covariance
+    jacobian = {cell: x.copy() for cell, x in found.jacobian.items()}
     for cell, x in again.jacobian.items():
         jacobian[cell][:, moving] = x
     return Fit(
         found.coordinates,
         point_of(found.coordinates, again.values),
-        covariance,
+        found.covariance,
         again.residuals,
         jacobian,
         again.square,
