@@ -61,8 +61,8 @@ def fit_all(
         roughly: the maps stay as they are, and captures that do not show what has moved are not simulated again, until
             `complete_fit`. `known` is given.
         near: of the model without the last step, see `evaluate`.
-        where_shown: the Jacobian is simulated where the steps showed when they were added. Since then no shape has
-            moved to another minimum.
+        where_shown: the Jacobian is simulated where the steps showed when they were added; this assumes that no
+            shape has moved to another minimum since.
     """
     if roughly and known is not None:
         maps = {step.candidate.carrier: step.map for step in path.steps if step.candidate.carrier and step.map}

@@ -1,9 +1,10 @@
 """Model selection: which physical effect does a model lack? Forward selection, then backward elimination.
 
 Candidates are tried only where a model fails (as `compare` judges): every registered effect that it lacks, every
-listed parameter at another value, every map (`candidates`). The best ones of the scan are fitted, the best of these
-is added, and everything is fitted anew, until nothing significant is left. What the set-up explains is not attributed
-to the sensor (`setups`).
+listed parameter at another value, every map (`candidates`). The best ones of the scan are fitted, and the best of
+these is added, until nothing significant is left. While checks fail plainly, the numbers of earlier steps are fitted
+roughly; all numbers are fitted together before anything fainter is decided, and at the end. What the set-up explains
+is not attributed to the sensor (`setups`).
 """
 
 from __future__ import annotations

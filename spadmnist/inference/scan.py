@@ -380,8 +380,8 @@ class Scan:
             now = replace(one)
             now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
-            resembled = now.fall >= PROMISING / 4
-            if (resembled and anew) or ((resembled or anew) and self._has_changed(evaluation, now)):
+            resembled, known_size = now.fall >= PROMISING / 4, now.size > 0
+            if (resembled and anew) or ((resembled or (anew and known_size)) and self._has_changed(evaluation, now)):
                 promising.add((now.candidate.name, shape_of(now)))
         return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
 
