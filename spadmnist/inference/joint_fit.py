@@ -102,8 +102,8 @@ def complete_fit(path: ModelPath) -> None:
         path.back_to(before)
         path.not_completed = path.evaluation
         for one in (step.candidate for step in path.steps[-1:]):
-            reason = "the model cannot be simulated around its values: they are those of an approximate fit"
-            path.scan.not_tried(one.kind, one.effect, one.parameter, "the fit of all numbers together", reason)
+            where = "the fit of all numbers together; the values are those of an approximate fit"
+            path.scan.not_tried(one.kind, one.effect, one.parameter, where, path.no_fit_because)
 
 
 def completed(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
@@ -169,6 +169,7 @@ def _gauss_newton(
             functools.partial(_shown, path) if where_shown else lambda key: (),
         )
         if isinstance(closer, str):
+            path.no_fit_because = closer
             if rejected is not None:
                 fit, path.approximate = rejected, True
             break

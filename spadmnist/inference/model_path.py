@@ -53,6 +53,7 @@ class ModelPath:
     fit: Fit | None = None  # of the coordinates of all steps, with the Jacobian
     nearest: list[Step] = field(default_factory=list)  # steps that only resembled what remains
     finished: bool = True  # no budget has ended it
+    no_fit_because: str = ""  # why the coordinates could not be fitted together the last time that they could not
     not_completed: Evaluation | None = None  # the last one of which a fit of all numbers together was not possible
     approximate: bool = False  # the Jacobian of `fit`, or the maps, are those of models near by
     # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
