@@ -24,6 +24,7 @@ _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess 
 _VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
 _CLEARLY = 1e-6  # p-value of a check that fails clearly: noise of a fit to first order does not make it
 _NEEDED = 90.0  # in chi square: a step is kept if a fit to first order without it is worse by more
+_LAST_STEP = 6.0  # in chi square: the most that the last step of a fit promises, which is not simulated
 _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
 
 
@@ -34,7 +35,8 @@ def drop_needless(path: ModelPath) -> None:
     """
     replicates = path.replicates
     last = path.steps[-1]
-    for step in list(path.steps):
+    # what others rest on comes last: it can be dropped once these are
+    for step in sorted(path.steps, key=lambda s: any(rests_on(other, s) for other in path.steps)):
         if len(path.steps) < 2 or step.phased or any(rests_on(other, step) for other in path.steps):
             continue
         if step is last and not step.on_rough_fit:
@@ -56,8 +58,9 @@ def drop_needless(path: ModelPath) -> None:
             continue
         others = tuple(d for s in path.steps if s is not step for d in s.coordinates)
         z = residuals_at(replicates, path.evaluation, signature)
-        # the evaluation is that of the values before the last step of the fit
-        now = min(square(x) for x in (path.evaluation.residuals, *([path.fit.residuals] if path.fit else [])))
+        now = square(path.evaluation.residuals)
+        if path.fit is not None:  # the evaluation is that of the values before the last step of the fit
+            now = max(min(now, square(path.fit.residuals)), now - _LAST_STEP)
         loss = square(z) - now
         if loss > 30 and not others:
             continue

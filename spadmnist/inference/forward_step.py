@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -103,7 +104,7 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
     replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
-    notes.second = second
+    notes.second = [replace(one, intervals=dict(one.intervals)) for one in second]  # a fit writes into a trial
     if not second:
         return False
     worth = worth_fitting(second, faint)
@@ -113,7 +114,7 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     refused = False
     for k, group in enumerate(groups):
         fitted += _fitted(path, group, faint)
-        while found := _best_of(path, notes, second, fitted, faint):
+        while found := _best_of(path, notes, second[0], fitted, faint):
             best, significance, p = found
             # squares do not show small differences of many pixels or codes: their p-value is that of their own test
             if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
@@ -155,7 +156,7 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
         if not group:
             break
         with contextlib.suppress(_NoCandidate, *UNABLE):  # the scan that follows records what cannot be simulated
-            found = _best_of(path, notes, group, _fitted(path, group, False), False)
+            found = _best_of(path, notes, None, _fitted(path, group, False), False)
             if found is not None and found[2] <= FALSE_ALARM and found[0].evidence >= LEAST_EVIDENCE:
                 best, significance, _ = found
                 if leads(best, notes.waiting) and _taken(path, notes, failed, group, best, significance):
@@ -168,17 +169,20 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
 def _with_rivals(path: ModelPath, group: list[Trial], others: Sequence[Trial]) -> list[Trial]:
     """The trials of a group, and those of others that compete with them under this model, which are worth fitting.
 
-    None where one of these has a map or a scatter of its own, which an earlier signature does not predict.
+    None where a new scan may find something else: where another trial that does not compete with them leads, or where
+    one has a map or a scatter of its own, which an earlier signature does not predict.
 
     Args:
         others: of the same second look, that promised too little beside the step that was added.
     """
     plain = [one for one in others if not (one.maps or one.chips or one.fluctuates)]
     rest = [one for one in others if one.maps or one.chips or one.fluctuates]
-    near = worth_fitting([*group, *_still_promising(path, plain)])
-    worth = next(one for one in competing(path.replicates, path.evaluation, near) if one[0] is group[0])
+    first, *further = competing(path.replicates, path.evaluation, [*group, *_still_promising(path, plain)])
+    apart = max((one.fall for members in further for one in members), default=0.0)
     falls = [path.scan.line_search(path.evaluation, one.signature, one.signed)[0] for one in rest]
-    return [] if max(falls, default=0.0) > NEAR * group[0].fall else worth
+    if NEAR * apart > group[0].fall or max(falls, default=0.0) > NEAR * group[0].fall:
+        return []
+    return worth_fitting(sorted(first, key=lambda one: -one.fall))
 
 
 def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
@@ -192,7 +196,8 @@ def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
         line = path.scan.line_at(evaluation, one.candidate, one.values) if one.phases else None
         if one.candidate.effect in added or path.scan.is_excluded(one.candidate) or (one.phases and line is None):
             continue
-        now = replace(one, p_value=line.p if line else one.p_value)
+        anew: dict[str, Any] = {"evaluation": None, "fit": None, "there": None, "residuals": None}
+        now = replace(one, p_value=line.p if line else one.p_value, evidence=-math.inf, **anew)
         now.fall, now.times = path.scan.line_search(evaluation, one.signature, one.signed)
         now.fall -= 2 * len(one.phases)
         with contextlib.suppress(SpadError):  # the scan that follows records what cannot be set in this model
@@ -216,9 +221,13 @@ def _fitted(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]
 
 
 def _best_of(
-    path: ModelPath, notes: Notes, second: Sequence[Trial], fitted: Sequence[Trial], faint: bool
+    path: ModelPath, notes: Notes, first: Trial | None, fitted: Sequence[Trial], faint: bool
 ) -> tuple[Trial, float, float] | None:
-    """(best of the fitted trials, its significance, its p-value); None where there is none."""
+    """(best of the fitted trials, its significance, its p-value); None where there is none.
+
+    Args:
+        first: of the second look, where `patterns_first` had a say.
+    """
     replicates = path.replicates
     judged = {id(one): p_of_best(replicates, path.evaluation, notes.tried, one, not faint) for one in fitted}
     if faint:
@@ -228,7 +237,7 @@ def _best_of(
         fitted = [one for one in fitted if explains_its_signature(replicates, path.evaluation, one)]
     if not fitted:
         return None
-    pattern = second[0] if is_pattern(second[0]) and (faint or second[0].evidence >= LEAST_EVIDENCE) else None
+    pattern = first if first and is_pattern(first) and (faint or first.evidence >= LEAST_EVIDENCE) else None
     if faint:
         best = best_of(fitted, lambda t: -judged[id(t)][1], pattern)
     else:

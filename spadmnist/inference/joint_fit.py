@@ -152,6 +152,7 @@ def _gauss_newton(
     fit: Fit | None = None
     rejected: Fit | None = None  # by known columns, at the values from which they led nowhere
     path.approximate = near is not None
+    borrowed_columns = path.approximate  # of `fit`: its Jacobian is that of other models
     turn = -1
     while turn < _AGAIN:
         turn += 1
@@ -170,10 +171,11 @@ def _gauss_newton(
         )
         if isinstance(closer, str):
             path.no_fit_because = closer
+            path.approximate = path.approximate or borrowed_columns
             if rejected is not None:
                 fit, path.approximate = rejected, True
             break
-        fit = closer
+        fit, borrowed_columns = closer, path.approximate
         promised = square(evaluation.residuals) - closer.square
         later = roughly and path.approximate  # what a Jacobian of other models promises little of can wait
         if turn == (_MOVES if later else _AGAIN) or promised < (_WORTH_AT_ONCE if later else _WORTH):
@@ -213,7 +215,7 @@ def _gauss_newton(
                 break
             path.approximate, near, turn = False, None, -1
             continue
-        fit = replace(step, residuals=evaluation.residuals)
+        fit, rejected = replace(step, residuals=evaluation.residuals), None
         near = closer if np.all(np.abs(step.point - point_of(coordinates, here)) < SAME) else None
         path.approximate = path.approximate and near is not None
     return fit, evaluation, maps

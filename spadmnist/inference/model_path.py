@@ -183,8 +183,10 @@ class ModelPath:
             hit = self.evaluation.once(("pixels hit", effect), made)
         if hit is None:
             return None
-        sensor = with_values(self.replicates.start, self.values)  # its other values may have moved since
-        return PixelsHit(hit, of_pixels(sensor, effect, hit))
+        with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
+            sensor = with_values(self.replicates.start, self.values)  # its other values may have moved since
+            return PixelsHit(hit, of_pixels(sensor, effect, hit))
+        return None
 
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""

@@ -26,7 +26,7 @@ from .exact_likelihood import MaximumLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
-from .joint_fit import complete_fit, edge_errors, fit_all, variances_by_pixels
+from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
 from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .pixel_maps import HALF_95
@@ -206,6 +206,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
         accept(path, best, math.sqrt(max(best.evidence, 0.0)))
     if path.approximate or path.evaluation.borrowed:
         complete_fit(path)
+        path.evaluation = completed(replicates, path.evaluation)  # where not all numbers could be fitted together
         path.last_rung()
     with contextlib.suppress(*UNABLE):  # the fit by other chips stands
         if fit_where_hit(path):
