@@ -257,7 +257,7 @@ def test_a_step_stays_while_another_one_changes_a_number_of_its_effect(lab) -> N
 
 
 def test_a_group_that_waited_is_fitted_with_what_competes_with_it_now(lab, monkeypatch) -> None:
-    """Beside the step that was added, its rival promised too little to be fitted."""
+    """A rival with a small fall was not worth a fit in the second look; with the new step in the model it is."""
     path, asked = begin(bench_of(lab("    crosstalk: {probability: 10 %}\n", dead=60, light=1000), 16)), []
     recovery = change_of(path.replicates, "add slow_recovery")
     edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import SpadError
 from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
 from .gauss_newton import Fit, column_of, gauss_newton
-from .joint_fit import SAME, fit_all, without_fit
+from .joint_fit import SAME, WORTH, fit_all, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
@@ -24,7 +24,6 @@ _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess 
 _VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
 _CLEARLY = 1e-6  # p-value of a check that fails clearly: noise of a fit to first order does not make it
 _NEEDED = 90.0  # in chi square: a step is kept if a fit to first order without it is worse by more
-_LAST_STEP = 6.0  # in chi square: the most that the last step of a fit promises, which is not simulated
 _NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
 
 
@@ -59,8 +58,8 @@ def drop_needless(path: ModelPath) -> None:
         others = tuple(d for s in path.steps if s is not step for d in s.coordinates)
         z = residuals_at(replicates, path.evaluation, signature)
         now = square(path.evaluation.residuals)
-        if path.fit is not None:  # the evaluation is that of the values before the last step of the fit
-            now = max(min(now, square(path.fit.residuals)), now - _LAST_STEP)
+        if path.fit is not None:  # its last step, which promises less than WORTH, is not simulated
+            now = max(min(now, square(path.fit.residuals)), now - WORTH)
         loss = square(z) - now
         if loss > 30 and not others:
             continue

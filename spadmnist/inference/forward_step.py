@@ -167,13 +167,13 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
 
 
 def _with_rivals(path: ModelPath, group: list[Trial], others: Sequence[Trial]) -> list[Trial]:
-    """The trials of a group, and those of others that compete with them under this model, which are worth fitting.
+    """The trials of a group that are worth fitting, with the other trials that compete with them under this model.
 
-    None where a new scan may find something else: where another trial that does not compete with them leads, or where
-    one has a map or a scatter of its own, which an earlier signature does not predict.
+    It is empty where a new scan is needed: a trial that does not compete with them promises far more, or one with a map
+    or a scatter of its own, which an earlier signature does not predict, promises much.
 
     Args:
-        others: of the same second look, that promised too little beside the step that was added.
+        others: the trials of the same second look that are in no group.
     """
     plain = [one for one in others if not (one.maps or one.chips or one.fluctuates)]
     rest = [one for one in others if one.maps or one.chips or one.fluctuates]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
 SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
 # in chi square: a fall beyond which the fitted model is simulated; and that beyond which a rough fit does so
-_WORTH, _WORTH_AT_ONCE = 6.0, 30.0
+WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 # of a rough fit: moves at most; and in chi square the promised fall for which a rejected Jacobian is simulated anew
 _MOVES, _WORTH_A_JACOBIAN = 2, 300.0
 _MANY = 32  # replicates for a Jacobian where they fluctuate
@@ -178,7 +178,7 @@ def _gauss_newton(
         fit, borrowed_columns = closer, path.approximate
         promised = square(evaluation.residuals) - closer.square
         later = roughly and path.approximate  # what a Jacobian of other models promises little of can wait
-        if turn == (_MOVES if later else _AGAIN) or promised < (_WORTH_AT_ONCE if later else _WORTH):
+        if turn == (_MOVES if later else _AGAIN) or promised < (_WORTH_AT_ONCE if later else WORTH):
             break
         before = path.values, maps, evaluation
         for step in (closer, *_strengths_alone(path, closer, evaluation, here)):

@@ -91,7 +91,7 @@ class Step:
         intervals: 95 % intervals of coordinates that the fit does not hold, by (effect, parameter), SI.
         template: (cells,) its expected residuals under the model before it, by block.
         before: (cells,) residuals of the data under the model before it, by block.
-        on_rough_fit: the numbers of the model before it were not all fitted.
+        on_rough_fit: it was added to a model whose numbers were not all fitted together.
     """
 
     candidate: Candidate

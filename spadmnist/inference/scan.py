@@ -261,8 +261,8 @@ class Scan:
         Args:
             everywhere: in all captures, not only in the most informative ones.
             known: trials under an earlier model. Their signatures are used again where the data do not resemble them,
-                or where the scatter of their cells has not changed; captures in which they were not simulated are
-                added.
+                or where the scatter of their cells has not changed; with `everywhere`, where both hold. Captures in
+                which they were not simulated are added.
         """
         tries: list[tuple[Candidate, dict[Key, Any]]] = []
         for candidate in self.candidates(evaluation.sensors.one):

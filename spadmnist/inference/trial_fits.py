@@ -32,8 +32,8 @@ _HARDLY = 1e-3, 1.0  # of the square of a signature, as a share and in variances
 _ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
 STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
 _PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
-_ROUNDS_AFTER_PROBES = 2  # see `gauss_newton`: of the fit from the best probe
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
+_ROUNDS_AFTER_PROBES = 2  # of the strengths' fit at the best probe, see `gauss_newton`; as for a whole number
 # of a logarithm: the first distances of an edge; how often they are repeated
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6
 _POWERS = (0.85, 2.3)  # powers with which a signature may grow if it is simulated at another strength
