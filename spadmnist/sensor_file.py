@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import itertools
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +30,29 @@ _OURS = "# Written by spadmnist, which writes it anew when asked to; without thi
 _ITS_EFFECT = "# Its effect"  # begins a line about a plug-in, behind the first line
 
 
-def check_place(source: Path, out: Path, ours: bool = False) -> None:
-    """Raise InputError where the next sensor file would take the place of one that was not made by `write`.
+@dataclass(frozen=True)
+class Original:
+    """The file that describes a sensor, as it was when it was read.
 
-    ours: is it known otherwise that what is there was?
+    Attributes:
+        path: absolute.
+        text: its bytes.
+        sensor: what it describes.
     """
+
+    path: Path
+    text: bytes
+    sensor: Sensor
+
+
+def original(source: Path) -> Original:
+    """The file that describes the sensor of a sensor file or config."""
+    path = _described_in(Path(source).absolute())
+    return Original(path, path.read_bytes(), config.read_sensor(path))
+
+
+def check_place(source: Path, out: Path) -> None:
+    """Raise InputError where the next sensor file would take the place of one that was not made by `write`."""
     if not out.exists():
         return
     source = _described_in(source)
@@ -40,7 +60,7 @@ def check_place(source: Path, out: Path, ours: bool = False) -> None:
         raise InputError(f"{out} is the sensor file itself, which stays as it is; name another folder or file with -o")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with -o, for example {out / 'next.yaml'}")
-    if not ours and not _is_ours(out):
+    if not _is_ours(out):
         raise InputError(
             f"{out} is there already and no sensor file that a fit or a diagnosis has written; it is left alone: name "
             "another folder or file with -o"
@@ -63,26 +83,33 @@ def _is_ours(file: Path) -> bool:
         return False
 
 
-def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = False) -> Path:
+def save(sensor: Sensor, out: Path, notes: Notes | None = None, earlier: set[Path] | None = None) -> Path:
     """Write a sensor as a file, its maps beside it as `.npy`; `out`. Read again it is the same sensor.
 
-    notes: what stands behind the line of an effect, as a comment. ours: as of `check_place`. Of a part of a chip the
-    whole chip is written. Raises InputError where something else lies there, SpadError where it cannot be written.
+    Of a part of a chip the whole chip is written.
+
+    Args:
+        notes: what stands behind the line of an effect, as a comment.
+        earlier: as of `write`.
+
+    Raises:
+        InputError: where something else lies there.
+        SpadError: where it cannot be written.
     """
     out = Path(out)
-    check_place(Path(os.devnull), out, ours)
+    check_place(Path(os.devnull), out)
     if sensor.chip is not None and sensor.window is not None:
         effects = [sensor._on_chip(effect) for effect in sensor.effects]
         sensor = sensor.chip.changed(effects=effects, name=sensor.name)
-    maps: dict[str, np.ndarray] = {}
+    maps: dict[str, bytes] = {}
 
     def value(effect: Effect, name: str, declared: Parameter) -> Any:
         held = getattr(effect, name)
         if isinstance(held, MapFile):
             return {"file": os.path.relpath(held.path, out.parent.resolve())}
         if isinstance(held, np.ndarray) and held.ndim:
-            file = f"{out.stem}.{effect.name}.{name}.npy"
-            maps[file] = held.reshape(sensor.layout.shape) if declared.per_pixel else held
+            file, data = _map_file(out, effect.name, name, held.reshape(at.shape) if declared.per_pixel else held)
+            maps[file] = data
             return {"file": file}
         return _plain(declared, held)
 
@@ -101,15 +128,38 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, ours: bool = Fal
         edit.note(("sensor", "effects", name, parameter), note)
     with disk.writing(out.parent, 0):
         out.parent.mkdir(parents=True, exist_ok=True)
-    for file, array in maps.items():
-        held = io.BytesIO()
-        np.save(held, array)
-        disk.put_file(out.parent / file, held.getvalue())
+    _put_maps(out, maps, earlier)
     if at.positions is not None:
         disk.put_file(out.parent / layout["positions"], positions_text(at.positions).encode())
     disk.put_file(out, _headed(edit.text(), out).encode())
     config.read_sensor(out)
+    _remove_earlier(out, maps, earlier)
     return out
+
+
+def _map_file(out: Path, effect: str, parameter: str, values: np.ndarray) -> tuple[str, bytes]:
+    """(the name of a map beside a sensor file, its bytes). By its content no map takes the place of another."""
+    held = io.BytesIO()
+    np.save(held, values)
+    data = held.getvalue()
+    return f"{out.stem}.{effect}.{parameter}.{hashlib.sha256(data).hexdigest()[:8]}.npy", data
+
+
+def _put_maps(out: Path, maps: Mapping[str, bytes], earlier: set[Path] | None) -> None:
+    for name, data in maps.items():
+        path = out.parent / name
+        if earlier is not None and not path.exists():
+            earlier.add(path)
+        disk.put_file(path, data)
+
+
+def _remove_earlier(out: Path, maps: Mapping[str, bytes], earlier: set[Path] | None) -> None:
+    """Remove the maps of earlier values of a sensor file."""
+    for path in list(earlier or ()):
+        if path.parent == out.parent and path.name.startswith(f"{out.stem}.") and path.name not in maps:
+            path.unlink(missing_ok=True)
+            assert earlier is not None
+            earlier.remove(path)
 
 
 def _plain(declared: Parameter, held: Any) -> Any:
@@ -134,18 +184,33 @@ def _plain(declared: Parameter, held: Any) -> Any:
     return units.exact(float(held), declared.unit)
 
 
-def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, window: Window | None = None) -> Path:
-    """Write `out` beside its maps; source: the sensor file that was diagnosed. Returns `out`.
+def write(
+    source: Original,
+    out: Path,
+    values: Mapping[Key, Any],
+    notes: Notes,
+    window: Window | None = None,
+    earlier: set[Path] | None = None,
+) -> Path:
+    """Write a sensor file with other values, and its maps beside it; `out`.
 
-    values: (effect, parameter) -> number, switch, table over the wavelength or map; notes: what stands behind a line,
-    as a comment. window: the part of the sensor that maps are of; elsewhere they are as `source` has them, or at their
-    median where it does not. Raises SpadError where the file cannot be read again; then none is left there.
+    Args:
+        source: the sensor file that was diagnosed; its comments are kept.
+        values: (effect, parameter) -> number, switch, table over the wavelength or map.
+        notes: what stands behind a line, as a comment.
+        window: the part of the sensor that maps are of; elsewhere they are as `source` has them, or at their median
+            where it does not.
+        earlier: the maps that earlier calls with this set have written; those that the file no longer names are
+            removed.
+
+    Raises:
+        SpadError: where the file cannot be read again; then none is left there.
     """
+    chip = source.sensor
     out.parent.mkdir(parents=True, exist_ok=True)
-    source = _described_in(source)
-    chip = config.read_sensor(source)
-    edit = yaml_edit.Edit(source.read_bytes().decode("utf-8-sig"), str(source))
-    before, after = source.parent.resolve(), out.parent.resolve()
+    edit = yaml_edit.Edit(source.text.decode("utf-8-sig"), str(source.path))
+    before, after = source.path.parent.resolve(), out.parent.resolve()
+    maps: dict[str, bytes] = {}
     edit.map_texts({"file", "positions"}, lambda name: os.path.relpath(before / name, after))
     head = ("sensor", "effects") if "sensor" in edit.value else ("effects",)
     for (effect, parameter), value in values.items():
@@ -153,11 +218,9 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
         if isinstance(value, np.ndarray):
             if window is not None:
                 value = window.filled(declared, value, getattr(chip.effect(effect), parameter, None))
-            # with the file's own name, lest it takes the place of a map that another sensor beside it has
-            name = f"{out.stem}.{effect}.{parameter}.npy"
-            map_ = io.BytesIO()
-            np.save(map_, value.reshape(chip.layout.shape) if declared.per_pixel else value)
-            disk.put_file(out.parent / name, map_.getvalue())
+            shaped = value.reshape(chip.layout.shape) if declared.per_pixel else value
+            name, data = _map_file(out, effect, parameter, shaped)
+            maps[name] = data
             written: Any = {"file": name}
         elif isinstance(value, bool):
             written = value
@@ -170,12 +233,14 @@ def write(source: Path, out: Path, values: Mapping[Key, Any], notes: Notes, wind
     for (effect, parameter), note in notes.items():
         if (effect, parameter) in values:
             edit.note((*head, effect, parameter), note)
+    _put_maps(out, maps, earlier)
     disk.put_file(out, _headed(edit.text(), out).encode())
     try:
         config.read_sensor(out)
     except SpadError:
         out.unlink()
         raise
+    _remove_earlier(out, maps, earlier)
     return out
 
 

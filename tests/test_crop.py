@@ -619,7 +619,9 @@ def test_the_next_sensor_describes_the_whole_chip(lab: Path, tmp_path: Path) -> 
         ("afterpulsing", "lifetime"): 30e-9,
         ("dead_time", "duration"): 45e-9,
     }
-    out = sensor_file.write(lab / "sensor.yaml", tmp_path / "sensor.yaml", values, {}, part.window)
+    out = sensor_file.write(
+        sensor_file.original(lab / "sensor.yaml"), tmp_path / "sensor.yaml", values, {}, part.window
+    )
     again = config.read_sensor(out).cropped(slice(16, 32), slice(8, 24))
     found = with_values(part, values)
     for one, other in ((again, found), (again.chip, found.chip)):

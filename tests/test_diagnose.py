@@ -109,7 +109,12 @@ def test_the_next_sensor_is_the_users_own_file(tmp_path):
         ("dead_time", "duration"): 52e-9,
         ("detection", "relative"): np.linspace(0.9, 1.1, 64),
     }
-    out = sensor_file.write(file, tmp_path / "next" / "sensor.yaml", values, {("crosstalk", "probability"): "from lab"})
+    out = sensor_file.write(
+        sensor_file.original(file),
+        tmp_path / "next" / "sensor.yaml",
+        values,
+        {("crosstalk", "probability"): "from lab"},
+    )
     text = out.read_text()
     assert "# what the datasheet says" in text and "# at 500 nm" in text and "# from lab" in text
     read = config.read_sensor(out)
@@ -123,8 +128,8 @@ def test_the_next_of_the_next_sensor_leaves_its_maps_alone(tmp_path):
     first, second = tmp_path / "next.yaml", tmp_path / "next2.yaml"
     (tmp_path / "sensor.yaml").write_text(SENSOR)
     key = ("detection", "relative")
-    sensor_file.write(tmp_path / "sensor.yaml", first, {key: np.linspace(0.9, 1.1, 64)}, {})
-    sensor_file.write(first, second, {key: np.linspace(0.5, 1.5, 64)}, {})
+    sensor_file.write(sensor_file.original(tmp_path / "sensor.yaml"), first, {key: np.linspace(0.9, 1.1, 64)}, {})
+    sensor_file.write(sensor_file.original(first), second, {key: np.linspace(0.5, 1.5, 64)}, {})
     for file, low in ((first, 0.9), (second, 0.5)):
         assert config.read_sensor(file).effect("detection").relative[0] == pytest.approx(low)
         assert file.read_text().count("Written by spadmnist") == 1
@@ -133,7 +138,9 @@ def test_the_next_of_the_next_sensor_leaves_its_maps_alone(tmp_path):
         "dead_time: {duration: 50 ns}", "dead_time:\n      duration:\n        normal: {mean: 50 ns, sigma: 1 ns}"
     )
     (tmp_path / "lines.yaml").write_text(lines)
-    out = sensor_file.write(tmp_path / "lines.yaml", tmp_path / "third.yaml", {("dead_time", "duration"): 55e-9}, {})
+    out = sensor_file.write(
+        sensor_file.original(tmp_path / "lines.yaml"), tmp_path / "third.yaml", {("dead_time", "duration"): 55e-9}, {}
+    )
     sensor_file.check_place(tmp_path / "lines.yaml", out)
 
 

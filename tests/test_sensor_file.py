@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,9 @@ def test_a_value_is_written_along_what_it_runs(per: str, rows: int, columns: int
     size = {"": 0, "pixel": rows * columns, "row": rows, "column": columns, "code": codes}[per]
     value: Any = 0.005 if size == 0 else np.linspace(0.9, 1.1, size)
     key = OF_KIND[per]
-    again = config.read_sensor(sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: value}, {})).resolved()
+    again = config.read_sensor(
+        sensor_file.write(sensor_file.original(file), tmp_path / "next" / "sensor.yaml", {key: value}, {})
+    ).resolved()
     found = getattr(again.effect(key[0]), key[1])
     assert np.shape(found) == np.shape(value)
     assert np.array_equal(found, value)
@@ -67,7 +70,9 @@ def test_a_config_that_names_its_sensor_s_file_is_followed_there(tmp_path: Path)
     lab.write_text("seed: 1\nscene: {images: {source: uniform}, lux: [1 lux]}\nsensor: sensors/sensor.yaml\n")
     with pytest.raises(InputError, match="is the sensor file itself"):
         sensor_file.check_place(lab, file)
-    out = sensor_file.write(lab, tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {})
+    out = sensor_file.write(
+        sensor_file.original(lab), tmp_path / "next" / "sensor.yaml", {("crosstalk", "probability"): 0.005}, {}
+    )
     found: dict[str, Any] = {e.name: e for e in config.read_sensor(out).resolved().effects}
     assert found["crosstalk"].probability == 0.005
     assert np.array_equal(found["dark_counts"].rate, np.arange(1.0, 7.0))
@@ -82,7 +87,9 @@ def test_the_user_s_own_lines_stay_and_the_maps_are_reached_from_the_new_place(t
     text = text.replace("  rules: device", "  rules:   'device'  # as on the data sheet\n\n  # its size")
     file.write_bytes(text.replace("\n", "\r\n").encode())
     key = ("crosstalk", "probability")
-    out = sensor_file.write(file, tmp_path / "next" / "sensor.yaml", {key: 0.005}, {key: "from lab"})
+    out = sensor_file.write(
+        sensor_file.original(file), tmp_path / "next" / "sensor.yaml", {key: 0.005}, {key: "from lab"}
+    )
     assert np.array_equal(config.read_sensor(out).resolved().effect("dark_counts").rate, np.arange(1.0, 7.0))
     first, *lines = out.read_bytes().decode().split("\r\n")
     assert first.startswith("# Written by")
@@ -95,7 +102,9 @@ def test_the_user_s_own_lines_stay_and_the_maps_are_reached_from_the_new_place(t
 def test_codes_of_each_pixel_are_written_as_they_are(tmp_path: Path) -> None:
     file, widths = sensor_in(tmp_path, 2, 2), np.linspace(0.9, 1.1, 16).reshape(4, 4)
     key = OF_KIND["code"]
-    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {key: widths}, {})).resolved()
+    again = config.read_sensor(
+        sensor_file.write(sensor_file.original(file), tmp_path / "next.yaml", {key: widths}, {})
+    ).resolved()
     assert np.array_equal(again.effect(key[0]).widths, widths)
 
 
@@ -104,7 +113,9 @@ def test_a_table_over_the_wavelength_is_read_again(effects: str, tmp_path: Path)
     file = sensor_in(tmp_path, 2, 2)
     file.write_text(file.read_text().replace("{pdp: 0.42}", effects))
     table = ByWavelength((450e-9, 517.25e-9, 850e-9), (0.3, 0.41, 0.05))
-    again = config.read_sensor(sensor_file.write(file, tmp_path / "next.yaml", {("detection", "pdp"): table}, {}))
+    again = config.read_sensor(
+        sensor_file.write(sensor_file.original(file), tmp_path / "next.yaml", {("detection", "pdp"): table}, {})
+    )
     found = again.effect("detection").pdp
     assert found.wavelengths == pytest.approx(table.wavelengths, rel=1e-9)
     assert found.values == pytest.approx(table.values, rel=1e-6)
@@ -120,7 +131,7 @@ def test_every_parameter_of_the_catalogue_runs_along_what_is_tested() -> None:
 def test_what_cannot_be_read_again_is_not_left_there(tmp_path: Path) -> None:
     out = tmp_path / "next.yaml"
     with pytest.raises(SpadError, match="needs one number for each row"):
-        sensor_file.write(sensor_in(tmp_path, 4, 4), out, {OF_KIND["row"]: np.ones(3)}, {})
+        sensor_file.write(sensor_file.original(sensor_in(tmp_path, 4, 4)), out, {OF_KIND["row"]: np.ones(3)}, {})
     assert not out.exists()
 
 
@@ -147,15 +158,15 @@ def test_a_sensor_file_says_which_plug_in_it_needs_and_the_command(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     file, out = sensor_in(tmp_path, 2, 2), Path("next", "sensor.yaml")
-    sensor_file.write(file, out, {("crosstalk", "probability"): 0.005}, {})
+    sensor_file.write(sensor_file.original(file), out, {("crosstalk", "probability"): 0.005}, {})
     assert "plug-in" not in out.read_text()
     Path("my echo.py").write_text(ECHO)
     plugins.load_file("my echo.py")
-    sensor_file.write(file, out, {("echo_of_test", "rate"): 2.0}, {})
+    sensor_file.write(sensor_file.original(file), out, {("echo_of_test", "rate"): 2.0}, {})
     said = "# Its effect echo_of_test is in the plug-in my echo.py. The command with it: spadmnist compare "
     command = "next/sensor.yaml MEASUREMENT --plugin 'my echo.py'"
     assert out.read_text().splitlines()[1] == said + command
-    sensor_file.write(out, Path("third.yaml"), {("crosstalk", "probability"): 0.005}, {})
+    sensor_file.write(sensor_file.original(out), Path("third.yaml"), {("crosstalk", "probability"): 0.005}, {})
     assert Path("third.yaml").read_text().count("# Its effect") == 1
     assert "compare third.yaml MEASUREMENT" in Path("third.yaml").read_text()
     saved = sensor_file.save(config.read_sensor(out), Path("saved.yaml"))
@@ -178,7 +189,7 @@ def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, values: dict[Any, An
     lists: list[Any] = [[], [], [], [], [], [], []]
     found = Diagnosis("small", "lab", "explained" if options else "adequate", 1.0, 1.0, 1.2, *lists, values=values)
     monkeypatch.setattr(model_selection, "diagnose", lambda *_, **__: found)
-    monkeypatch.setattr(measurement, "open", lambda path: None)
+    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None))
     (folder / "lab").mkdir()
     asked = ["diagnose", str(sensor_in(folder, 16, 16)), str(folder / "lab"), "-o", str(folder / "next")]
     return CliRunner().invoke(cli.cli, [*asked, *options, "--json", str(folder / "answer.json")])

@@ -229,11 +229,12 @@ def test_a_sensor_file_that_nobody_made_here_is_left_alone(tmp_path):
     own.write_text(TR + "# typical; from data sheet, 2024-05-01\n")
     with pytest.raises(InputError, match="it is left alone"):
         sensor_file.check_place(file, own)
-    sensor_file.check_place(file, own, ours=True)
     with pytest.raises(InputError, match="is a folder"):
         sensor_file.check_place(file, tmp_path)
     key = ("dead_time", "duration")
-    made = sensor_file.write(file, tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"})
+    made = sensor_file.write(
+        sensor_file.original(file), tmp_path / "next.yaml", {key: 55e-9}, {key: "from lab, 2026-11-23: duration (95 %)"}
+    )
     sensor_file.check_place(file, made)
     made.write_text(made.read_text().partition("\n")[2])  # the line that says so
     with pytest.raises(InputError, match="it is left alone"):

@@ -64,7 +64,7 @@ def compare(
             raise InputError(f'--tolerance: {tolerance} is not a share of more than 0 and less than 1, like "0.5 %"')
     if output is not None:
         pages.check_place(output)
-    _check_answer(json_file, output)
+    _check_answer(json_file, output, *_pages(output))
     with terminal.progress() as progress:
         found = library.compare(
             sensor,
@@ -130,7 +130,7 @@ def diagnose(
     from ..inference import next_step, results
     from ..library.answers import SENSOR
 
-    _check_answer(json_file, output)
+    _check_answer(json_file, output, *_pages(output), *([output / SENSOR] if output else []))
 
     def keep(so_far: Diagnosis) -> None:
         """What is found so far, should the rest be interrupted."""
@@ -241,11 +241,18 @@ def _write_sensor(found: Diagnosis | Fit, out: Path) -> None:
 _HEAD = 200  # bytes in which an answer says its format
 
 
-def _check_answer(file: Path | None, output: Path | None = None) -> None:
-    """Refuse to put an answer where something else is, or will be, before any work is done."""
+def _pages(folder: Path | None) -> list[Path]:
+    """The pages that a folder may hold."""
+    from .. import pages
+
+    return [] if folder is None else [folder / name for name in sorted(set(pages.FILES.values()))]
+
+
+def _check_answer(file: Path | None, *taken: Path | None) -> None:
+    """Refuse to put an answer where something else is, or will be (`taken`), before any work is done."""
     from ..errors import InputError
 
-    if file is not None and output is not None and file.resolve() == output.resolve():
+    if file is not None and any(file.resolve() == place.resolve() for place in taken if place is not None):
         raise InputError(f"--json {file}: is the place of -o, too; name a file, for example {file}.json")
     if file is None or not file.exists():
         return

@@ -158,6 +158,7 @@ def _answer(
         asked="fit",
         dark=replicates.dark,
         crop=str(replicates.start.window) if replicates.start.window else None,
+        compared="the counts in the dark",
     )
 
 

@@ -116,7 +116,7 @@ def _diagnosed(
     while len(path.steps) < max_steps and not _in_vain(path, notes) and _possible(path, notes):
         if path.steps:
             keep(so_far(path, start, notes))
-    replicates.budget.until = FITS
+    replicates.budget.until, stopped = FITS, len(path.steps) >= max_steps
     if path.steps:
         with or_as_before(path, "the fit of all numbers together"):
             complete(path)
@@ -176,7 +176,9 @@ def _diagnosed(
         in_sample = (
             comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values, path.scan.phases)
         )
-    return answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
+    found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
+    found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
+    return found
 
 
 def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:

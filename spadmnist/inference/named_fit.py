@@ -73,6 +73,7 @@ def fit_named(
     ]
     if not wanted:
         raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
+    _check_once(wanted)
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
         if counts_in_the_dark.may_fit(sensor.resolved(), wanted):
@@ -263,6 +264,18 @@ def _started(path: ModelPath, candidate: Candidate) -> Trial:
         raise InputError(f"{title(candidate)} cannot be simulated in these captures")
     best = max(found, key=lambda t: t.fall)
     return replace(best, others=of_other_shapes(best, sorted(found, key=lambda t: -t.fall))) if best.chips else best
+
+
+def _check_once(wanted: Sequence[Candidate]) -> None:
+    """Raise InputError where two candidates would fit one parameter."""
+    known: dict[Key, Candidate] = {}
+    for candidate in wanted:
+        keys = [candidate.carrier] if candidate.carrier else [d.key for d in candidate.coordinates]
+        for key in {*keys, *(key for key, _ in candidate.fixed)}:
+            if key in known:
+                both = f"as {title(known[key])} and as {title(candidate)}"
+                raise InputError(f"{'.'.join(key)} would be fitted twice, {both}; name it once, for a map has its mean")
+            known[key] = candidate
 
 
 def _halves(name: str) -> tuple[str, str]:

@@ -60,6 +60,8 @@ def after_diagnosis(
             f"spadmnist effects --new NAME writes the file of a new effect{like}; then spadmnist diagnose {sensor} "
             f"{measurement} --plugin NAME.py tries it."
         )
+    if found.stopped:
+        return f"spadmnist diagnose {new} {measurement} -o further goes on from the new model; it may take more steps."
     if found.verdict == "partly_explained":
         return (
             f"spadmnist compare {new} {measurement} shows what remains; spadmnist effects --new NAME writes the file "

@@ -86,7 +86,14 @@ def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
     """
     with plugins.blaming(type(statistic)):
         found = statistic.reduce(recording)
-    if found is not None and not plugins.is_built_in(type(statistic)) and not np.isfinite(found.values).all():
+    if found is None or plugins.is_built_in(type(statistic)):
+        return found
+    if np.ndim(found.values) != 1 or not np.size(found.values):
+        raise SpadError(
+            f"{plugins.source_file(type(statistic))}: the statistic {statistic.name} has values of shape "
+            f"{np.shape(found.values)} in {recording.capture.id}; they are (cells,), and None says that there are none"
+        )
+    if not np.isfinite(found.values).all():
         cell = int(np.argmin(np.isfinite(found.values)))
         where = f"cell {cell} of {recording.capture.id}"
         raise SpadError(

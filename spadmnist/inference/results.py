@@ -199,6 +199,9 @@ class Diagnosis:
     finished: bool = True  # False: a budget ended it, and the verdict is that of the steps so far
     shape: tuple[int, int] | None = None  # rows, columns of the measured pixels
     unwritten: str = ""  # why there is no next sensor file where one was wanted
+    compared: str = ""  # what alone was compared with the model, in words; "" for all statistics
+    stopped: bool = False  # the largest number of steps ended the search
+    or_setup: bool = False  # the last step explains the totals as well as `setup` does, and is in no sensor file
 
     def as_data(self) -> dict[str, Any]:
         """The result as JSON data: `formats`, spadmnist-diagnosis/1 or spadmnist-fit/1."""
@@ -222,6 +225,7 @@ class Diagnosis:
             "not_tried": self.untried,
             "sensor": self.file,
             **({"not_written": self.unwritten} if self.unwritten else {}),
+            **({"compared": self.compared} if self.compared else {}),
         }
 
 
@@ -241,8 +245,11 @@ def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
     """
     kinds = {Statistic.registry.find(str(r["statistic"])).among for r in found if r["statistic"] in Statistic.registry}
     who = next((words for kind, words in _WHO.items() if kind in kinds), "it is in the rates and maps")
-    in_dark = any(r["capture"] in dark for r in found)
-    return f"{who}; {'it is in the dark captures, too' if in_dark else 'it is in the lit captures alone'}"
+    if not dark:
+        return who
+    in_dark, in_light = (any((r["capture"] in dark) is side for r in found) for side in (True, False))
+    lit = "it is in the dark captures, too" if in_dark else "it is in the lit captures alone"
+    return f"{who}; {lit if in_light else 'it is in the dark captures'}"
 
 
 def mimic(candidate: Candidate) -> Mimic | None:
@@ -383,13 +390,22 @@ def _limit(entry: Mapping[str, Any]) -> str:
 
 def sentence(found: Diagnosis) -> str:
     """The verdict in words."""
+    if found.compared:
+        return f"{_verdict_on(found)} Only {found.compared} were compared with the model, no other statistic."
+    return _verdict_on(found)
+
+
+def _verdict_on(found: Diagnosis) -> str:
     if not found.finished and found.verdict == "unexplained":
         what = f" What differs: {remains(found)}." if found.unexplained else ""
         fitted = " and ".join(title(s.candidate) for s in found.steps)
         so_far = f"the rest was explained; fitted so far: {fitted}" if fitted else "an explanation was found"
         return f"not finished: the budget ended before {so_far}.{what}"
+    if not found.finished and found.verdict == "adequate" and not found.steps:
+        ended = ", ".join(str(e["where"]) for e in found.untried if e["effect"] is None)
+        return f"not finished: no check fails; the budget ended before all was done: {ended}."
     if not found.finished:
-        return "not finished; the verdict is that of the steps so far: " + sentence(
+        return "not finished; the verdict is that of the steps so far: " + _verdict_on(
             dataclasses.replace(found, finished=True)
         )
     fitted = " and ".join(title(s.candidate) for s in found.steps)
@@ -404,11 +420,17 @@ def sentence(found: Diagnosis) -> str:
     if found.verdict == "confused" and found.setup and not found.steps:
         where = found.setup[0]["capture"] or "all captures"
         return f"the set-up of {where}, or {NONLINEARITY}: it is the brightest capture."
+    if found.verdict == "confused" and found.or_setup:
+        *earlier, last = [title(s.candidate) for s in found.steps]
+        either = f"the {found.setup[0]['quantity']} of {found.setup[0]['capture'] or 'all captures'}, or {last}"
+        besides = f"; besides, {' and '.join(earlier)} was found" if earlier else ""
+        return f"{either}: each explains the totals, and the sensor file has neither{besides}."
     if found.verdict == "confused":
         return f"{fitted}, or another effect with the same signature in this measurement."
     if found.verdict == "partly_explained":
         what = remains(found)
         rest = f"What remains: {what}." if what else "Some checks still fail."
+        rest += " The search ended at its largest number of steps." if found.stopped else ""
         return f"{fitted} {'explains' if len(found.steps) == 1 else 'explain'} a part of the deviations. {rest}"
     what = f": {remains(found)}" if found.unexplained else ""
     return f"no known effect explains what differs{what}. {mechanism(found.unexplained, found.dark).capitalize()}."
@@ -426,7 +448,10 @@ def notes(found: Diagnosis) -> dict[Key, str]:
                 parts.append(f"{name} {ends[0]} to {ends[1]} (95 %)")
         part = f" of rows and columns {found.crop}" if found.crop else ""
         text = f"from {found.measurement}{part}, {today}" + (f": {', '.join(parts)}" if parts else "")
-        keys = [key for key in found.values if key[0] == step.candidate.effect]
+        changed = step.candidate
+        keys = [key for key in found.values if key[0] == changed.effect]
+        if changed.kind != "add":  # another step may have changed another number of the same effect
+            keys = [key for key in keys if key[1] == changed.parameter] or keys
         for key in keys:
             out[key] = text
     return out

@@ -31,6 +31,7 @@ from ..measurement import Measurement
 from ..plugins import check_values, discover, load_file
 from ..recording import Capture
 from ..sensor import Sensor
+from ..sensor_file import original
 from ..system import processors
 from ..workers import Executor
 
@@ -109,6 +110,7 @@ def compare(
     workers, bar, done = _workers(jobs), _bar(progress), 0.0
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
+    origin = _origin(sensor, data, seed)
 
     def told(what: str, share: float) -> None:
         nonlocal done
@@ -118,7 +120,7 @@ def compare(
     bar.start("comparing", 100, 0)
     found = comparison.compare(model, data, seed, tolerance, workers, progress=told, say=bar.notice)
     bar.stop()
-    return Comparison(**vars(found), origin=_origin(sensor, measurement, seed))
+    return Comparison(**vars(found), origin=origin)
 
 
 def diagnose(
@@ -144,7 +146,8 @@ def diagnose(
         within: budget of work as time of two idle cores, "3 min" or s; "none": without end; None: 10 min, quick 3 min.
         keep: a folder that keeps what is simulated until the search is finished. The same call goes on from there to
             the same answer. The diagnosis so far is saved to it after each step, and the answer at the end.
-        on_step: called with the diagnosis so far after each step; nothing is then saved to `keep` by itself.
+        on_step: called with the diagnosis so far after each step; nothing is then saved to `keep` by itself, and what
+            is simulated is kept until the report of the answer is written there.
 
     Raises:
         InputError: where sensor and measurement do not belong together.
@@ -160,7 +163,7 @@ def diagnose(
     seconds, workers, say = seconds_of(within, quick), _workers(jobs), _bar(progress).notice
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
-    origin = _origin(sensor, measurement, seed)
+    origin = _origin(sensor, data, seed)
     journal = None
     if keep is not None:
         check_place(keep, origin.sensor)
@@ -190,10 +193,8 @@ def diagnose(
         lambda so_far: each(Diagnosis(so_far, model, origin)),
         journal,
     )
-    answer = Diagnosis(found, model, origin)
-    if journal is not None and found.finished:
-        journal.remove()
-    elif journal is not None and journal.bytes:
+    answer = Diagnosis(found, model, origin, journal)
+    if journal is not None and journal.bytes and not found.finished:
         kept = f"{journal.bytes / 1e6:.0f} MB of replicates"
         say(f"Not finished: {journal.folder} keeps {kept}, from which the next command goes on")
     if on_step is None:
@@ -231,8 +232,9 @@ def fit(
     workers, say = _workers(jobs), _bar(progress).notice
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
+    origin = _origin(sensor, data, seed)
     found = named_fit.fit_named(model, data, *lists, seed, workers, say)
-    return Fit(found, model, _origin(sensor, measurement, seed))
+    return Fit(found, model, origin)
 
 
 # ---- what is given to them ----------------------------------------------------------------------------------
@@ -304,11 +306,13 @@ def _plan(plan: Measurement | PathLike | Sequence[Capture], model: Sensor) -> Me
     return measurements.in_memory(model.name or "simulated", model.layout, captures)
 
 
-def _origin(sensor: Sensor | PathLike, measurement: Measurement | PathLike, seed: int) -> Origin:
+def _origin(sensor: Sensor | PathLike, data: Measurement, seed: int) -> Origin:
     from .answers import Origin
 
-    file = measurement.file if isinstance(measurement, Measurement) else Path(measurement) / measurements.FILE
-    return Origin(None if isinstance(sensor, Sensor) else Path(sensor), file, seed)
+    if isinstance(sensor, Sensor):
+        return Origin(measurement=data.file, seed=seed)
+    path = Path(sensor).absolute()
+    return Origin(path, path.read_bytes(), original(path), data.file, seed)
 
 
 def _workers(jobs: int | Executor | None) -> int | Executor:

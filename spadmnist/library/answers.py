@@ -20,6 +20,8 @@ from ..sensor import Sensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..inference.journal import Journal
+
 T = TypeVar("T")
 PathLike = str | Path
 
@@ -33,14 +35,20 @@ class Origin:
     """Where an answer comes from.
 
     Attributes:
-        sensor: the sensor file that was read; None where the model was an object.
+        sensor: the sensor file or config that was read; None where the model was an object.
+        text: its bytes.
+        described: the file that describes the sensor: `sensor`, or the one that it names.
         measurement: the `measurement.yaml` that was read; None where the data were an object.
         seed: of the simulations.
+        maps: those that were written beside next sensor files.
     """
 
     sensor: Path | None = None
+    text: bytes = b""
+    described: sensor_file.Original | None = None
     measurement: Path | None = None
     seed: int = 0
+    maps: set[Path] = field(default_factory=set, compare=False)
 
     def source(self, command: str = "", then: str = "", following: str | None = None) -> pages.Source:
         """What a report says of how it was made.
@@ -52,7 +60,9 @@ class Origin:
             "measurement.yaml": self.measurement,
             "the next sensor": None if following is None else Path(following),
         }
-        files = {} if self.sensor is None else {f"the sensor, {self.sensor.name}": self.sensor}
+        files: dict[str, Path | bytes] = {}
+        if self.sensor is not None:
+            files[f"the sensor, {self.sensor.name}"] = self.text
         for what, path in named.items():
             if path is not None:
                 files[what if what == path.name else f"{what}, {path.name}"] = path
@@ -67,16 +77,7 @@ def check_place(folder: PathLike, sensor: Path | None) -> None:
     """
     place = Path(folder)
     pages.check_place(place, "diagnosis")
-    _check_sensor(place / SENSOR, sensor)
-
-
-def _check_sensor(out: Path, sensor: Path | None) -> None:
-    sensor_file.check_place(Path(os.devnull) if sensor is None else sensor, out, _beside_report(out))
-
-
-def _beside_report(out: Path) -> bool:
-    """Whether a file is the `sensor.yaml` of a folder that holds the report of a diagnosis."""
-    return out.name == SENSOR and (out.parent / pages.FILES["diagnosis"]).exists()
+    sensor_file.check_place(Path(os.devnull) if sensor is None else sensor, place / SENSOR)
 
 
 @dataclass(frozen=True, repr=False)
@@ -128,10 +129,13 @@ class Comparison(comparison.Comparison):
 class _Found:
     """What `diagnose` and `fit` share: steps and the model that they make."""
 
-    def __init__(self, found: results.Diagnosis, start: Sensor, origin: Origin = Origin()):
+    def __init__(
+        self, found: results.Diagnosis, start: Sensor, origin: Origin | None = None, journal: Journal | None = None
+    ):
         self.found = found
         self.start = start
-        self.origin = origin
+        self.origin = origin or Origin()
+        self.journal = journal
 
     @property
     def verdict(self) -> str:
@@ -213,16 +217,17 @@ class _Found:
         Returns:
             The file; None where it cannot be written.
         """
-        out, notes = Path(file), results.notes(self.found)
+        out, notes, origin = Path(file), results.notes(self.found), self.origin
         self.found.file, self.found.unwritten = None, ""
         try:
             with disk.writing_file(out):
-                _check_sensor(out, self.origin.sensor)
-                if self.origin.sensor is not None:
-                    made = sensor_file.write(self.origin.sensor, out, self.found.values, notes, self.start.window)
+                sensor_file.check_place(origin.sensor or Path(os.devnull), out)
+                values, start = self.found.values, self.start
+                if origin.described is not None:
+                    made = sensor_file.write(origin.described, out, values, notes, start.window, origin.maps)
                 else:
-                    numbers = {key: _rounded(value) for key, value in self.found.values.items()}
-                    made = sensor_file.save(candidates.with_values(self.start, numbers), out, notes, ours=True)
+                    numbers = {key: _rounded(value) for key, value in values.items()}
+                    made = sensor_file.save(candidates.with_values(start, numbers), out, notes, origin.maps)
         except Exception as error:
             if os.environ.get("SPADMNIST_DEBUG"):
                 raise
@@ -234,10 +239,16 @@ class _Found:
     def write_report(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
         """Write the report, one HTML page, into a folder; the page. command, then: as of `save`.
 
+        What a finished diagnosis keeps in that folder to go on from is then removed.
+
         Raises:
             SpadError: where something else lies there, or it cannot be written.
         """
-        return pages.diagnosis(self.found, Path(folder), self.origin.source(command, then, self.found.file))
+        page = pages.diagnosis(self.found, Path(folder), self.origin.source(command, then, self.found.file))
+        kept = self.journal
+        if kept is not None and self.found.finished and not self.unwritten and kept.folder.parent == Path(folder):
+            kept.remove()
+        return page
 
     def __repr__(self) -> str:
         return results.table(self.found)
@@ -273,7 +284,16 @@ class Diagnosis(_Found):
     @property
     def upper_limits(self) -> dict[str, float]:
         """`effect.parameter` -> 95 % upper limit (SI) of effects that would have been seen."""
-        return {f"{e['effect']}.{e['parameter']}": e["upper_limit_95"] for e in self.found.excluded}
+        return self._limits(False)
+
+    @property
+    def lower_limits(self) -> dict[str, float]:
+        """`effect.parameter` -> 95 % lower limit (SI) of what would have been seen, were it less: of a share of 1."""
+        return self._limits(True)
+
+    def _limits(self, lower: bool) -> dict[str, float]:
+        held = [e for e in self.found.excluded if bool(e.get("at_least")) is lower]
+        return {f"{e['effect']}.{e['parameter']}": e["upper_limit_95"] for e in held}
 
     @property
     def advice(self) -> list[dict[str, Any]]:

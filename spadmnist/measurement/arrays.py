@@ -309,6 +309,13 @@ def _first_stamps(capture: recordings.Capture, layout: Layout, frames: np.ndarra
     time, tick = capture.conditions.frame_time, capture.tick
     none = no_detection(time, tick)
     if frames.dtype.kind == "f":
+        late = np.isneginf(frames) | (np.isfinite(frames) & (frames > time * (1 + 1e-9)))
+        if late.any():
+            raise _wrong(
+                capture.id,
+                f"has stamps of {frames[late][0]:g} s, and a frame takes {time:g} s; give seconds (float) or ticks "
+                f"(integers); {time:g} s, nan or inf is no detection",
+            )
         absent = ~np.isfinite(frames) | (frames >= time * (1 - 1e-12))
         ticks = np.where(absent, none, _ticks(capture.id, np.where(absent, 0.0, frames), tick))
     elif frames.dtype.kind in "ui":

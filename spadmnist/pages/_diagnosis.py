@@ -20,7 +20,7 @@ from ..inference.results import Diagnosis, Step, Trace, Value
 from . import _figures as figures
 from ._figures import MEASURED, ROUGH, Cells, Picture
 from ._frame import Source, number, title_of, write
-from ._pixels import OddPixels, odd_pixels_of, write_list
+from ._pixels import OddPixels, odd_pixels_of, write_lists
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,8 +63,7 @@ def diagnosis(found: Diagnosis, folder: Path, source: Source | None = None) -> P
     """
     maps = {k: odd for k, step in enumerate(found.steps) if (odd := odd_pixels_of(found, step)) is not None}
     page = write(folder, "diagnosis", _TEMPLATE, _words(found, maps), source)
-    for odd in maps.values():
-        write_list(odd, folder)
+    write_lists(maps.values(), folder)
     return page
 
 
@@ -401,8 +400,8 @@ shows what is faint in each statistic, or what only a few of them show.{% endif 
 <p class="small">{{ found.sensor or "A sensor without a name" }}\
 {% if found.crop %}, its rows and columns {{ found.crop }} (places count from the first of them),{% endif %} \
 against {{ found.measurement }}\
-{% if next %} &middot; the {{ "next" if found.steps else "same" }} model is in the file <b>{{ next }}</b>\
-{% if not found.steps %} (nothing was added){% endif %}{% endif %}\
+{% if next %} &middot; the {{ "next" if found.values else "same" }} model is in the file <b>{{ next }}</b>\
+{% if not found.values %} (nothing was added){% endif %}{% endif %}\
 {% if found.unwritten %} &middot; the next sensor file was not written: {{ found.unwritten }}{% endif %}\
 {% if found.simulations %} &middot; {{ "{:,}".format(found.simulations) }} simulated recordings{% endif %}</p>
 <p class="next"><b>Next:</b> {{ source.then or then }}</p>

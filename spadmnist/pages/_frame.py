@@ -48,12 +48,16 @@ class Source:
         return [(name, text[:_LONGEST] + cut * (len(text) > _LONGEST)) for name, text in self.files.items()]
 
 
-def source_of(command: str, seed: int | None, files: Mapping[str, Path], then: str = "") -> Source:
-    """Where a page comes from, today; files: what each is -> its path. What cannot be read as text is left out."""
+def source_of(command: str, seed: int | None, files: Mapping[str, Path | bytes], then: str = "") -> Source:
+    """Where a page comes from, today. What cannot be read as text is left out.
+
+    Args:
+        files: what each is -> its path, or its bytes.
+    """
     texts = {}
-    for name, path in files.items():
+    for name, held in files.items():
         try:
-            texts[name] = disk.read_file(path, 16 << 20).decode()
+            texts[name] = (held if isinstance(held, bytes) else disk.read_file(held, 16 << 20)).decode()
         except (OSError, UnicodeDecodeError, SpadError):
             continue
     return Source(command, datetime.date.today().isoformat(), seed, texts, then)

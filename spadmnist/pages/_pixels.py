@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LISTED = 40  # odd pixels in the page; the file has all
+_FILE = "odd_pixels-{}.csv"  # the list of a map, by the name of its step
 _HEAD = ("row", "column", "value", "unit", "relative_to_median", "kind")
 _HIGH, _LOW = "high", "low"
 
@@ -88,20 +89,36 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
         f"{int(high.sum())} of {values.size:,} pixels lie far above the others and {int(low.sum())} far below; "
         f"the median is {_shown(middle, unit)}."
     )
-    file = re.sub(r"[^a-z0-9_]+", "-", f"odd_pixels-{name}".lower()) + ".csv"
+    file = _FILE.format(re.sub(r"[^a-z0-9_]+", "-", name.lower()))
     return OddPixels(file, picture, sentence, odd.size, rows, table)
 
 
-def write_list(odd: OddPixels, folder: Path) -> Path:
-    """Write the odd pixels as a CSV file; its path. Raises SpadError where another file has its name."""
-    path, text = Path(folder) / odd.file, io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_HEAD)
-    writer.writerows(odd.table)
-    if path.is_symlink() or (path.exists() and not disk.read_file(path, 1 << 30).startswith(",".join(_HEAD).encode())):
-        raise SpadError(f"{path} is there already and is not a list of odd pixels; it is left alone: choose another -o")
-    disk.put_file(path, text.getvalue().encode())
-    return path
+def write_lists(maps: Collection[OddPixels], folder: Path) -> None:
+    """Write the odd pixels of each map as a CSV file; those of an earlier page are removed.
+
+    Raises:
+        SpadError: where another file has the name of one.
+    """
+    for odd in maps:
+        path, text = Path(folder) / odd.file, io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(_HEAD)
+        writer.writerows(odd.table)
+        if (path.is_symlink() or path.exists()) and not _is_list(path):
+            raise SpadError(
+                f"{path} is there already and is not a list of odd pixels; it is left alone: choose another -o"
+            )
+        disk.put_file(path, text.getvalue().encode())
+    written = {odd.file for odd in maps}
+    for path in Path(folder).glob(_FILE.format("*")):
+        if path.name not in written and _is_list(path):
+            path.unlink()
+
+
+def _is_list(path: Path) -> bool:
+    """Whether a file is a list of odd pixels."""
+    head = ",".join(_HEAD).encode()
+    return path.is_file() and not path.is_symlink() and disk.read_file(path, 1 << 30).startswith(head)
 
 
 def _shown(value: float, unit: str) -> str:

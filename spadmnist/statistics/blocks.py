@@ -1,0 +1,220 @@
+"""Blocks of pixels that share a part of the readout: pairs within a block, and blocks that are silent for long."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from .. import units
+from ..kernels import jit
+from . import Recording, Statistic, Summary
+from ._counting import Surplus, exposure_in, span, tick_of, whole
+from ._order import in_time_order
+from ._walk import REACH
+
+_LAGS = (1e-9, 3e-9, 10e-9)  # s, of pairs: the blind time of a shared converter is 7 ns in LinoSPAD2 (real data)
+_LEVELS = (
+    6  # blocks of up to 2^6 = 64 pixels; a converter of LinoSPAD2 has 4, one of a column-parallel readout its column
+)
+_EXPECTED = 5.0  # long silences of all blocks of a size in steady light: enough for their law, few beside a fault
+_LEAST = 10  # detections of a block below which its rate is not known well enough
+_SHORTEST = 3.0  # mean intervals: a silence that is shorter is none
+_ROW, _COLUMN = _LEVELS + 1, _LEVELS + 2  # classes of pairs behind those of the blocks
+
+
+def _levels(pixels: int) -> int:
+    """How many sizes of blocks there are, 2, 4, 8, ... pixels; the largest may be the whole array."""
+    return min(_LEVELS, max(pixels - 1, 0).bit_length())
+
+
+class Blocks(Statistic):
+    """Coincident detections of different pixels that may share a part of the readout.
+
+    Classes: pixels 2k and 2k + 1; others of 4k to 4k + 3; others of 8k to 8k + 7; and so on to 64, in the order of
+    read-out; on a grid those of one row, or of one column, that are more than 3 pitches apart. Up to 1, 3 and 10 ns
+    apart in either order.
+    Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
+    Shows: a converter that several pixels share and that is blind while it works (a deficit in its blocks alone).
+    Source: measured in a LinoSPAD2, four pixels to a converter, no two within 6.9 ns.
+    """
+
+    modalities = ("tr",)
+    specific = 3
+    pools = ("neighbours", "far_pairs")
+    among = "neighbours"
+    unit = "standard deviations"
+    costly = True
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Scores of pairs beyond chance."""
+        layout, tick = recording.layout, tick_of(recording)
+        levels = _levels(layout.pixels)
+        if not levels:
+            return None
+        names = {1: "pixels 2k and 2k + 1"}
+        names |= {k: f"pixels {2**k}k to {2**k}k + {2**k - 1}, not of one half" for k in range(2, levels + 1)}
+        grid = layout.positions is None and layout.rows > 1 and layout.columns > 1
+        if grid and layout.columns > REACH + 1:
+            names[_ROW] = f"pixels of one row, more than {REACH} pitches apart"
+        if grid and layout.rows > REACH + 1:
+            names[_COLUMN] = f"pixels of one column, more than {REACH} pitches apart"
+        edges = np.unique([max(1, round(lag / tick)) for lag in _LAGS])
+        found = np.zeros((_COLUMN + 1, edges.size), np.int64)
+        for words, bits, new in in_time_order(recording, int(edges[-1])):
+            _close(words, bits, new, edges, layout.columns if grid else 0, found)
+        by_chance = _by_chance(recording.totals.astype(np.float64), layout.shape, levels, grid)
+        lags = np.diff(2.0 * edges - 1.0, prepend=0.0) / exposure_in(recording, tick)
+        kinds = sorted(names)
+        chance = np.array([by_chance[k] * lags for k in kinds]).ravel()
+        pairs = Surplus(found[kinds].ravel().astype(np.float64), chance, chance)
+        spans = [span(a, b) for a, b in itertools.pairwise(np.concatenate([[0.0], edges * tick]))]
+        where = [f"{names[k]}, {apart}" for k in kinds for apart in spans]
+        total = max(float(recording.totals.sum()), 1.0)
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            beyond = pairs.beyond(cell, float(expected))
+            text = f"{whole(pairs.number[cell])} pairs, {whole(max(pairs.chance[cell] + beyond, 0.0))} expected"
+            return text, float(pairs.number[cell] - pairs.chance[cell] - beyond) / total
+
+        return Summary(pairs.scores(recording.totals), "normal", lambda cell: where[cell], size)
+
+
+class Silences(Statistic):
+    """Long silences of blocks of pixels: 1, 2, 4, ... pixels that follow each other in the order of read-out.
+
+    A silence counts where it is so long that steady light of the same total would give about 5 of all blocks of that
+    size. The times before the first detection and after the last one are silences, too.
+    Law: Poisson, for counts.
+    Shows: a converter that is full, or a readout that stops, for some of the pixels; pixels that blink.
+    """
+
+    modalities = ("tr",)
+    specific = 2
+    pools = ("autocorrelation", "spectrum")
+    among = "pixel"
+    unit = "silences"
+    costly = True
+
+    def reduce(self, recording: Recording) -> Summary | None:
+        """Counts of long silences."""
+        layout, tick = recording.layout, tick_of(recording)
+        end, levels = exposure_in(recording, tick), _levels(layout.pixels)
+        sizes = [_of_blocks(recording.totals, k) for k in range(levels + 1)]
+        longest = np.full((levels + 1, layout.pixels), np.iinfo(np.int64).max)
+        for k, n in enumerate(sizes):
+            known = n >= _LEAST
+            blocks = np.maximum(np.log(np.maximum(n, 1.0) * max(known.sum(), 1) / _EXPECTED), _SHORTEST)
+            times = np.where(known, blocks * end / np.maximum(n, 1.0), 2.0**62)
+            longest[k, : n.size] = np.minimum(times, 2.0**62).astype(np.int64)
+        last = np.zeros(longest.shape, np.int64)
+        counts, clearest = np.zeros(levels + 1, np.int64), np.zeros((levels + 1, 3), np.int64)
+        for words, bits, new in in_time_order(recording):
+            _silent(words, bits, new, longest, last, counts, clearest)
+        _silent_to_the_end(end, np.array([n.size for n in sizes]), longest, last, counts, clearest)
+
+        def where(cell: int) -> str:
+            size, (block, begun, stop) = 2**cell, clearest[cell]
+            first, final = size * block, min(size * (block + 1), layout.pixels) - 1
+            which = f"pixel {first}" if first == final else f"pixels {first} to {final}"
+            if not counts[cell]:
+                return f"silences of blocks of {size}" if size > 1 else "silences of single pixels"
+            times = " to ".join(units.show(x * tick, "s", 4) for x in (begun, stop))
+            return f"{which} silent, the longest of blocks of {size}: from {times}"
+
+        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            known = longest[cell][longest[cell] < 1 << 61]
+            share = (measured - expected) * float(known.mean()) / end / known.size if known.size else 0.0
+            return f"{whole(measured)} long silences, {whole(expected)} expected", float(share)
+
+        return Summary(counts.astype(np.float64), "poisson", where, size)
+
+
+def _of_blocks(totals: np.ndarray, level: int) -> np.ndarray:
+    """(blocks,) detections of blocks of 2^level pixels."""
+    return np.add.reduceat(totals.astype(np.float64), np.arange(0, len(totals), 1 << level))
+
+
+def _by_chance(n: np.ndarray, shape: tuple[int, int], levels: int, grid: bool) -> dict[int, float]:
+    """Sums of n n' over the pairs of each class. n: (pixels,) detections."""
+    squares = [float(np.sum(_of_blocks(n, k) ** 2)) for k in range(levels + 1)]
+    out = {k: (squares[k] - squares[k - 1]) / 2 for k in range(1, levels + 1)}
+    if grid:
+        out |= {_ROW: _far_in_line(n.reshape(shape)), _COLUMN: _far_in_line(n.reshape(shape).T)}
+    return out
+
+
+def _far_in_line(n: np.ndarray) -> float:
+    """The sum of n n' over the pairs of a line more than the reach apart. n: (lines, places)."""
+    near = sum(float(np.sum(n[:, d:] * n[:, :-d])) for d in range(1, min(REACH + 1, n.shape[1])))
+    return float(np.sum(n.sum(axis=1) ** 2) - np.sum(n**2)) / 2 - near
+
+
+@jit
+def _close(words, bits, new, edges, columns, out):
+    """Add the pairs of different pixels to their classes and the bins of their lags.
+
+    words, bits, new: see `TimeOrder`; columns: of a grid, 0 where rows and columns mean nothing.
+    """
+    mask = (np.int64(1) << bits) - 1
+    longest = edges[edges.size - 1]
+    for i in range(new, words.size):
+        now, pixel = words[i] >> bits, words[i] & mask
+        j = i - 1
+        while j >= 0 and now - (words[j] >> bits) < longest:
+            other = words[j] & mask
+            if other != pixel:
+                b = 0
+                while edges[b] <= now - (words[j] >> bits):
+                    b += 1
+                apart = pixel ^ other
+                level = 0
+                while apart > 0 and level <= _LEVELS:
+                    apart >>= 1
+                    level += 1
+                if apart == 0 and level <= _LEVELS:
+                    out[level, b] += 1
+                if columns > 0:
+                    across = abs(pixel % columns - other % columns)
+                    down = abs(pixel // columns - other // columns)
+                    if down == 0 and across > REACH:
+                        out[_ROW, b] += 1
+                    elif across == 0 and down > REACH:
+                        out[_COLUMN, b] += 1
+            j -= 1
+
+
+@jit
+def _silent(words, bits, new, longest, last, counts, clearest):
+    """Count the long silences of blocks of each size.
+
+    longest: (sizes, blocks) ticks beyond which a silence is long; last: the last detection of each block; clearest:
+    (sizes, 3) block, begin and end of the longest one, as a multiple of what is long.
+    """
+    mask = (np.int64(1) << bits) - 1
+    for i in range(new, words.size):
+        now, pixel = words[i] >> bits, words[i] & mask
+        for level in range(counts.size):
+            block = pixel >> level
+            if now - last[level, block] > longest[level, block]:
+                _count(level, block, now, longest, last, counts, clearest)
+            last[level, block] = now
+
+
+@jit
+def _silent_to_the_end(end, sizes, longest, last, counts, clearest):
+    for level in range(counts.size):
+        for block in range(sizes[level]):
+            if end - last[level, block] > longest[level, block]:
+                _count(level, block, end, longest, last, counts, clearest)
+
+
+@jit
+def _count(level, block, now, longest, last, counts, clearest):
+    counts[level] += 1
+    before, begun, stop = clearest[level]
+    ratio = (now - last[level, block]) / longest[level, block]
+    if counts[level] == 1 or ratio > (stop - begun) / longest[level, before]:
+        clearest[level, 0], clearest[level, 1], clearest[level, 2] = block, last[level, block], now
