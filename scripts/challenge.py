@@ -5,10 +5,11 @@
     python scripts/challenge.py run out --minutes 90            # spadmnist compare and diagnose; again: what is missing
     python scripts/challenge.py score out                       # opens the truth; writes out/score.md; several: as one
 
-CASES are `all`, a class (null, single, double, outside, setup) or a pattern of names (`tr-crosstalk-*`). Case folders
-have numbers for names, drawn at random: the first so many are a fair sample. Beside them stands the sha256 of each
-sealed truth, with its salt, and each truth holds the sha256 of its case's files: neither can be changed between `make`
-and `score`. out/unseen holds captures of the same sensors that `diagnose` never gets: they judge the sensor it found.
+CASES are `all`, a class (null, single, double, triple, camera, outside, setup) or a pattern of names
+(`tr-crosstalk-*`). Case folders have numbers for names, drawn at random: the first so many are a fair sample. Beside
+them stands the sha256 of each sealed truth, with its salt, and each truth holds the sha256 of its case's files:
+neither can be changed between `make` and `score`. out/unseen holds captures of the same sensors that `diagnose` never
+gets: they judge the sensor it found.
 """
 
 from __future__ import annotations

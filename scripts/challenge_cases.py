@@ -543,10 +543,14 @@ def gradient(lab: Lab, x: float) -> Hidden:
     v = np.linspace(-0.5, 0.5, w.rows)[:, None]
     falls = (1 + along_x * u + along_y * v).ravel()
     w.illumination = w.illumination * falls
-    z = math.sqrt(oracle.light_map(lab, falls))
+    z = math.sqrt(max(oracle.sine(math.sqrt(oracle.light_map(lab, falls))), 0.0))  # its angle is a phase
     parameters = {"illumination_gradient.x": along_x, "illumination_gradient.y": along_y}
     return Hidden(
-        z, "a known slope over the map", added("illumination_gradient"), {"x": along_x, "y": along_y}, parameters
+        z,
+        "a known slope over the map, in any direction",
+        added("illumination_gradient"),
+        {"x": along_x, "y": along_y},
+        parameters,
     )
 
 
@@ -611,10 +615,10 @@ def drift(lab: Lab, x: float) -> Hidden:
     lab.world.lamp.warming = x * (1 if lab.rng.random() < 0.5 else -1)
     t = np.linspace(0, 1, 1001)
     rise = (1 - np.exp(-1.5 * t)) / (1 - math.exp(-1.5))
-    z = math.sqrt(oracle.all_lit(lab, x**2 * float(rise.var())))
+    z = math.sqrt(max(oracle.either_sign(math.sqrt(oracle.all_lit(lab, x**2 * float(rise.var())))), 0.0))
     return Hidden(
         z,
-        "a known rise in every lit capture",
+        "a known rise or fall in every lit capture",
         added("source_drift"),
         {"warming": lab.world.lamp.warming},
         near={"source_drift.slope": lab.world.lamp.warming},

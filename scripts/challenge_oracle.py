@@ -155,6 +155,13 @@ def sine(amplitude: float) -> float:
     return 2 * float((np.log(i0e(amplitude * seen)) + amplitude * seen - amplitude**2 / 2).mean())
 
 
+def either_sign(amplitude: float) -> float:
+    """Square of the Z of a shape of this size (in standard errors) whose sign is unknown."""
+    seen = np.abs(amplitude + HERMITE) * amplitude
+    ratio = np.logaddexp(seen, -seen) - math.log(2.0) - amplitude**2 / 2
+    return 2 * float(ratio @ WEIGHTS)
+
+
 def _z(twice_log_ratio: float) -> float:
     return math.sqrt(max(twice_log_ratio, 0.0))
 

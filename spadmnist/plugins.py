@@ -44,7 +44,7 @@ PER = ("", "pixel", "row", "column", "code")  # what a parameter may have a valu
 #   time       by gradients where it is a shape; as a strength in steps, for no signature is proportional to it
 #   edge       a time at which something begins or ends at once: also in steps of a few thousandths
 #   count      from one whole number to the next
-#   frequency  of a line: it is tried where the data have one
+#   frequency  of a line, in Hz: it is tried where the data have one
 #   phase      of a line: another one in each capture
 #   switch     yes or no
 KINDS = ("smooth", "time", "edge", "count", "frequency", "phase", "switch")

@@ -332,6 +332,10 @@ def test_a_sine_of_unknown_phase_and_unknown_blinking_pixels() -> None:
     ratio = np.log(np.i0(6 * np.hypot(*seen))) - 18
     assert abs(oracle.sine(6.0) - 2 * ratio.mean()) < 4.9 * 2 * ratio.std() / math.sqrt(1e5) + 0.02 * oracle.sine(6.0)
     assert oracle.sine(6.0) < 33  # 36 where the phase is known
+    seen = 5.0 + rng.standard_normal(100_000)
+    ratio = np.log((np.exp(5.0 * seen) + np.exp(-5.0 * seen)) / 2) - 12.5
+    assert abs(oracle.either_sign(5.0) - 2 * ratio.mean()) < 4.9 * 2 * ratio.std() / math.sqrt(1e5)
+    assert 23 < oracle.either_sign(5.0) < 24 and abs(oracle.either_sign(0.0)) < 1e-12  # 25 where the sign is known
     each, share = 4.0, 20 / 256
     logs = np.concatenate([rng.normal(4, math.sqrt(8), (4000, 20)), rng.normal(-4, math.sqrt(8), (4000, 236))], axis=1)
     totals = 2 * np.log1p(share * np.expm1(logs)).sum(axis=1)

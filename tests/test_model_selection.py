@@ -236,10 +236,23 @@ def test_jitter_is_confused_where_only_intervals_tell(lab):
     """A dead time drawn anew for every detection blurs the same edge; what neighbours share it does not blur."""
     replicates = bench_of(lab())
     evaluation = evaluate(replicates, {})
-    found = mimicked(of("jitter", evaluation, replicates, intervals=30.0, edge_intervals=30.0, neighbours=3.9))
+    found = mimicked(of("jitter", evaluation, replicates, intervals=30.0, edge_intervals=30.0, neighbours=3.9), [])
     assert found is not None and found.what == "a dead time that differs from event to event"
-    assert mimicked(of("jitter", evaluation, replicates, intervals=30.0, neighbours=4.1)) is None
-    assert mimicked(of("crosstalk", evaluation, replicates, intervals=30.0)) is None
+    assert mimicked(of("jitter", evaluation, replicates, intervals=30.0, neighbours=4.1), []) is None
+    assert mimicked(of("crosstalk", evaluation, replicates, intervals=30.0), []) is None
+
+
+def test_a_map_of_one_lit_capture_is_confused_with_one_of_the_light(lab):
+    """Either explains what differs from pixel to pixel; two lit captures may have the lamp elsewhere."""
+    replicates = bench_of(lab())
+    step = Step(change_of(replicates, "per_pixel detection.pdp"), {}, 1.0, 20.0, "")
+    (flat,) = (seen.capture for seen in replicates.seen.values() if not seen.capture.light.dark)
+    dark = replace(flat, id="dark", light=replace(flat.light, wavelength=None, level=None))
+    assert dark.light.dark
+    found = mimicked(step, [flat, dark])
+    assert found is not None and found.what == "light that is not uniform"
+    assert mimicked(step, [flat, replace(flat, id="again"), dark]) is None
+    assert mimicked(Step(change_of(replicates, "per_pixel dark_counts.rate"), {}, 1.0, 20.0, ""), [flat, dark]) is None
 
 
 def test_what_looks_the_same_is_named_with_what_tells(lab):
@@ -247,14 +260,14 @@ def test_what_looks_the_same_is_named_with_what_tells(lab):
     step = of("jitter", path.evaluation, path.replicates, intervals=30.0)
     path.steps.append(step)
     beside = Notes([], False)
-    assert _or_confused(path, beside) == "confused"
+    assert _or_confused(path, beside, "explained") == "confused"
     assert step.alternatives[0]["what"] == "a dead time that differs from event to event"
     (told,) = beside.advice
     assert told["capture"] == "a pulsed source" and told["significance_then"] == 20.0
     assert told["separates"] == ["jitter", step.alternatives[0]["what"]]
     assert mimic(step.candidate) is not None
     path.steps = [of("crosstalk", path.evaluation, path.replicates, intervals=30.0)]
-    assert _or_confused(path, Notes([], False)) == "explained"
+    assert _or_confused(path, Notes([], False), "explained") == "explained"
 
 
 def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):

@@ -684,6 +684,11 @@ def framed(page: Path, folder: Path, width: int, height: int) -> np.ndarray:
 def test_four_hundred_points_are_wide_enough(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
     page = tmp_path / "index.html"
     page.write_text(failing_page[1])
+    is_wide_enough(page, tmp_path)
+
+
+def is_wide_enough(page: Path, tmp_path: Path) -> None:
+    """A page fits on a telephone."""
     seen = framed(page, tmp_path, 400, 3000)
     background = near(seen, "#fafaf8") | near(seen, "#ffffff")
     assert background[:, :8].all() and background[:, -8:].all()  # nothing runs over the edge
@@ -696,8 +701,14 @@ def test_four_hundred_points_are_wide_enough(tmp_path: Path, failing_page: tuple
 
 @needs_a_browser
 def test_it_is_dark_where_the_reader_wants_it(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
-    page, target = tmp_path / "index.html", tmp_path / "screen.png"
+    page = tmp_path / "index.html"
     page.write_text(failing_page[1])
+    is_dark_where_wanted(page, tmp_path)
+
+
+def is_dark_where_wanted(page: Path, tmp_path: Path) -> None:
+    """A page and its pictures are dark for a reader who prefers that."""
+    target = tmp_path / "screen.png"
     # 0: dark
     options = ("--blink-settings=preferredColorScheme=0", "--window-size=1280,2500", f"--screenshot={target}")
     browse(page, tmp_path, *options)

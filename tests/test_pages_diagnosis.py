@@ -7,21 +7,36 @@ import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_pages import EVIL, Parts, decoded, marks, near, needs_a_browser, screenshot, summary_of
+from test_pages import (
+    EVIL,
+    Parts,
+    decoded,
+    is_dark_where_wanted,
+    is_wide_enough,
+    marks,
+    near,
+    needs_a_browser,
+    screenshot,
+    summary_of,
+)
 
 from spadmnist import cli, measurement, pages
 from spadmnist.effects import Effect
-from spadmnist.errors import SpadError
+from spadmnist.errors import InputError, SpadError
+from spadmnist.events import Layout
 from spadmnist.inference import model_selection
 from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.results import Diagnosis, Step, Trace, Value, table
+from spadmnist.library.answers import Fit
 from spadmnist.pages import _diagnosis, _figures
+from spadmnist.sensor import Sensor
 from spadmnist.statistics import Statistic, Summary
 from spadmnist.statistics.checks import Check
 
@@ -197,7 +212,7 @@ def test_everything_that_was_found_is_there_in_its_order(full_page: str) -> None
             Effect.registry.find("crosstalk").summary(),
             "probability probability that an avalanche fires one given side neighbour 0.0051 0.0047 to 0.0055",
             "1.12 ns 900 ps to 1.4 ns",
-            "crosstalk (chosen) 11.2",
+            "alternative in-sample misfit with it",
             "source_noise " + Effect.registry.find("source_noise").summary() + " 41.3",
             "dead_time.duration",
             "2. detection.pdp per pixel a number of the model that varies from pixel to pixel",
@@ -267,7 +282,11 @@ def test_what_was_not_found_is_not_spoken_of(tmp_path: Path, verdict: str, look:
     text, parts = written(answer_of(**BARE | {"verdict": verdict}), tmp_path)
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["The ladder of errors", "Words"]
     assert f'<section class="verdict {look}">' in text and f"{word}" in parts.text
-    assert "The misfit is 1.01;" in parts.text and "fell from" not in parts.text and "placebo is" not in parts.text
+    assert (
+        "The misfit on held-out data is 1.01;" in parts.text
+        and "fell from" not in parts.text
+        and "placebo is" not in parts.text
+    )
     assert "next model" not in parts.text
     text, parts = written(answer_of(**BARE | {"ladder": []}), tmp_path)
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Words"] and not parts.images
@@ -452,12 +471,12 @@ def test_the_command_writes_it_and_says_before_the_work_that_it_cannot(
         return answer_of(**BARE | {"verdict": "adequate"})
 
     monkeypatch.setattr(model_selection, "diagnose", diagnose)
-    monkeypatch.setattr(measurement, "open", lambda path: None)
+    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None))
     sensor = str(Path(__file__).parents[1] / "configs" / "spad23.yaml")
     folder = tmp_path / "next"
     told = CliRunner().invoke(cli.cli, ["diagnose", sensor, "lab", "-o", str(folder)])
     assert told.exit_code == 0, told.output
-    assert {p.name for p in folder.iterdir()} == {"report.html", "sensor.yaml"}
+    assert {p.name for p in folder.iterdir()} == {"answer.json", "report.html", "sensor.yaml"}
     assert "Adequate" in (folder / "report.html").read_text() and f"Report: {folder / 'report.html'}" in told.stderr
     page = (folder / "report.html").read_text()
     assert "the same model is in the file <b>sensor.yaml</b> (nothing was added)" in page
@@ -466,6 +485,24 @@ def test_the_command_writes_it_and_says_before_the_work_that_it_cannot(
     (folder / "report.html").write_text("mine")
     told = CliRunner().invoke(cli.cli, ["diagnose", sensor, "lab", "-o", str(folder)])
     assert isinstance(told.exception, SpadError) and len(asked) == 1
+
+
+def test_figures_have_names(tmp_path: Path) -> None:
+    fit = Fit(answer_of(), Sensor(Layout(2, 2, 1e-10, 1.0), []))
+    assert len(fit.figure("ladder").axes[0].patches) >= 5  # a bar for each model
+    with pytest.raises(InputError, match="figure 'map': is none of this answer; there are ladder, or a number from 0"):
+        fit.figure("map")
+    with pytest.raises(InputError, match="there are none with a name"):
+        Fit(answer_of(**BARE | {"ladder": []}), fit.start).figure("ladder")
+
+
+def test_what_is_nearest_to_what_remains_is_named(tmp_path: Path) -> None:
+    _, parts = written(answer_of(), tmp_path)
+    assert "Nearest, but" not in parts.text
+    found = answer_of(verdict="unexplained")
+    found.unexplained[0]["alternatives"] = [other("set", "dead_time", "duration", 9.0)]
+    _, parts = written(found, tmp_path)
+    assert "Nearest, but it explains too little of its own cells: dead_time.duration." in parts.text
 
 
 # --- harmless -------------------------------------------------------------------------------------------------------
@@ -554,3 +591,11 @@ def test_a_browser_shows_the_ladder_beside_its_table_and_on_a_telephone_above_it
         placed[width] = (heads.min() < rows.max(), columns.max() / width)
     assert placed[1280][0] and placed[1280][1] < 0.5  # side by side
     assert not placed[500][0] and placed[500][1] > 0.4  # below
+
+
+@needs_a_browser
+def test_the_page_fits_on_a_telephone_and_is_dark_where_the_reader_wants_it(tmp_path: Path, full_page: str) -> None:
+    page = tmp_path / "report.html"
+    page.write_text(full_page)
+    is_dark_where_wanted(page, tmp_path)
+    is_wide_enough(page, tmp_path)

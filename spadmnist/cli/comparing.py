@@ -87,7 +87,9 @@ def compare(
 
 
 @cli.verb(130, short_help="Which physical effect does a model lack?")
-@options.output("FOLDER", "Folder of the report, an HTML page, and of the next sensor.yaml with its maps.")
+@options.output(
+    "FOLDER", "Folder of the report, an HTML page, of the next sensor.yaml with its maps, and of answer.json."
+)
 @click.option(
     "--max-steps",
     type=click.IntRange(1, MAX_STEPS),
@@ -128,7 +130,7 @@ def diagnose(
     """
     from .. import library
     from ..inference import next_step, results
-    from ..library.answers import SENSOR
+    from ..library.answers import ANSWER, SENSOR
 
     _check_answer(json_file, output, *_pages(output), *([output / SENSOR] if output else []))
 
@@ -136,6 +138,7 @@ def diagnose(
         """What is found so far, should the rest be interrupted."""
         if output is not None:
             _write_sensor(so_far, output / SENSOR)
+            so_far.write_answer(output / ANSWER)
             so_far.write_report(output, command=_command())
         _write_answer(json_file, results.canonical(so_far.found))
 
@@ -161,9 +164,10 @@ def diagnose(
     again = options.again(measurement, plugin_files, crop)
     what = next_step.after_diagnosis(found.found, quoted(sensor), again, new, same, output is not None)
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
+        last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
         if output is not None:
             last.callback(lambda: terminal.say(f"Report: {found.write_report(output, command=_command(), then=what)}"))
-        last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
+            last.callback(lambda: found.write_answer(output / ANSWER))
         last.callback(lambda: _write_answer(json_file, results.canonical(found.found)))
     if found.unwritten:
         sys.exit(2)
@@ -238,9 +242,6 @@ def _write_sensor(found: Diagnosis | Fit, out: Path) -> None:
         terminal.say(f"Error: the next sensor file was not written: {found.unwritten}")
 
 
-_HEAD = 200  # bytes in which an answer says its format
-
-
 def _pages(folder: Path | None) -> list[Path]:
     """The pages that a folder may hold."""
     from .. import pages
@@ -251,21 +252,13 @@ def _pages(folder: Path | None) -> list[Path]:
 def _check_answer(file: Path | None, *taken: Path | None) -> None:
     """Refuse to put an answer where something else is, or will be (`taken`), before any work is done."""
     from ..errors import InputError
+    from ..library.answers import check_answer
 
-    if file is not None and any(file.resolve() == place.resolve() for place in taken if place is not None):
-        raise InputError(f"--json {file}: is the place of -o, too; name a file, for example {file}.json")
-    if file is None or not file.exists():
+    if file is None:
         return
-    if file.is_dir():
-        raise InputError(f"--json {file}: is a folder; name a file, for example {file / 'answer.json'}")
-    if not file.is_file() or file.is_symlink():
-        raise InputError(f"--json {file}: is a link, a pipe or a device, and is left alone; name a file")
-    with open(file, "rb") as there:
-        head = there.read(_HEAD)
-    if head and b'"format": "spadmnist-' not in head:
-        raise InputError(
-            f"--json {file}: exists, and is no answer of this program; it is left alone: name another file"
-        )
+    if any(file.resolve() == place.resolve() for place in taken if place is not None):
+        raise InputError(f"--json {file}: is the place of -o, too; name a file, for example {file}.json")
+    check_answer(file, "--json")
 
 
 def _write_answer(file: Path | None, text: str) -> None:

@@ -137,12 +137,14 @@ class Chip:
 class Mimic:
     """What no effect describes and yet leaves the trace of one: said wherever a diagnosis names that one.
 
-    among: the `Statistic.among` of all statistics in which the two look the same; capture: what would tell.
+    among: the `Statistic.among` of all statistics in which the two look the same, "" for all there are; capture: what
+    would tell. alone: only where one capture shows the two, as a map of one lit capture.
     """
 
     what: str
     among: str
     capture: str
+    alone: bool = False
 
     def __str__(self) -> str:
         return f"{self.what} would look the same; only {self.capture} tells them apart"
@@ -169,6 +171,7 @@ class Effect(Plugin, abstract=True):
     # values (SI) with which pictures show it, where those that the contract test chooses show it less well
     shown: ClassVar[dict[str, Any]] = {}
     mimic: ClassVar[Mimic | None] = None
+    mimic_of_map: ClassVar[Mimic | None] = None  # of a map of one of its parameters
 
     # what a search knows of it; by its stage, where it does not say so itself
     on_light: ClassVar[bool] = False  # it acts on the light alone: a common factor is another light level

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..plugins import ByWavelength
-from . import Conditions, Effect, parameter
+from . import Conditions, Effect, Mimic, parameter
 
 
 class Detection(Effect, stage="detection"):
@@ -17,6 +17,7 @@ class Detection(Effect, stage="detection"):
     """
 
     by_pixel = True
+    mimic_of_map = Mimic("light that is not uniform", "", "a capture with the lamp or the sensor moved", alone=True)
     moves = ("map", "rows_columns", "surface", "level", "outliers")
 
     pdp = parameter(

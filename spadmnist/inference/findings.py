@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from ..effects import Mimic
+from ..recording import Capture
 from ..statistics import Statistic
 from . import comparison
 from .deviations import Deviation, deviations, excess
@@ -26,11 +27,17 @@ _SEPARATED = 4.0  # standard deviations of a signature in statistics where the m
 _REGISTRY = Statistic.registry
 
 
-def mimicked(step: Step) -> Mimic | None:
-    """The mimic of a step that has the same signature in all that was measured; None where there is none."""
+def mimicked(step: Step, captures: Iterable[Capture]) -> Mimic | None:
+    """The mimic of a step that has the same signature in all that was measured; None where there is none.
+
+    Args:
+        captures: that were measured.
+    """
     other = mimic(step.candidate)
-    if other is None:
+    if other is None or (other.alone and sum(not capture.light.dark for capture in captures) != 1):
         return None
+    if not other.among:
+        return other
     apart = [t for (_, name), t in step.template.items() if name in _REGISTRY and _among(name) != other.among]
     return other if sum(float(t @ t) for t in apart) < _SEPARATED**2 else None
 

@@ -151,9 +151,9 @@ def _diagnosed(
         path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
     rungs = [path.ladder[0], *([notes.placebo] if notes.placebo else []), *path.ladder[1:]]
     null_95 = _measured(path, rungs)
-    if verdict == "explained":
+    if verdict in ("explained", "partly_explained"):
         replicates.budget.until = 1.0
-        verdict = _or_confused(path, notes)
+        verdict = _or_confused(path, notes, verdict)
     if notes.rival is not None:
         path.steps.append(rival_step(path, notes.rival))
     for step in path.steps:
@@ -277,13 +277,16 @@ def _stands_out(path: ModelPath, tried: Sequence[Trial], largest_p: float) -> bo
     return p <= largest_p
 
 
-def _or_confused(path: ModelPath, notes: Notes) -> str:
-    """The verdict on steps that leave nothing: "explained", or "confused" where something else is a tie.
+def _or_confused(path: ModelPath, notes: Notes, verdict: str) -> str:
+    """The verdict on steps, "confused" where they leave nothing and something else is a tie.
 
-    The advice is added.
+    The mimics of steps, which no effect describes, stand under their alternatives in any case. The advice is added.
+
+    Args:
+        verdict: "explained" or "partly_explained".
     """
-    verdict = "explained"
-    near = [(s.candidate, a["tried"]) for s in path.steps for a in s.alternatives if a.get("confused")]
+    whole = verdict == "explained"
+    near = [(s.candidate, a["tried"]) for s in path.steps for a in s.alternatives if whole and a.get("confused")]
     if near:
         verdict = "confused"
         with or_as_before(path, "advice"):
@@ -292,9 +295,9 @@ def _or_confused(path: ModelPath, notes: Notes) -> str:
                 other = replace(other, sensors=other.sensors.changed(path.where(path.values)))
             notes.advice += experiment_design.between(path.scan, path.evaluation, known, other)
     for step in path.steps:
-        unlisted = mimicked(step)
+        unlisted = mimicked(step, [seen.capture for seen in path.replicates.seen.values()])
         if unlisted is not None:
-            verdict = "confused"
+            verdict = "confused" if whole else verdict
             step.alternatives.insert(0, outside(unlisted, path.ladder[-1].misfit))
             notes.advice.append(experiment_design.on_mimic(step, unlisted))
     return verdict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .comparison import Comparison
-from .results import Diagnosis, named
+from .results import Diagnosis, nearest
 
 # what commands name; a terminal puts the paths that it was given in their places
 SENSOR, MEASUREMENT = "SENSOR", "MEASUREMENT"
@@ -54,7 +54,7 @@ def after_diagnosis(
     if found.advice and found.verdict == "confused":
         return f"take the capture {found.advice[-1]['capture']!r}, add it to the measurement, and diagnose again."
     if found.verdict == "unexplained":
-        near = [named(other) for other in (found.unexplained or [{}])[0].get("alternatives", [])]
+        near = nearest(found)
         like = f", perhaps like {near[0]}" if near else ""
         return (
             f"spadmnist effects --new NAME writes the file of a new effect{like}; then spadmnist diagnose {sensor} "

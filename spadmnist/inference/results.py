@@ -254,8 +254,10 @@ def mechanism(found: Sequence[Mapping[str, Any]], dark: Sequence[str]) -> str:
 
 def mimic(candidate: Candidate) -> Mimic | None:
     """The mimic of a candidate: what no effect describes and has the same signature; None where none is known."""
-    known = candidate.effect in Effect.registry
-    return Effect.registry.find(candidate.effect).mimic if candidate.kind == "add" and known else None
+    if candidate.effect not in Effect.registry or candidate.kind == "set":
+        return None
+    effect = Effect.registry.find(candidate.effect)
+    return effect.mimic if candidate.kind == "add" else effect.mimic_of_map
 
 
 def canonical(found: Diagnosis) -> str:
@@ -306,7 +308,7 @@ def table(found: Diagnosis) -> str:
                 lines += textwrap.wrap(also, 100, initial_indent="     ", subsequent_indent="     ")
         if len(groups) > LISTED:
             lines.append(f"... and {len(groups) - LISTED} more (--json FILE or the report holds them)")
-        near = [named(other) for other in found.unexplained[0].get("alternatives", [])]
+        near = nearest(found)
         if near:
             text = f"Nearest, but it explains too little of its own cells: {', '.join(near)}."
             lines += textwrap.wrap(text, 100)
@@ -363,6 +365,11 @@ def remaining(found: Diagnosis) -> list[list[dict[str, Any]]]:
     for k, entry in enumerate(found.unexplained):
         groups.setdefault(entry.get("deviation", -k), []).append(entry)
     return list(groups.values())
+
+
+def nearest(found: Diagnosis) -> list[str]:
+    """The names of the candidates that resemble what remains, and explain too little of it."""
+    return [named(other) for entry in found.unexplained[:1] for other in entry.get("alternatives", [])]
 
 
 def named(entry: Mapping[str, Any]) -> str:

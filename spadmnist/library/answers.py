@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,6 +26,8 @@ T = TypeVar("T")
 PathLike = str | Path
 
 SENSOR = "sensor.yaml"  # the next sensor file, in the folder of a diagnosis
+ANSWER = "answer.json"  # the answer, in the same folder
+_HEAD = 200  # bytes in which an answer says its format
 _SHOWN = 20  # checks in a notebook's table
 _DIGITS = 6  # of a fitted number in a sensor file
 
@@ -78,6 +80,26 @@ def check_place(folder: PathLike, sensor: Path | None) -> None:
     place = Path(folder)
     pages.check_place(place, "diagnosis")
     sensor_file.check_place(Path(os.devnull) if sensor is None else sensor, place / SENSOR)
+    check_answer(place / ANSWER)
+
+
+def check_answer(file: PathLike, name: str = "") -> None:
+    """Raise InputError where an answer as JSON would take the place of something else.
+
+    Args:
+        name: of the option, for the message.
+    """
+    place, named = Path(file), f"{name} {file}".strip()
+    if not place.exists() and not place.is_symlink():
+        return
+    if place.is_dir():
+        raise InputError(f"{named}: is a folder; name a file, for example {place / ANSWER}")
+    if not place.is_file() or place.is_symlink():
+        raise InputError(f"{named}: is a link, a pipe or a device, and is left alone; name a file")
+    with open(place, "rb") as there:
+        head = there.read(_HEAD)
+    if head and b'"format": "spadmnist-' not in head:
+        raise InputError(f"{named}: exists, and is no answer of this program; it is left alone: name another file")
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,8 +119,18 @@ class Comparison(comparison.Comparison):
         """A pandas DataFrame, a row a check. Raises InputError where pandas is not installed."""
         return _frame(self.as_data()["checks"])
 
-    def figure(self, i: int = 0) -> Figure:
-        """The matplotlib figure of the i-th check with cells, the failing ones first: measured, model, residuals."""
+    def figure(self, i: int | str = 0) -> Figure:
+        """A matplotlib figure of the page.
+
+        Args:
+            i: the i-th check with cells, the failing ones first: measured, model, residuals. Or "light": the light
+                level of each capture, as a factor on what is stated.
+
+        Raises:
+            InputError: where there is no such figure.
+        """
+        if isinstance(i, str):
+            return _by_name(pages.comparison_figures(self), i)
         drawn = [c for c in sorted(self.checks, key=lambda c: (c.passes, c.p_value)) if c.summary is not None]
         return pages.check_figure(_nth(drawn, i, "checks with cells"))
 
@@ -153,6 +185,11 @@ class _Found:
         return {"before": self.found.before, "after": self.found.after}
 
     @property
+    def misfit_in_sample(self) -> float | None:
+        """The misfit of the model with all steps over all captures; None where it was not simulated."""
+        return None if self.found.in_sample is None else self.found.in_sample.misfit
+
+    @property
     def path(self) -> list[dict[str, Any]]:
         """The ladder of models: `model`, `misfit`, `errors` of each, the first one the model that was given."""
         return [dict(row) for row in self.found.ladder]
@@ -176,8 +213,18 @@ class _Found:
         ]
         return _frame(rows)
 
-    def figure(self, i: int = 0) -> Figure:
-        """The matplotlib figure of the i-th trace: measured, the model before and after, residuals."""
+    def figure(self, i: int | str = 0) -> Figure:
+        """A matplotlib figure of the page.
+
+        Args:
+            i: the i-th trace: measured, the model before and after, residuals. Or "ladder": the misfit of each model;
+                or the name of a step that is a map, "detection.pdp per pixel".
+
+        Raises:
+            InputError: where there is no such figure.
+        """
+        if isinstance(i, str):
+            return _by_name(pages.diagnosis_figures(self.found), i)
         return pages.trace_figure(_nth(self.found.traces, i, "traces"))
 
     @property
@@ -191,7 +238,7 @@ class _Found:
         return self.found.unwritten
 
     def save(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
-        """Write the report and the next `sensor.yaml` with its maps into a folder; the folder.
+        """Write the report, the next `sensor.yaml` with its maps and `answer.json` into a folder; the folder.
 
         Args:
             command: what made it, for the page. then: the next step, for the page.
@@ -203,6 +250,7 @@ class _Found:
         place = Path(folder)
         check_place(place, self.origin.sensor)
         self.write_sensor(place / SENSOR)
+        self.write_answer(place / ANSWER)
         self.write_report(place, command=command, then=then)
         if self.unwritten:
             raise SpadError(f"the next sensor file was not written: {self.unwritten}")
@@ -235,6 +283,17 @@ class _Found:
             return None
         self.found.file = str(made)
         return made
+
+    def write_answer(self, file: PathLike) -> Path:
+        """Write the answer as JSON; the file.
+
+        Raises:
+            SpadError: where something else lies there, or it cannot be written.
+        """
+        check_answer(file)
+        with disk.writing_file(Path(file)):
+            disk.put_file(Path(file), (results.canonical(self.found) + "\n").encode())
+        return Path(file)
 
     def write_report(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
         """Write the report, one HTML page, into a folder; the page. command, then: as of `save`.
@@ -346,6 +405,13 @@ def _frame(rows: Sequence[Mapping[str, Any]]) -> Any:
 
 def _rounded(value: Any) -> Any:
     return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _by_name(drawn: Mapping[str, Callable[[], Figure]], name: str) -> Figure:
+    if name not in drawn:
+        known = f"there are {', '.join(drawn)}" if drawn else "there are none with a name"
+        raise InputError(f"figure {name!r}: is none of this answer; {known}, or a number from 0")
+    return drawn[name]()
 
 
 def _nth(drawn: Sequence[T], i: int, what: str) -> T:

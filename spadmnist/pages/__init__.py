@@ -4,8 +4,8 @@ Names come from users' files, so all text is escaped by the template, every pict
 page forbids the browser to fetch or run anything. The same answer gives the same bytes.
 """
 
-from ._comparison import check_figure, comparison
-from ._diagnosis import diagnosis, trace_figure
+from ._comparison import check_figure, comparison, comparison_figures
+from ._diagnosis import diagnosis, diagnosis_figures, trace_figure
 from ._experiment import Drawing, Story, Table, experiment, markdown
 from ._frame import FILES, Source, check_place, source_of
 
@@ -18,7 +18,9 @@ __all__ = [
     "check_figure",
     "check_place",
     "comparison",
+    "comparison_figures",
     "diagnosis",
+    "diagnosis_figures",
     "experiment",
     "markdown",
     "source_of",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -152,10 +153,21 @@ def _cells(check: Check) -> Cells | None:
     )
 
 
-def _light_picture(nuisances: Sequence[Nuisance]) -> Picture:
+def comparison_figures(found: Comparison) -> dict[str, Callable[[], Figure]]:
+    """The figures of a comparison that show no check, by name."""
+    shown, _ = _lights(found.nuisances)
+    return {"light": partial(figures.figure_by, _draw_light, shown)} if shown else {}
+
+
+def _lights(nuisances: Sequence[Nuisance]) -> tuple[list[Nuisance], str]:
+    """(the light levels that are drawn, a note where these are not all)."""
     clearest = sorted(nuisances, key=lambda n: (n.capture is not None, -abs(n.pull)))[:_LIGHTS]
-    shown = [n for n in nuisances if n in clearest]
     note = f"Of {len(nuisances)} the {_LIGHTS} with the largest pulls." if len(nuisances) > _LIGHTS else ""
+    return [n for n in nuisances if n in clearest], note
+
+
+def _light_picture(nuisances: Sequence[Nuisance]) -> Picture:
+    shown, note = _lights(nuisances)
     return Picture(figures.drawn(_draw_light, shown), "Light of each capture, as a factor on what is stated", note)
 
 

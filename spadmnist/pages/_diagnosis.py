@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,6 +121,7 @@ def _words(found: Diagnosis, maps: Mapping[int, OddPixels]) -> dict[str, Any]:
         "then": next_step.after_diagnosis(found, new=Path(found.file).name if found.file else "next/sensor.yaml"),
         "headline": headline(found.in_sample) if found.in_sample is not None else "",
         "next": Path(found.file).name if found.file else None,
+        "nearest": results.nearest(found),
         "ladder": ladder,
         "broad": _ladder_picture(ladder, found.null_95, _BROAD) if ladder else None,
         "narrow": _ladder_picture(ladder, found.null_95, _NARROW) if ladder else None,
@@ -269,6 +271,19 @@ def _pictured(traces: Sequence[Trace]) -> _Picture:
     return _Picture(first, title_of(first.statistic), squares[0], squares[1], picture, traces[1:])
 
 
+def diagnosis_figures(found: Diagnosis) -> dict[str, Callable[[], Figure]]:
+    """The figures of a diagnosis that show no trace, by name: the ladder of errors, and each map of pixels."""
+    out: dict[str, Callable[[], Figure]] = {}
+    if found.ladder:
+        ladder = sorted(found.ladder, key=lambda row: bool(row["placebo"]))
+        out["ladder"] = partial(figures.figure_by, _draw_ladder, ladder, found.null_95, _BROAD)
+    for step in found.steps:
+        odd = odd_pixels_of(found, step)
+        if odd is not None:
+            out[results.title(step.candidate)] = odd.figure
+    return out
+
+
 def _ladder_picture(rows: Sequence[Mapping[str, Any]], floor: float, width: float) -> Picture:
     words = ", ".join(f"{row['model']}: {number(row['misfit'])}" for row in rows)
     words = f"The ladder of errors: misfit of each model on held-out data. {words}; noise floor: {number(floor)}"
@@ -377,7 +392,6 @@ main { max-width: 1160px; }
 .list th { overflow-wrap: normal; }
 .list td:first-child { min-width: 9em; overflow-wrap: break-word; }
 .list .figure { white-space: nowrap; font-variant-numeric: tabular-nums; }
-.chosen td { font-weight: 600; }
 .pair { display: grid; grid-template-columns: minmax(0, 6fr) minmax(0, 5fr); gap: 20px; margin-top: .7rem; }
 @media (max-width: 1180px) { .ladder { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
 @media (max-width: 900px) { .pair { grid-template-columns: minmax(0, 1fr); gap: 12px; } }
@@ -389,7 +403,7 @@ main { max-width: 1160px; }
 <p class="lead">{% if found.steps %}\
 The misfit on held-out data {{ "fell" if found.after < found.before else "went" }} from \
 <b>{{ found.before | number }}</b> to <b>{{ found.after | number }}</b>\
-{% else %}The misfit is <b>{{ found.before | number }}</b>{% endif %}; \
+{% else %}The misfit on held-out data is <b>{{ found.before | number }}</b>{% endif %}; \
 a right model stays below {{ found.null_95 | number }} in 95 of 100 measurements.\
 {% if fallen %} The misfit does not contain the totals: the error of the {{ fallen[0] }} fell from \
 <b>{{ (100 * fallen[1]) | number }} %</b> to <b>{{ (100 * fallen[2]) | number }} %</b>.\
@@ -435,9 +449,8 @@ misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 {% endif %}
 {% if card.step.alternatives %}
 <div class="wide"><table class="list">
-<thead><tr><th>alternative</th><th>misfit with it</th></tr></thead>
+<thead><tr><th>alternative</th><th>in-sample misfit with it</th></tr></thead>
 <tbody>
-<tr class="chosen"><td>{{ card.title }} (chosen)</td><td class="figure">{{ card.step.misfit | number }}</td></tr>
 {% for other in card.step.alternatives %}
 <tr><td>{{ name(other) }}\
 {% if other.effect and about(other.effect) %}<br><span class="small">{{ about(other.effect) }}</span>{% endif %}</td>\
@@ -491,6 +504,8 @@ misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 <td class="figure fails">{{ "%.1f" | format(entry.significance) }} sigma</td></tr>
 {% endfor %}
 </tbody></table></div>
+{% if nearest %}<p>Nearest, but it explains too little of its own cells: {{ nearest | join(", ") }}.</p>
+{% endif %}
 {% endif %}
 
 {% if found.setup or found.nuisances %}

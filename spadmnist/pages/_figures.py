@@ -160,6 +160,11 @@ def picture(cells: Cells, words: str) -> Picture:
 
 def figure_of(cells: Cells) -> Figure:
     """The same drawing as a matplotlib figure, in the style of the pages, for a notebook or a paper."""
+    return figure_by(_drawing(cells.summary), cells)
+
+
+def figure_by(draw: Callable[..., None], *arguments: Any) -> Figure:
+    """What `draw(figure, *arguments)` draws, as a matplotlib figure in the style of the pages."""
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -168,7 +173,7 @@ def figure_of(cells: Cells) -> Figure:
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(facecolor="white")
-        _drawing(cells.summary)(figure, cells)
+        draw(figure, *arguments)
         return figure
 
 

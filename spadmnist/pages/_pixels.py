@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,7 +42,10 @@ class OddPixel:
 
 @dataclass(frozen=True)
 class OddPixels:
-    """The odd pixels of a map, the oddest first. table: what the file holds; number: of the odd ones."""
+    """The odd pixels of a map, the oddest first.
+
+    table: what the file holds; number: of the odd ones; figure: the picture as a matplotlib figure.
+    """
 
     file: str
     picture: Picture
@@ -49,6 +53,7 @@ class OddPixels:
     number: int
     rows: Sequence[OddPixel]
     table: Sequence[tuple[object, ...]]
+    figure: Callable[[], Figure]
 
 
 def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
@@ -84,13 +89,14 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     ]
     name = title(step.candidate).removesuffix(" per pixel")
     words = f"Map of {name}: the fitted value of each pixel, relative to the median"
-    picture = Picture(figures.drawn(_draw_map, ratios.reshape(shape), _shown(middle, unit), odd), words)
+    drawing = ratios.reshape(shape), _shown(middle, unit), odd
+    picture = Picture(figures.drawn(_draw_map, *drawing), words)
     sentence = (
         f"{int(high.sum())} of {values.size:,} pixels lie far above the others and {int(low.sum())} far below; "
         f"the median is {_shown(middle, unit)}."
     )
     file = _FILE.format(re.sub(r"[^a-z0-9_]+", "-", name.lower()))
-    return OddPixels(file, picture, sentence, odd.size, rows, table)
+    return OddPixels(file, picture, sentence, odd.size, rows, table, partial(figures.figure_by, _draw_map, *drawing))
 
 
 def write_lists(maps: Collection[OddPixels], folder: Path) -> None:

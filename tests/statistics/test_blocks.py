@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import null_laws
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from simple_sensor import grid, many, one_of_each, reduced, tr, tr_of
 
+from spadmnist import cli, measurement
 from spadmnist.events import Layout
 from spadmnist.recording import Recording
 from spadmnist.statistics import _order
@@ -179,3 +183,30 @@ def test_a_full_converter_is_beyond_the_law() -> None:
     usual = 10 * many(Silences, lambda seed: tr(seed, LINE, 5e5, 1e-3), 30)[:, 2].mean()
     assert 35 < usual < 75
     assert many(Silences, cycled, 10)[:, 2].sum() > usual + 8 * np.sqrt(usual)
+
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "real" / "linospad2_a5_36"
+
+
+@pytest.mark.skipif(not REAL.exists(), reason=f"{REAL} is not there: a capture of a real line of 256 pixels")
+def test_a_real_line_whose_pixels_share_converters(tmp_path: Path) -> None:
+    """Pixels 4k to 4k + 3 share one, hardly two are within 7 ns; a full one is blind until its 500 us cycle ends.
+
+    Of those within 1 ns there are 13, which the offsets of the pixels bring together.
+    """
+    files = {"--tdc": "TDC_A5_#36_2212b.csv", "--offsets": "Offset_A5_#36_2212b.npy"}
+    given = [word for option, name in files.items() for word in (option, str(REAL / name))]
+    given += ["--firmware", "2212b", "--timestamps", "200", "--cycle", "500 us", "--light", "free"]
+    done = CliRunner().invoke(cli.cli, ["import", str(REAL / "capture_2212b.dat"), "-o", str(tmp_path / "lab"), *given])
+    assert done.exit_code == 0, done.output
+    recording = measurement.open(tmp_path / "lab").recording("capture_2212b")
+    pairs = reduced(Blocks, recording)
+    found = {pairs.where(k): pairs.size(k, 0.0, 0.0)[0].split()[0] for k in range(len(pairs.values))}
+    for name in ("pixels 2k and 2k + 1", "pixels 4k to 4k + 3, not of one half"):
+        assert int(found[f"{name}, 1 to 3 ns"]) <= 4  # of 16 and 33 by chance
+    assert int(found["pixels 8k to 8k + 7, not of one half, 0 to 1 ns"]) > 100  # crosstalk, of other converters
+    silent = reduced(Silences, recording)
+    first, last = (int(word) for word in re.findall(r"pixels (\d+) to (\d+) silent", silent.where(2))[0])
+    assert first % 4 == 0 and last == first + 3 and silent.values[2] > 30 > 3 * silent.values[0]
+    end = float(silent.where(2).rpartition(" to ")[2].split()[0])  # ms
+    assert end % 0.5 < 0.02
