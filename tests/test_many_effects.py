@@ -21,6 +21,7 @@ from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
 from spadmnist.inference.model_selection import _another
+from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
 from spadmnist.inference.trial import Trial
@@ -135,6 +136,33 @@ def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeyp
     trials[1].fall = 2000.0
     _best_of_scan_added(path, Notes([], False), path.failed, 0.01)
     assert asked[0] == "add crosstalk"
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_trace_that_nothing_explains_forbids_no_step_of_another_one(lab, monkeypatch, apart: bool) -> None:
+    """The second look has the largest trace alone; its best candidate explains nothing when it is fitted."""
+    path, asked = begin(bench_of(lab("    crosstalk: {probability: 10 %}\n", dead=60, light=1000), 16)), []
+    edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
+    cross = given(path, "add crosstalk", {CROSSTALK: 0.1}, fitted=False)
+    rival = given(path, "add slow_recovery", {("slow_recovery", "time_constant"): 1e-8}, fitted=False)
+    trials = [replace(edge, fall=4000.0), replace(rival, fall=300.0), *([replace(cross, fall=200.0)] if apart else [])]
+    module = "spadmnist.inference.forward_step."
+
+    def fitted(path, worth, faint):
+        asked.append([t.candidate.name for t in worth])
+        return [replace(t, evidence=t.fall if t.candidate.effect == "crosstalk" else -2.0) for t in worth]
+
+    monkeypatch.setattr(module + "_fitted", fitted)
+    monkeypatch.setattr(module + "_taken", lambda path, notes, failed, second, best, significance: True)
+    monkeypatch.setattr(module + "p_of_best", lambda *_: (9.0, 1e-20))
+    monkeypatch.setattr(module + "patterns_first", lambda scan, evaluation, second: second)
+    monkeypatch.setattr(path.scan, "again", lambda evaluation, values, tried, faint=False: tried[:1])
+    notes = Notes([], False)
+    notes.tried = trials
+    assert _best_of_scan_added(path, notes, path.failed, 0.01) is True
+    # what competes with that candidate is no other trace
+    assert asked == ([["set dead_time.duration"], ["add crosstalk"]] if apart else [["set dead_time.duration"]])
+    assert apart or len(path.evaluation.replicate_residuals[TOTALS]) > 16  # then more replicates are made
 
 
 def test_signatures_of_the_first_look_are_used_again(lab) -> None:

@@ -124,6 +124,18 @@ def competing(replicates: Replicates, evaluation: Evaluation, trials: Sequence[T
     return groups
 
 
+def apart_from(
+    replicates: Replicates, evaluation: Evaluation, seen: Sequence[Trial], second: Sequence[Trial]
+) -> list[Trial]:
+    """The trials of the second look that explain another trace than those that were fitted, and promise enough."""
+    return [
+        one
+        for one in second
+        if one.fall > PROMISING
+        and all(one is not other and not _compete(replicates, evaluation, one, other) for other in seen)
+    ]
+
+
 def leads(best: Trial, others: Sequence[Sequence[Trial]]) -> bool:
     """Whether no trial of other groups promises so much more that it may be the better step."""
     return best.evidence >= NEAR * max((one.fall for group in others for one in group), default=-math.inf)

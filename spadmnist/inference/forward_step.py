@@ -16,7 +16,7 @@ from .conclusion import Notes, not_done
 from .elimination import left_in_own_cells
 from .error_budget import placebo_of
 from .evaluation import BlockCheck, Evaluation, evaluate
-from .evidence import NEAR, best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
+from .evidence import NEAR, apart_from, best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
 from .joint_fit import complete_fit
 from .levels import FALSE_ALARM, LEAST_EVIDENCE, PROMISING
 from .map_trials import patterns_first, random_map_trials
@@ -108,12 +108,13 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     if not second:
         return False
     worth = worth_fitting(second, faint)
-    groups = [worth] if faint else competing(replicates, path.evaluation, worth)
+    seen, groups = list(worth), [worth] if faint else competing(replicates, path.evaluation, worth)
     fitted: list[Trial] = []
     doubtful: tuple[Any, ...] | None = None  # the path with a step that helps too little to go on from
-    refused = False
-    for k, group in enumerate(groups):
-        fitted += _fitted(path, group, faint)
+    refused, k = False, -1
+    while k + 1 < len(groups):
+        k += 1
+        fitted += _fitted(path, groups[k], faint)
         while found := _best_of(path, notes, second[0], fitted, faint):
             best, significance, p = found
             # squares do not show small differences of many pixels or codes: their p-value is that of their own test
@@ -131,14 +132,29 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
             if len(path.steps) > len(earlier[2]):
                 doubtful = doubtful or path.kept()
                 path.back_to(earlier)
+        if k + 1 == len(groups) and not faint:  # a trace that nothing explains forbids no step of another one
+            further = _of_other_traces(path, notes, seen)
+            second, worth = second + further, worth_fitting(further) if further else []
+            groups += competing(replicates, path.evaluation, worth)
+            seen += worth
     if not fitted and not refused:
-        raise _NoCandidate({one.candidate.name for one in worth})
+        raise _NoCandidate({one.candidate.name for one in seen})
     if doubtful is not None:
         path.back_to(doubtful)
     elif not (faint or refused) and has_few_replicates(path):
         path.evaluation = with_more_replicates(path)  # something is wrong: too few replicates may be what hides it
         return True
     return False
+
+
+def _of_other_traces(path: ModelPath, notes: Notes, seen: Sequence[Trial]) -> list[Trial]:
+    """The best trials on all captures that explain other traces than those that were fitted and not taken."""
+    names = {one.candidate.name for one in seen}
+    left = apart_from(path.replicates, path.evaluation, seen, [t for t in notes.tried if t.candidate.name not in names])
+    if not left:
+        return []
+    again = path.scan.again(path.evaluation, path.values, left)
+    return apart_from(path.replicates, path.evaluation, seen, again)
 
 
 def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], waiting: Sequence[list[Trial]]) -> bool:

@@ -15,7 +15,9 @@ from ._counting import Surplus, exposure_in, span, tick_of, whole
 from ._order import in_time_order
 from ._walk import REACH
 
-_LAGS = (1e-9, 3e-9, 10e-9)  # s, of pairs: the blind time of a shared converter is 7 ns in LinoSPAD2 (real data)
+# s, of pairs: crosstalk, which is no matter of the readout, is mostly nearer; the blind time of a shared converter is
+# 7 ns in LinoSPAD2 (real data)
+_LAGS = (1e-9, 3e-9, 10e-9)
 _LEVELS = (
     6  # blocks of up to 2^6 = 64 pixels; a converter of LinoSPAD2 has 4, one of a column-parallel readout its column
 )
@@ -34,8 +36,8 @@ class Blocks(Statistic):
     """Coincident detections of different pixels that may share a part of the readout.
 
     Classes: pixels 2k and 2k + 1; others of 4k to 4k + 3; others of 8k to 8k + 7; and so on to 64, in the order of
-    read-out; on a grid those of one row, or of one column, that are more than 3 pitches apart. Up to 1, 3 and 10 ns
-    apart in either order.
+    read-out; on a grid those of one row, or of one column, that are more than 3 pitches apart. 1 to 3 and 3 to 10 ns
+    apart in either order: what is nearer is crosstalk's, which `neighbours` shows.
     Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
     Shows: a converter that several pixels share and that is blind while it works (a deficit in its blocks alone).
     Source: measured in a LinoSPAD2, four pixels to a converter, no two within 6.9 ns.
@@ -62,15 +64,17 @@ class Blocks(Statistic):
         if grid and layout.rows > REACH + 1:
             names[_COLUMN] = f"pixels of one column, more than {REACH} pitches apart"
         edges = np.unique([max(1, round(lag / tick)) for lag in _LAGS])
-        found = np.zeros((_COLUMN + 1, edges.size), np.int64)
+        if edges.size < len(_LAGS):
+            return None
+        found = np.zeros((_COLUMN + 1, edges.size - 1), np.int64)
         for words, bits, new in in_time_order(recording, int(edges[-1])):
             _close(words, bits, new, edges, layout.columns if grid else 0, found)
         by_chance = _by_chance(recording.totals.astype(np.float64), layout.shape, levels, grid)
-        lags = np.diff(2.0 * edges - 1.0, prepend=0.0) / exposure_in(recording, tick)
+        lags = np.diff(2.0 * edges) / exposure_in(recording, tick)
         kinds = sorted(names)
         chance = np.array([by_chance[k] * lags for k in kinds]).ravel()
         pairs = Surplus(found[kinds].ravel().astype(np.float64), chance, chance)
-        spans = [span(a, b) for a, b in itertools.pairwise(np.concatenate([[0.0], edges * tick]))]
+        spans = [span(a, b) for a, b in itertools.pairwise(edges * tick)]
         where = [f"{names[k]}, {apart}" for k in kinds for apart in spans]
         total = max(float(recording.totals.sum()), 1.0)
 
@@ -164,10 +168,10 @@ def _close(words, bits, new, edges, columns, out):
         now, pixel = words[i] >> bits, words[i] & mask
         j = i - 1
         while j >= 0 and now - (words[j] >> bits) < longest:
-            other = words[j] & mask
-            if other != pixel:
+            other, lag = words[j] & mask, now - (words[j] >> bits)
+            if other != pixel and lag >= edges[0]:
                 b = 0
-                while edges[b] <= now - (words[j] >> bits):
+                while edges[b + 1] <= lag:
                     b += 1
                 apart = pixel ^ other
                 level = 0
