@@ -111,10 +111,11 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     seen, groups = list(worth), [worth] if faint else competing(replicates, path.evaluation, worth)
     fitted: list[Trial] = []
     doubtful: tuple[Any, ...] | None = None  # the path with a step that helps too little to go on from
-    refused, k = False, -1
+    refused, able, k = False, False, -1
     while k + 1 < len(groups):
         k += 1
         fitted += _fitted(path, groups[k], faint)
+        able = able or bool(fitted)
         while found := _best_of(path, notes, second[0], fitted, faint):
             best, significance, p = found
             # squares do not show small differences of many pixels or codes: their p-value is that of their own test
@@ -134,10 +135,10 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
                 path.back_to(earlier)
         if k + 1 == len(groups) and not faint:  # a trace that nothing explains forbids no step of another one
             further = _of_other_traces(path, notes, seen)
-            second, worth = second + further, worth_fitting(further) if further else []
+            second, worth, fitted = second + further, worth_fitting(further) if further else [], []
             groups += competing(replicates, path.evaluation, worth)
             seen += worth
-    if not fitted and not refused:
+    if not able and not refused:
         raise _NoCandidate({one.candidate.name for one in seen})
     if doubtful is not None:
         path.back_to(doubtful)
@@ -153,7 +154,7 @@ def _of_other_traces(path: ModelPath, notes: Notes, seen: Sequence[Trial]) -> li
     left = apart_from(path.replicates, path.evaluation, seen, [t for t in notes.tried if t.candidate.name not in names])
     if not left:
         return []
-    again = path.scan.again(path.evaluation, path.values, left)
+    again = patterns_first(path.scan, path.evaluation, path.scan.again(path.evaluation, path.values, left))
     return apart_from(path.replicates, path.evaluation, seen, again)
 
 
