@@ -68,10 +68,12 @@ def upper_limits(
             entry = {"effect": name, "parameter": coordinate.parameter, "upper_limit_95": plain(far)}
             # an effect that vanishes at the upper end of its range: the strength is at least that
             excluded.append(entry | ({"at_least": True} if far < (coordinate.off or 0.0) else {}))
-    # a periodic effect is tried where there are lines; one that could not be tried is reported where it failed
-    failed = {entry["effect"] for entry in scan.untried} - {one.candidate.effect for one in tried}
-    every = scan.replicates.candidates(evaluation.sensors.one)
-    others = {one.effect for one in every if one.kind == "add"} - shapes.keys() - failed
+    # periodic effects are looked for in the spectrum, though none is tried where there are no lines; an effect that
+    # could not be tried is reported where it failed
+    looked = {one.candidate.effect for one in tried}
+    failed = {entry["effect"] for entry in scan.untried} - looked
+    added = [one for one in scan.replicates.candidates(evaluation.sensors.one) if one.kind == "add"]
+    others = {one.effect for one in added if one.phases or one.effect in looked} - shapes.keys() - failed
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 
