@@ -106,18 +106,21 @@ class Silences(Statistic):
         """Counts of long silences."""
         layout, tick = recording.layout, tick_of(recording)
         end, levels = exposure_in(recording, tick), _levels(layout.pixels)
-        sizes = [_of_blocks(recording.totals, k) for k in range(levels + 1)]
-        longest = np.full((levels + 1, layout.pixels), np.iinfo(np.int64).max)
-        for k, n in enumerate(sizes):
+        each, share_of_time = [], []
+        for level in range(levels + 1):
+            n = _of_blocks(recording.totals, level)
             known = n >= _LEAST
-            blocks = np.maximum(np.log(np.maximum(n, 1.0) * max(known.sum(), 1) / _EXPECTED), _SHORTEST)
-            times = np.where(known, blocks * end / np.maximum(n, 1.0), 2.0**62)
-            longest[k, : n.size] = np.minimum(times, 2.0**62).astype(np.int64)
-        last = np.zeros(longest.shape, np.int64)
+            intervals = np.maximum(np.log(np.maximum(n, 1.0) * max(known.sum(), 1) / _EXPECTED), _SHORTEST)
+            times = np.where(known, intervals * end / np.maximum(n, 1.0), 2.0**62)
+            each.append(np.minimum(times, 2.0**62).astype(np.int64))
+            share_of_time.append(float(times[known].mean() / end / known.sum()) if known.any() else 0.0)
+        # the blocks of all sizes, one size after the other
+        begins, longest = np.concatenate([[0], np.cumsum([len(x) for x in each])]), np.concatenate(each)
+        last = np.zeros(longest.size, np.int64)
         counts, clearest = np.zeros(levels + 1, np.int64), np.zeros((levels + 1, 3), np.int64)
         for words, bits, new in in_time_order(recording):
-            _silent(words, bits, new, longest, last, counts, clearest)
-        _silent_to_the_end(end, np.array([n.size for n in sizes]), longest, last, counts, clearest)
+            _silent(words, bits, new, begins, longest, last, counts, clearest)
+        _silent_to_the_end(end, begins, longest, last, counts, clearest)
 
         def where(cell: int) -> str:
             size, (block, begun, stop) = 2**cell, clearest[cell]
@@ -129,9 +132,8 @@ class Silences(Statistic):
             return f"{which} silent, the longest of blocks of {size}: from {times}"
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            known = longest[cell][longest[cell] < 1 << 61]
-            share = (measured - expected) * float(known.mean()) / end / known.size if known.size else 0.0
-            return f"{whole(measured)} long silences, {whole(expected)} expected", float(share)
+            share = float(measured - expected) * share_of_time[cell]
+            return f"{whole(measured)} long silences, {whole(expected)} expected", share
 
         return Summary(counts.astype(np.float64), "poisson", where, size)
 
@@ -191,34 +193,35 @@ def _close(words, bits, new, edges, columns, out):
 
 
 @jit
-def _silent(words, bits, new, longest, last, counts, clearest):
+def _silent(words, bits, new, begins, longest, last, counts, clearest):
     """Count the long silences of blocks of each size.
 
-    longest: (sizes, blocks) ticks beyond which a silence is long; last: the last detection of each block; clearest:
-    (sizes, 3) block, begin and end of the longest one, as a multiple of what is long.
+    begins: (sizes + 1,) where the blocks of a size begin; longest: (blocks,) ticks beyond which a silence is long;
+    last: (blocks,) the last detection; clearest: (sizes, 3) block, begin and end of the longest one, as a multiple of
+    what is long.
     """
     mask = (np.int64(1) << bits) - 1
     for i in range(new, words.size):
         now, pixel = words[i] >> bits, words[i] & mask
         for level in range(counts.size):
-            block = pixel >> level
-            if now - last[level, block] > longest[level, block]:
-                _count(level, block, now, longest, last, counts, clearest)
-            last[level, block] = now
+            block = begins[level] + (pixel >> level)
+            if now - last[block] > longest[block]:
+                _count(level, block, now, begins[level], longest, last, counts, clearest)
+            last[block] = now
 
 
 @jit
-def _silent_to_the_end(end, sizes, longest, last, counts, clearest):
+def _silent_to_the_end(end, begins, longest, last, counts, clearest):
     for level in range(counts.size):
-        for block in range(sizes[level]):
-            if end - last[level, block] > longest[level, block]:
-                _count(level, block, end, longest, last, counts, clearest)
+        for block in range(begins[level], begins[level + 1]):
+            if end - last[block] > longest[block]:
+                _count(level, block, end, begins[level], longest, last, counts, clearest)
 
 
 @jit
-def _count(level, block, now, longest, last, counts, clearest):
+def _count(level, block, now, begin, longest, last, counts, clearest):
     counts[level] += 1
     before, begun, stop = clearest[level]
-    ratio = (now - last[level, block]) / longest[level, block]
-    if counts[level] == 1 or ratio > (stop - begun) / longest[level, before]:
-        clearest[level, 0], clearest[level, 1], clearest[level, 2] = block, last[level, block], now
+    ratio = (now - last[block]) / longest[block]
+    if counts[level] == 1 or ratio > (stop - begun) / longest[begin + before]:
+        clearest[level, 0], clearest[level, 1], clearest[level, 2] = block - begin, last[block], now
