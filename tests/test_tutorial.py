@@ -52,7 +52,8 @@ def test_the_loop_of_the_docs(tmp_path):
     values = second["steps"][0]["values"]
     assert values["share"]["low"] < 0.008 < values["share"]["high"]
     assert values["delay"]["low"] < 150e-9 < values["delay"]["high"]
-    assert second["misfit"]["before"] > 2.8 and second["misfit"]["after"] < max(1.2, second["misfit_null_95"])
+    # a mean over all statistics, most of which an echo does not move
+    assert second["misfit"]["before"] > 2.5 and second["misfit"]["after"] < max(1.2, second["misfit_null_95"])
     placebo = next(row for row in second["ladder"] if row["placebo"])
     assert placebo["misfit"] > 0.8 * second["misfit"]["before"]  # adding just anything does not help
     assert "The model is adequate" in run(folder, check)
