@@ -292,7 +292,7 @@ def test_one_parameter_is_fitted_once(given: dict[str, list[str]], tmp_path: Pat
     (tmp_path / "sensor.yaml").write_text(SENSOR)
     model = sp.read_sensor(tmp_path / "sensor.yaml")
     lab = sp.simulate(model, [FLAT, sp.Capture("dark", "str", frames=4, frame_time=10e-6, dark=True, tick=1e-9)], 1)
-    with pytest.raises(InputError, match=r"would be fitted twice, .*name it once"):
+    with pytest.raises(InputError, match=r"would be fitted twice.*; name it once"):
         sp.fit(model, lab, **given)
 
 

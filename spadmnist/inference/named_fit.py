@@ -270,8 +270,9 @@ def _check_once(wanted: Sequence[Candidate]) -> None:
         keys = [candidate.carrier] if candidate.carrier else [d.key for d in candidate.coordinates]
         for key in {*keys, *(key for key, _ in candidate.fixed)}:
             if key in known:
-                both = f"as {title(known[key])} and as {title(candidate)}"
-                raise InputError(f"{'.'.join(key)} would be fitted twice, {both}; name it once, for a map has its mean")
+                names = title(known[key]), title(candidate)
+                both = "" if names[0] == names[1] else f", as {names[0]} and as {names[1]}, which has a mean of its own"
+                raise InputError(f"{'.'.join(key)} would be fitted twice{both}; name it once")
             known[key] = candidate
 
 
