@@ -156,7 +156,8 @@ def _put_maps(out: Path, maps: Mapping[str, bytes], earlier: set[Path] | None) -
 def _remove_earlier(out: Path, maps: Mapping[str, bytes], earlier: set[Path] | None) -> None:
     """Remove the maps of earlier values of a sensor file."""
     for path in list(earlier or ()):
-        if path.parent == out.parent and path.name.startswith(f"{out.stem}.") and path.name not in maps:
+        # its name, the effect, the parameter, the content
+        if path.parent == out.parent and path.name.rsplit(".", 4)[0] == out.stem and path.name not in maps:
             path.unlink(missing_ok=True)
             assert earlier is not None
             earlier.remove(path)

@@ -112,32 +112,39 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     fitted: list[Trial] = []
     doubtful: tuple[Any, ...] | None = None  # the path with a step that helps too little to go on from
     refused, able, k = False, False, -1
-    while k + 1 < len(groups):
-        k += 1
-        fitted += _fitted(path, groups[k], faint)
-        able = able or bool(fitted)
-        while found := _best_of(path, notes, second[0], fitted, faint):
-            best, significance, p = found
-            # squares do not show small differences of many pixels or codes: their p-value is that of their own test
-            if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
-                break
-            earlier = path.kept()
-            # a map and random pixels fit by their scatter, which an earlier signature does not predict
-            notes.waiting = [
-                g for g in groups[k + 1 :] if not (faint or any(t.maps or t.chips or t.fluctuates for t in g))
-            ]
-            if _taken(path, notes, failed, second, best, significance):
-                return True
-            notes.waiting, refused = [], True
-            fitted = [one for one in fitted if one is not best]
-            if len(path.steps) > len(earlier[2]):
-                doubtful = doubtful or path.kept()
-                path.back_to(earlier)
-        if k + 1 == len(groups) and not faint:  # a trace that nothing explains forbids no step of another one
-            further = _of_other_traces(path, notes, seen)
-            second, worth, fitted = second + further, worth_fitting(further) if further else [], []
-            groups += competing(replicates, path.evaluation, worth)
-            seen += worth
+    try:
+        while k + 1 < len(groups):
+            k += 1
+            fitted += _fitted(path, groups[k], faint)
+            able = able or bool(fitted)
+            while found := _best_of(path, notes, second[0], fitted, faint):
+                best, significance, p = found
+                # squares do not show small differences of many pixels or codes: their p-value is that of their own test
+                if p > least or (best.evidence < LEAST_EVIDENCE and not faint) or not leads(best, groups[k + 1 :]):
+                    break
+                earlier = path.kept()
+                # a map and random pixels fit by their scatter, which an earlier signature does not predict
+                notes.waiting = [
+                    g for g in groups[k + 1 :] if not (faint or any(t.maps or t.chips or t.fluctuates for t in g))
+                ]
+                if _taken(path, notes, failed, second, best, significance):
+                    return True
+                notes.waiting, refused = [], True
+                fitted = [one for one in fitted if one is not best]
+                if len(path.steps) > len(earlier[2]):
+                    doubtful = doubtful or path.kept()
+                    path.back_to(earlier)
+            if k + 1 == len(groups) and not faint:  # a trace that nothing explains forbids no step of another one
+                further = _of_other_traces(path, notes, seen)
+                second, worth, fitted = second + further, worth_fitting(further) if further else [], []
+                groups += competing(replicates, path.evaluation, worth)
+                seen += worth
+    except OutOfBudget:
+        if doubtful is None:
+            raise
+        path.back_to(doubtful)
+        record_end(path, f"step {len(path.steps) + 1}")
+        return False
     if not able and not refused:
         raise _NoCandidate({one.candidate.name for one in seen})
     if doubtful is not None:

@@ -312,6 +312,8 @@ def _origin(sensor: Sensor | PathLike, data: Measurement, seed: int) -> Origin:
     if isinstance(sensor, Sensor):
         return Origin(measurement=data.file, seed=seed)
     path = Path(sensor).absolute()
+    if not path.is_file():  # a pipe, which has been read
+        return Origin(measurement=data.file, seed=seed)
     return Origin(path, path.read_bytes(), original(path), data.file, seed)
 
 

@@ -18,6 +18,7 @@ from ._walk import REACH
 # s, of pairs: crosstalk, which is no matter of the readout, is mostly nearer; the blind time of a shared converter is
 # 7 ns in LinoSPAD2 (real data)
 _LAGS = (1e-9, 3e-9, 10e-9)
+_CROWDED = 64.0  # detections of the array within the longest lag beyond which the work would grow with their square
 _LEVELS = (
     6  # blocks of up to 2^6 = 64 pixels; a converter of LinoSPAD2 has 4, one of a column-parallel readout its column
 )
@@ -64,7 +65,7 @@ class Blocks(Statistic):
         if grid and layout.rows > REACH + 1:
             names[_COLUMN] = f"pixels of one column, more than {REACH} pitches apart"
         edges = np.unique([max(1, round(lag / tick)) for lag in _LAGS])
-        if edges.size < len(_LAGS):
+        if edges.size < len(_LAGS) or recording.totals.sum() * edges[-1] > _CROWDED * exposure_in(recording, tick):
             return None
         found = np.zeros((_COLUMN + 1, edges.size - 1), np.int64)
         for words, bits, new in in_time_order(recording, int(edges[-1])):
