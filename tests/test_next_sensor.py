@@ -105,6 +105,15 @@ def test_maps_of_earlier_values_of_one_answer_are_removed(tmp_path: Path, diagno
     assert np.array_equal(rates(tmp_path / "other" / "sensor.yaml"), np.linspace(1.0, 4.0, 16))
 
 
+def test_the_maps_of_a_file_with_a_longer_name_stay(tmp_path: Path, diagnosed: Callable[..., Any]) -> None:
+    found, values = diagnosed(answer({RATE: np.linspace(1.0, 2.0, 16)})), np.linspace(3.0, 4.0, 16)
+    found.write_sensor(tmp_path / "next.1.yaml")
+    found.found.values = {RATE: values}
+    found.write_sensor(tmp_path / "next.yaml")
+    assert np.array_equal(rates(tmp_path / "next.1.yaml"), np.linspace(1.0, 2.0, 16))
+    assert np.array_equal(rates(tmp_path / "next.yaml"), values)
+
+
 def test_lists_of_odd_pixels_of_an_earlier_page_are_removed(tmp_path: Path) -> None:
     head = "row,column,value,unit,relative_to_median,kind\n"
     earlier, own = tmp_path / "odd_pixels-detection-pdp.csv", tmp_path / "odd_pixels-mine.csv"
