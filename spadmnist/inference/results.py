@@ -458,7 +458,8 @@ def notes(found: Diagnosis) -> dict[Key, str]:
         changed = step.candidate
         keys = [key for key in found.values if key[0] == changed.effect]
         if changed.kind != "add":  # another step may have changed another number of the same effect
-            keys = [key for key in keys if key[1] == changed.parameter] or keys
+            own = changed.carrier[1] if changed.carrier else changed.parameter
+            keys = [key for key in keys if key[1] == own]
         for key in keys:
             out[key] = text
     return out

@@ -307,6 +307,7 @@ class _Found:
         kept = self.journal
         if kept is not None and self.found.finished and not self.unwritten and kept.folder.parent == Path(folder):
             kept.remove()
+            self.journal = None
         return page
 
     def __repr__(self) -> str:
