@@ -138,7 +138,7 @@ def save(sensor: Sensor, out: Path, notes: Notes | None = None, earlier: set[Pat
 
 
 def _map_file(out: Path, effect: str, parameter: str, values: np.ndarray) -> tuple[str, bytes]:
-    """(the name of a map beside a sensor file, its bytes). By its content no map takes the place of another."""
+    """(the name of a map file, its bytes). The name holds a digest of the content, so that no map replaces another."""
     held = io.BytesIO()
     np.save(held, values)
     data = held.getvalue()
@@ -193,7 +193,7 @@ def write(
     window: Window | None = None,
     earlier: set[Path] | None = None,
 ) -> Path:
-    """Write a sensor file with other values, and its maps beside it; `out`.
+    """Write a sensor file with new values, and its maps into the same folder; `out`.
 
     Args:
         source: the sensor file that was diagnosed; its comments are kept.

@@ -1,4 +1,4 @@
-"""The next sensor file, its maps and what lies beside it: nothing takes the place of anything else."""
+"""The next sensor file, its maps and the files of its folder: none replaces a file of somebody else."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Origin:
         described: the file that describes the sensor: `sensor`, or the one that it names.
         measurement: the `measurement.yaml` that was read; None where the data were an object.
         seed: of the simulations.
-        maps: those that were written beside next sensor files.
+        maps: the map files that this answer has written for its sensor files.
     """
 
     sensor: Path | None = None

@@ -15,16 +15,18 @@ from ._counting import Surplus, exposure_in, span, tick_of, whole
 from ._order import in_time_order
 from ._walk import REACH
 
-# s, of pairs: crosstalk, which is no matter of the readout, is mostly nearer; the blind time of a shared converter is
-# 7 ns in LinoSPAD2 (real data)
+# s, edges of the lags of pairs. Crosstalk is mostly below the first one. The shared converter of LinoSPAD2 is blind for
+# 7 ns, between the last two.
 _LAGS = (1e-9, 3e-9, 10e-9)
-_CROWDED = 64.0  # detections of the array within the longest lag beyond which the work would grow with their square
-_LEVELS = (
-    6  # blocks of up to 2^6 = 64 pixels; a converter of LinoSPAD2 has 4, one of a column-parallel readout its column
-)
-_EXPECTED = 5.0  # long silences of all blocks of a size in steady light: enough for their law, few beside a fault
-_LEAST = 10  # detections of a block below which its rate is not known well enough
-_SHORTEST = 3.0  # mean intervals: a silence that is shorter is none
+# detections of the array within the longest lag: with more no pairs are counted, because the work grows with their
+# square (a rule of thumb)
+_CROWDED = 64.0
+_LEVELS = 6  # the largest block has 2^6 = 64 pixels; a converter of LinoSPAD2 serves 4 (a rule of thumb)
+# long silences of all blocks of one size that steady light gives: they set what is long. A full converter of LinoSPAD2
+# adds ten times as many.
+_EXPECTED = 5.0
+_LEAST = 10  # detections: a block with fewer has no silences, because its rate is not known (a rule of thumb)
+_SHORTEST = 3.0  # mean intervals: a shorter silence is never long (a rule of thumb)
 _ROW, _COLUMN = _LEVELS + 1, _LEVELS + 2  # classes of pairs behind those of the blocks
 
 
