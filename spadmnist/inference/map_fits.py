@@ -59,6 +59,7 @@ _LARGEST_SHIFT = 0.5  # of the mean of all pixels in an iteration
 _LEVEL_STEP = 2.0  # factor: the most that a light level changes in an iteration
 # probability of a child of an avalanche, at most: at 1 a cascade does not end, here it has ten avalanches in the mean
 _CASCADE_ENDS = 0.9
+_MANY = 128  # values, the median of whose distances gives their width within 10 %
 _FREE_TURNS = 2  # iterations before the prior's width is estimated, so that the maps have their shape by then
 
 
@@ -178,8 +179,7 @@ class _Fitted:
         noise = float(np.median(self.raw_variance))
         if noise < INFORMED**2:
             # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
-            width = 1.4826 * median_of(np.abs(self.raw - median_of(self.raw)))
-            self.sigma = math.sqrt(max(width**2 - noise, LEAST_WIDTH**2))
+            self.sigma = math.sqrt(max(_width_of_most(self.raw, noise) ** 2 - noise, LEAST_WIDTH**2))
         apart = self.logs - self.middle
         odd = outside_bulk(apart, self.sigma**2 + self.variance)
         if noise >= INFORMED**2:
@@ -219,6 +219,24 @@ class _Fitted:
         error = np.sqrt(np.maximum(self.variance, 0))
         own = self.group, self.logs, error, self.raw, np.sqrt(self.raw_variance), self.sigma, self.low, self.high
         return replace(PixelMap(self.candidate.carrier, self.base, *own), of_scene=of_scene)
+
+
+def _width_of_most(raw: np.ndarray, noise: float) -> float:
+    """The standard deviation of most values.
+
+    The median of their distances needs many: that of 32 rows is off by 20 %, the mean square of those that are not odd
+    by 13 %.
+
+    Args:
+        raw: (groups,) logarithms.
+        noise: the variance of their noise.
+    """
+    apart = raw - median_of(raw)
+    width = 1.4826 * median_of(np.abs(apart))
+    if raw.size >= _MANY:
+        return width
+    rest = apart[~outside_bulk(apart, np.full(raw.size, max(width**2, noise)))]
+    return float(np.std(rest, ddof=1)) if rest.size > 1 else width
 
 
 def fit_maps(

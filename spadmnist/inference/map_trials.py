@@ -38,8 +38,7 @@ _INFORMED = 50.0
 # in chi square: the least evidence for a pattern that says as much as the map (one-sided p of 8e-4 with one number)
 _LITTLE = 8.0
 _LIKE = 0.4  # cosine of two signatures: below it they are not alike
-# the least width of a map that is tried, of a logarithm, and its least mean square relative to its noise
-_LEAST_SIGMA, _LEAST_SPREAD = 2e-3, 0.05
+_LEAST_SPREAD = 0.05  # the least mean square of a map that is tried, relative to its noise
 
 
 def map_trials_of(
@@ -73,7 +72,7 @@ def map_trials_of(
         sensors, found, mapped = made
         map_ = found[group[0].carrier]  # type: ignore[index]
         spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
-        if max(map_.sigma, float(np.std(map_.estimate))) < _LEAST_SIGMA or spread < _LEAST_SPREAD:
+        if spread < _LEAST_SPREAD:
             continue
         sensors = sensors.changed({}, scan.phases)
         p = min(p_of_map(scan.replicates, evaluation, c, values, levels) for c in group)

@@ -171,17 +171,27 @@ class Scan:
         return list(kept.values())
 
     def looked_at(
-        self, evaluation: Evaluation, candidate: Candidate, tries: Sequence[Mapping[Key, Any]], only: Sequence[str] = ()
+        self,
+        evaluation: Evaluation,
+        candidate: Candidate,
+        tries: Sequence[Mapping[Key, Any]],
+        only: Sequence[str] = (),
+        few: int = _SCAN,
     ) -> list[Trial]:
         """The trials of a candidate at some values, each with its best strength.
 
         Args:
             only: the captures that are simulated; all where it is empty.
+            few: replicates of each.
         """
-        return self._looked_at(evaluation, [(candidate, dict(tried)) for tried in tries], only)
+        return self._looked_at(evaluation, [(candidate, dict(tried)) for tried in tries], only, few)
 
     def _looked_at(
-        self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]], only: Sequence[str] = ()
+        self,
+        evaluation: Evaluation,
+        tries: Sequence[tuple[Candidate, dict[Key, Any]]],
+        only: Sequence[str] = (),
+        few: int = _SCAN,
     ) -> list[Trial]:
         out = []
         still: list[Trial] = []
@@ -192,7 +202,7 @@ class Scan:
                 chips = candidate.kind == "add" and has_random_pixels(with_values(evaluation.sensors.one, tried))
                 sensors = evaluation.sensors.changed(tried, chips=chips)
                 still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
-        for one in self._simulated(evaluation, still, _SCAN, only):
+        for one in self._simulated(evaluation, still, few, only):
             one.seen = set(only or evaluation.made)
             one.size = size_of(self.replicates, evaluation, one.signature)
             one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
@@ -203,8 +213,8 @@ class Scan:
             swing: Any = None
             line = self.line_at(evaluation, candidate, tried)
             with self.if_possible(candidate, _LOOKING, wholly=False):
-                few = _SCAN if only else FEW  # a look at some captures chooses what is fitted, which simulates anew
-                swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line, few)
+                of_it = _SCAN if only else FEW  # a look at some captures chooses what is fitted, which simulates anew
+                swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line, of_it)
             if swing is None or isinstance(swing, str):
                 if swing is not None:
                     self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
@@ -377,7 +387,7 @@ class Scan:
         for one in known:
             if one.candidate.phases or not any(is_same(one, *t) for t in tries):
                 continue
-            now = replace(one)
+            now = replace(one, sharp=False)
             now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
             out.append(now)
             resembled, known_size = now.fall >= PROMISING / 4, now.size > 0
@@ -453,7 +463,7 @@ class Scan:
             if one.fall > max(9.0, least) and not known:
                 # of those with nearly the largest fall, the one simulated nearest to its best strength
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
-                alike = [t for t in same if t.fall > _NEARLY * one.fall]
+                alike = [one] if one.sharp else [t for t in same if t.fall > _NEARLY * one.fall]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
                 further += faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
@@ -461,9 +471,9 @@ class Scan:
         best = [replace(one, others=of_other_shapes(one, tried)) if one.chips else one for one in best + further]
         out: list[Trial] = []
         sizes: dict[int, float] = {}  # of the signature as it was simulated first, by the trial's id
-        kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
+        kept = [one for one in best if one.phases or one.sharp]  # these are known, at any strength
         for one in best:
-            if one.phases:
+            if one.phases or one.sharp:
                 continue
             # noise hides the shape of a faint signature: it is simulated stronger, unless it is an edge
             size = size_of(self.replicates, evaluation, one.signature)

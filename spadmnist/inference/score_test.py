@@ -86,6 +86,20 @@ def p_of_any(
     return min(1.0, 3 * min([p, *line_ps, *(q * len(maps) for q in maps)]))
 
 
+def most_significant(
+    replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial], number: int
+) -> list[Trial]:
+    """The best trial of each of the most significant candidates by score, up to some number, by p-value."""
+    found: list[tuple[float, int]] = []
+    for k, one in enumerate(tried):
+        ps = [p for p, _ in _p_values_of_group(replicates, evaluation, [one])]
+        found += [(min(ps), k)] if ps else []
+    best: dict[str, Trial] = {}
+    for _, k in sorted(found):
+        best.setdefault(tried[k].candidate.name, tried[k])
+    return list(best.values())[:number]
+
+
 def p_of_best(
     replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial], best: Trial, large: bool = True
 ) -> tuple[float, float]:
@@ -101,7 +115,9 @@ def p_of_best(
         return float(stats.norm.isf(max(best.p_value, LEAST_P) / 2)), min(1.0, best.p_value * max(others, 1))
     directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
     _, own = _p_values(replicates, evaluation, tried if directions else [best, *tried])
-    significance, found, _ = best_direction(replicates, evaluation, best)
+    # the noise of a fitted signature, at a small strength, takes nothing from a test that was sharper
+    looks = [best, *(t for t in tried if t.sharp and t.candidate.name == best.candidate.name and not large)]
+    significance, found, _ = max((best_direction(replicates, evaluation, t) for t in looks), key=lambda look: look[0])
     if found.size <= 0:
         return 0.0, 1.0
     sides = max(len(best.candidate.strengths) if _sided(best) else 1, 1)

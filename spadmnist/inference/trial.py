@@ -62,6 +62,7 @@ class Trial:
     faint: bool = False  # fitted by the signature of a stronger one
     more: tuple[Candidate, ...] = ()  # maps that only make sense together
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    sharp: bool = False  # its signature comes from more replicates, see `sharper_tests`
     seen: set[str] = field(default_factory=set)  # captures in which it was simulated
     there: Signature | None = None  # the signature at the fitted values
     others: tuple[Trial, ...] = ()  # of other shapes, where the squares do not determine the best shape

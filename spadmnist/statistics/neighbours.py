@@ -19,6 +19,8 @@ from ._walk import REACH, Near, around, lag_edges, latest, near, walk
 _CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model; of 100, one in 20 by chance
 _CROWDED = 24  # places for each stamp, up to which all places of a frame are gone through
 _SPOTS = 512  # places that are looked at together
+# s: side neighbours are taken together up to this lag: crosstalk comes within a few ns, and chance grows with the lag
+_CLOSE = 10e-9
 _BLOCK = 4096  # words that are looked at together: they stay in the cache
 _PARTS = 64  # of a frame, in which the times of first stamps are counted
 
@@ -29,7 +31,8 @@ class Neighbours(Statistic):
     Directions: horizontal, vertical, both diagonals; then 2 and 3 pitches. In a layout with positions: the nearest
     pixels, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart in either order, and for each
     direction one cell for the order of the two. Frames: the same frame, and the next one. First stamps of frames (STR):
-    both.
+    both. The nearest pixels in all directions together have cells up to 1, 3 and 10 ns, or for the same frame: of a few
+    pairs no direction by itself shows much.
     Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
     Its variance is the number by chance; for frames it is (1 - p)(1 - p') times that, with p the share of frames with a
     detection.
@@ -152,7 +155,25 @@ def _near_stamps(recording: Recording, near_by: Near) -> list[_Row]:
             until = latest(tick)
             where = f"{name}, {near_by.second[k]} later by up to {span(0, until * tick).partition(' to ')[2]}"
             rows.append((where, float(counted.later[k]), both[k] * (until - 1), both[k] * (until - 1)))
-    return rows
+    return rows + _together(near_by, counted.near, both, edges, tick)
+
+
+def _together(near_by: Near, number: np.ndarray, both: np.ndarray, edges: np.ndarray, tick: float) -> list[_Row]:
+    """Pairs of the nearest pixels in all directions, up to each of the shorter lags.
+
+    Args:
+        number: (classes, bins) pairs.
+        both: (classes,) of these by chance at each lag.
+        edges: (bins,) ticks, each `tick` s long.
+    """
+    some = list(near_by.nearest)
+    found, chance = number[some].sum(axis=0).cumsum(), both[some].sum() * _lags_in(edges).cumsum()
+    new = [b for b, edge in enumerate(edges) if edge * tick < 1.01 * _CLOSE and (b > 0 or len(some) > 1)]
+    return [
+        (f"{near_by.together}, {span(0, edges[b] * tick)}", float(found[b]), float(chance[b]), float(chance[b]))
+        for b in new
+        if some
+    ]
 
 
 # --- frames -----------------------------------------------------------------------------------------------------
@@ -169,6 +190,9 @@ def _near_frames(recording: Recording, near_by: Near) -> list[_Row]:
     rows: list[_Row] = []
     for k, name in enumerate(near_by.names):
         rows.append((f"{name}, the same frame", float(pairs[k, 0]), both[k], spread[k] * frames))
+    if len(some := list(near_by.nearest)) > 1:
+        same = float(pairs[some, 0].sum()), float(both[some].sum()), float(spread[some].sum()) * frames
+        rows.append((f"{near_by.together}, the same frame", *same))
     # the first frame has none before it, the last none behind
     most = both / frames * (frames - 1)
     later = near_by.sums(n - last, mean) + near_by.sums(mean, n - first) - most
@@ -377,7 +401,7 @@ def _near_first(recording: Recording, near_by: Near) -> list[_Row]:
         (f"{name}, {span(seconds[b], seconds[b + 1])}", float(number[k, b]), both[k] * lags, both[k] * lags)
         for k, name in enumerate(near_by.names)
         for b, lags in enumerate(_lags_in(edges))
-    ]
+    ] + _together(near_by, number, both, edges, tick)
 
 
 @jit
