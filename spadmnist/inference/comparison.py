@@ -35,6 +35,7 @@ from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .models import Model
 from .null_distribution import Judgement
 from .phases import evaluate_start
+from .repeated_cells import place, repeated
 from .replicates import REPLICATES, TOTALS, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
@@ -54,6 +55,7 @@ class Check:
         material: it is significant and exceeds the tolerance, so that it fails.
         excess: excess chi square (`deviations.excess`).
         summary, judgement: the measured summary and the model's expectation, for pictures; None for totals.
+        tests: the number of tests of which `p_value` is the smallest.
     """
 
     statistic: str
@@ -69,6 +71,7 @@ class Check:
     excess: float = 0.0
     summary: Summary | None = field(default=None, repr=False)
     judgement: Judgement | None = field(default=None, repr=False)
+    tests: int = field(default=1, repr=False)
 
 
 @dataclass(frozen=True)
@@ -222,19 +225,25 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     # capture, log of the light factor, its standard error, elasticity
     levels: list[tuple[Capture, float, float, float]] = []
     of_cells = misfits(evaluation.replicate_residuals, evaluation.residuals)
+    together = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, evaluation.residuals)
     for id, seen in replicates.seen.items():
         checks += _level_checks(replicates.start, seen.capture, seen.total, evaluation.rates[id], levels)
         for name, summary in seen.summaries.items():
             judged = evaluation.judgements.get((id, name))
             if judged is not None:
+                alike, number = together.get((id, name)), 1
+                if alike is not None and alike.p < judged.p_value:
+                    judged, number = replace(judged, p_value=alike.p, worst=alike.worst), alike.captures
                 measured, expected = float(summary.values[judged.worst]), float(judged.expected[judged.worst])
                 text, relative = summary.size(judged.worst, measured, expected)
-                misfit, where = of_cells.get((id, name), judged.misfit), summary.where(judged.worst)
+                misfit = of_cells.get((id, name), judged.misfit)
+                where = place(summary.where(judged.worst), number)
                 p = max(judged.p_value, LEAST_P)
                 beyond = excess(summary, judged.expected, judged.residuals)
-                checks.append(
-                    Check(name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged)
+                own = Check(
+                    name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged
                 )
+                checks.append(replace(own, tests=1 if alike is None else 2))
     captures = [seen.capture for seen in replicates.seen.values()]
     nuisances, common = light_of(levels, captures)
     checks += common
@@ -406,7 +415,8 @@ def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
     # the light, the totals and the statistics have a share each of the false alarms, so that a wrong power meter is
     # not lost among a hundred statistics
     kinds = [c.statistic if c.statistic in SHARES else "" for c in checks]
-    weights = [SHARES.get(kind, SHARE_OF_STATISTICS) / kinds.count(kind) for kind in kinds]
+    tests = {kind: sum(c.tests for c, its in zip(checks, kinds, strict=True) if its == kind) for kind in kinds}
+    weights = [SHARES.get(kind, SHARE_OF_STATISTICS) / tests[kind] for kind in kinds]
     order = sorted(range(len(checks)), key=lambda i: checks[i].p_value / weights[i])
     failing: set[int] = set()
     left = sum(weights)

@@ -32,6 +32,7 @@ from .light_levels import (
 )
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
+from .repeated_cells import repeated
 from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
@@ -411,12 +412,16 @@ class BlockCheck:
     Attributes:
         p: two-sided p-value, of its sum of squares or its worst cell.
         worst: that cell; z: its residual.
+        tests: the number of tests of which p is the smallest p-value.
+        captures: where p is that of several captures together, their number; 1 otherwise.
     """
 
     cell: Cell
     p: float
     worst: int
     z: float
+    tests: int = 1
+    captures: int = 1
 
 
 def block_checks(
@@ -428,6 +433,7 @@ def block_checks(
         residuals: (cells,) by block.
     """
     out = []
+    together = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, residuals)
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
@@ -435,7 +441,11 @@ def block_checks(
             ]
             continue
         p, worst = evaluation.nulls[cell].p_value(z)
-        out.append(BlockCheck(cell, p, worst, float(z[worst])))
+        alike = together.get(cell)
+        number, tests = 1, 1 if alike is None else 2
+        if alike is not None and alike.p < p:
+            p, worst, number = alike.p, alike.worst, alike.captures
+        out.append(BlockCheck(cell, p, worst, float(z[worst]), tests, number))
     out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 
@@ -449,7 +459,7 @@ def failing(checks: Sequence[BlockCheck], level: float = FALSE_ALARM) -> list[Bl
         level: probability that a right model fails any.
     """
     totals = sum(block.cell[0] == "" for block in checks)
-    others = len(checks) - totals
+    others = sum(block.tests for block in checks) - totals
     share = SHARE_OF_TOTALS if totals and others else float(bool(totals))
     weights = [share / totals if block.cell[0] == "" else (1 - share) / others for block in checks]
     out, left = [], 1.0

@@ -17,6 +17,7 @@ from .deviations import Deviation, deviations, excess
 from .evaluation import BlockCheck, Evaluation, block_checks, failing
 from .levels import LEAST_P
 from .light_levels import LEAST_ELASTICITY, Nuisance, totals_space
+from .repeated_cells import place
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
@@ -86,7 +87,8 @@ def _failed(
     text, relative = summary.size(block.worst, float(summary.values[block.worst]), float(expected[block.worst]))
     at = None if summary.axis is None or summary.shape is not None else float(summary.axis[block.worst])
     beyond = excess(summary, expected, z) if z.size else block.z**2
-    return Deviation(name, id, beyond, block.worst, summary.where(block.worst), relative, z, at), text
+    where = place(summary.where(block.worst), block.captures)
+    return Deviation(name, id, beyond, block.worst, where, relative, z, at), text
 
 
 def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:

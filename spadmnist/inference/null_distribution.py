@@ -173,15 +173,15 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-    return Null(law, middle, coefficients, inverse, spread, n, factor, _tail(z), np.mean(z**2, axis=1), reach)
+    return Null(law, middle, coefficients, inverse, spread, n, factor, tail_of(z), np.mean(z**2, axis=1), reach)
 
 
 def _terms(x: np.ndarray, terms: int) -> np.ndarray:
     return np.stack([x**k for k in range(terms)], axis=1)
 
 
-def _tail(z: np.ndarray) -> float:
-    """The factor by which the largest residuals exceed those of a normal law; at least 1."""
+def tail_of(z: np.ndarray) -> float:
+    """The factor by which the largest residuals of replicates exceed those of a normal law; at least 1."""
     magnitudes = np.sort(np.abs(z).ravel())
     beyond = 10 if magnitudes.size > 1000 else 3
     place = magnitudes[-beyond]

@@ -140,7 +140,8 @@ class Intervals(Statistic):
 class FineIntervals(Statistic):
     """Intervals between successive detections of a pixel beyond the dead time, in steps of 1 ns.
 
-    Cells: from 20 ns to 1 us beyond the dead time. Pooled over the pixels.
+    Cells: from 20 ns to 1 us beyond the dead time. Pooled over the pixels. A cell that deviates a little in every
+    capture is found by all captures together.
     Law: Poisson, for counts of intervals in one cell each.
     Shows: what returns after a fixed time and is too faint in wider bins: a reflection in a fibre or on a board, the
     period of a nearby clock.
@@ -151,6 +152,7 @@ class FineIntervals(Statistic):
     pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
+    repeats = True
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Counts."""
