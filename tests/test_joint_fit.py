@@ -91,8 +91,8 @@ def test_a_line_that_a_step_misses_is_seen_beside_the_noise_of_many_other_cells(
     own = {BLOCK: OWN, many: RNG.standard_normal((REPLICATES, 60_000))}
     before, after = (Evaluation({}, None, {}, {}, {}, {}, one, own, {}) for one in (z, missed))  # type: ignore[arg-type]
     fit = Fit((STRENGTH, SHAPE), np.zeros(2), np.eye(2), {}, slope, 0.0, {})
-    assert joint_fit._informing(fit) == [BLOCK]
-    rise, noise = joint_fit._rise(before, after, [BLOCK, many])
+    assert joint_fit.informing(fit) == [BLOCK]
+    rise, noise = joint_fit.rise_of(before, after, [BLOCK, many])
     assert 160 < rise < 3 * noise
-    rise, noise = joint_fit._rise(before, after, joint_fit._informing(fit))
+    rise, noise = joint_fit.rise_of(before, after, joint_fit.informing(fit))
     assert rise > 3 * noise

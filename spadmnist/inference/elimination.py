@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import SpadError
 from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
 from .gauss_newton import Fit, column_of, gauss_newton
-from .joint_fit import SAME, WORTH, fit_all, without_fit
+from .joint_fit import RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
@@ -155,7 +155,8 @@ def _fitted_anew(
 def _fit_from_templates(path: ModelPath) -> None:
     """Fit the steps that have shapes once more, each from its own templates; kept where the squares fall.
 
-    A shape that was fitted together with the dropped step may lie in another minimum, which no gradient leaves.
+    A shape that was fitted together with the dropped step may lie in another minimum, which no gradient leaves. Both
+    models have replicates of their own, so that a fall within their noise is none.
     """
     for step in path.steps:
         if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates or step.chips:
@@ -178,8 +179,15 @@ def _fit_from_templates(path: ModelPath) -> None:
                 fit_all(path)
         except SpadError:  # it cannot be simulated there
             best = None
-        if best is None or square(path.evaluation.residuals) > square(before[0].residuals) - _NEEDLESS:
+        if best is None or not _is_better(path, before[0]):
             path.back_to(before)
+
+
+def _is_better(path: ModelPath, before: Evaluation) -> bool:
+    """Whether the squares of the blocks that inform the fit are smaller than before, by more than their noise."""
+    blocks = informing(path.fit) if path.fit is not None else list(before.residuals)
+    rise, noise = rise_of(before, path.evaluation, blocks)
+    return -rise > max(_NEEDLESS, RISEN * noise)
 
 
 def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:

@@ -36,7 +36,7 @@ _STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rate
 _INFORMING = (
     0.99  # of the squared norm of a column of the Jacobian: the largest blocks with so much inform a coordinate
 )
-_RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
+RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
 _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
 _KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
 _LOST = 30.0  # in chi square: a rise beyond which a fitted step is not taken
@@ -195,9 +195,9 @@ def _gauss_newton(
                     evaluation = evaluate(replicates, path.values, sensors)
             except SpadError:  # there is no such model so far off
                 continue
-            risen, noise = _rise(before[2], evaluation, list(evaluation.residuals))
-            clearer = _rise(before[2], evaluation, _informing(closer))
-            if risen <= _RISEN * noise and clearer[0] <= _RISEN * clearer[1]:
+            risen, noise = rise_of(before[2], evaluation, list(evaluation.residuals))
+            clearer = rise_of(before[2], evaluation, informing(closer))
+            if risen <= RISEN * noise and clearer[0] <= RISEN * clearer[1]:
                 break
         else:  # a line or an edge: the gradient leads no further
             path.values, maps, evaluation = before
@@ -241,7 +241,7 @@ def _strengths_alone(path: ModelPath, fit: Fit, evaluation: Evaluation, here: Ma
     yield replace(fit, point=point_of(fit.coordinates, held), values={**fit.values, **held})
 
 
-def _informing(fit: Fit) -> list[Cell]:
+def informing(fit: Fit) -> list[Cell]:
     """The blocks that inform the coordinates of a fit: the others hardly change, and have noise only."""
     blocks: set[Cell] = set()
     for i in range(len(fit.coordinates)):
@@ -252,7 +252,7 @@ def _informing(fit: Fit) -> list[Cell]:
     return sorted(blocks)
 
 
-def _rise(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tuple[float, float]:
+def rise_of(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tuple[float, float]:
     """(rise of the sum of squared residuals of some blocks, its standard deviation by the noise of the replicates).
 
     Each expectation has the noise of the mean of its replicates, e, which moves the sum by 2 z e.

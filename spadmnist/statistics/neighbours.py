@@ -31,8 +31,8 @@ class Neighbours(Statistic):
     Directions: horizontal, vertical, both diagonals; then 2 and 3 pitches. In a layout with positions: the nearest
     pixels, then 2 and 3 pitches. Time stamps: up to 1, 3, 10, 30 and 100 ns apart in either order, and for each
     direction one cell for the order of the two. Frames: the same frame, and the next one. First stamps of frames (STR):
-    both. The nearest pixels in all directions together have cells up to 1, 3 and 10 ns, or for the same frame: of a few
-    pairs no direction by itself shows much.
+    both. Side neighbours in both directions together have cells up to 10 ns, or for the same frame: of a few pairs no
+    direction by itself shows much.
     Law: normal, as the score of the pairs beyond chance, given the total of each pixel. The number of pairs is Poisson.
     Its variance is the number by chance; for frames it is (1 - p)(1 - p') times that, with p the share of frames with a
     detection.
@@ -159,7 +159,7 @@ def _near_stamps(recording: Recording, near_by: Near) -> list[_Row]:
 
 
 def _together(near_by: Near, number: np.ndarray, both: np.ndarray, edges: np.ndarray, tick: float) -> list[_Row]:
-    """Pairs of the nearest pixels in all directions, up to each of the shorter lags.
+    """Pairs of the nearest pixels in all directions, by the shorter lags; none where there is one direction.
 
     Args:
         number: (classes, bins) pairs.
@@ -167,13 +167,13 @@ def _together(near_by: Near, number: np.ndarray, both: np.ndarray, edges: np.nda
         edges: (bins,) ticks, each `tick` s long.
     """
     some = list(near_by.nearest)
-    found, chance = number[some].sum(axis=0).cumsum(), both[some].sum() * _lags_in(edges).cumsum()
-    new = [b for b, edge in enumerate(edges) if edge * tick < 1.01 * _CLOSE and (b > 0 or len(some) > 1)]
-    return [
-        (f"{near_by.together}, {span(0, edges[b] * tick)}", float(found[b]), float(chance[b]), float(chance[b]))
-        for b in new
-        if some
-    ]
+    if len(some) < 2:
+        return []
+    found, chance = number[some].sum(axis=0), both[some].sum() * _lags_in(edges)
+    ends = np.concatenate([[0.0], edges * tick])
+    close = [b for b in range(edges.size) if ends[b + 1] < 1.01 * _CLOSE]
+    where = [f"{near_by.together}, {span(ends[b], ends[b + 1])}" for b in close]
+    return [(words, float(found[b]), float(chance[b]), float(chance[b])) for words, b in zip(where, close, strict=True)]
 
 
 # --- frames -----------------------------------------------------------------------------------------------------

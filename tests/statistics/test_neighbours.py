@@ -134,15 +134,12 @@ def test_stamps_of_a_small_recording(kind: str) -> None:
         by_class.setdefault(next(n for n in names if summary.where(cell).startswith(n)), []).append(cell)
     # classes come in the order of distance
     arranged = [row for name in by_class for row, n in zip(wanted, names, strict=True) if n == name]
-    # then the nearest pixels in all directions together, up to each of the lags to 10 ns
-    nearest = [name for name in by_class if "side" in name or "nearest" in name]
-    pooled = np.cumsum(np.sum([of_stamps(rows, found[name], tick, end)[:5] for name in nearest], axis=0), axis=0)
-    lags = [k for k in ((0, 2) if kind == "coarse" else (0, 1, 2)) if k > 0 or len(nearest) > 1]
-    arranged += [pooled[k] for k in lags]
-    called = "side neighbours" if len(nearest) > 1 else "nearest neighbours"
-    assert words[len(names) :] == [
-        f"{called}, 0 to {(5 if kind == 'coarse' and not k else EDGES[k + 1] * 1e9):g} ns" for k in lags
-    ]
+    # then side neighbours in both directions together, by the lags up to 10 ns
+    sides = [name for name in by_class if "side" in name]
+    lags = ([0, 2] if kind == "coarse" else [0, 1, 2]) if len(sides) > 1 else []
+    arranged += [sum(of_stamps(rows, found[name], tick, end)[k] for name in sides) for k in lags]
+    spans = ["0 to 5 ns", "5 to 10 ns"] if kind == "coarse" else ["0 to 1 ns", "1 to 3 ns", "3 to 10 ns"]
+    assert words[len(names) :] == [f"side neighbours, {span}" for span, _ in zip(spans, lags, strict=bool(lags))]
     np.testing.assert_allclose(summary.values, scored(recording, arranged), rtol=1e-9)
     if kind == "tr":
         assert summary.where(0) == "horizontal side neighbours, 0 to 1 ns"
@@ -233,9 +230,9 @@ def test_first_stamps_of_a_small_recording(kind: str) -> None:
                 both += n[a] * n[b] / 400 * density * (2 * (high - low) - (low == 0))
             assert f"{name}, {low} to {high} ns" in words
             rows.append([number, both, both])
-    together = np.cumsum(rows[:5] if kind == "hexagons" else np.add(rows[:5], rows[5:10]), axis=0)
-    rows += list(together[1 if kind == "hexagons" else 0 : 3])
-    assert words[-1] == f"{'nearest' if kind == 'hexagons' else 'side'} neighbours, 0 to 10 ns"
+    if kind != "hexagons":
+        rows += [np.add(rows[k], rows[5 + k]) for k in range(3)]
+        assert words[-3:] == [f"side neighbours, {span} ns" for span in ("0 to 1", "1 to 3", "3 to 10")]
     cells = len(words) - len(rows)
     wanted = Surplus(*np.concatenate([np.zeros((cells, 3)), rows]).T).scores(n)
     np.testing.assert_allclose(summary.values[cells:], wanted[cells:], rtol=1e-9)
@@ -287,8 +284,8 @@ def spread(seed: int, rows: int = 5, columns: int = 6, chance: float = 0.02) -> 
 def test_light_that_spreads_is_seen_and_its_direction() -> None:
     """2 % of 15,000 detections: 300 pairs of side neighbours, where chance makes 9 within 1 ns and 18 up to 3 ns."""
     found = sigmas(Neighbours, spread(1), STEADY["tr"])
-    assert found[0] > 10 and found[1] > 10 and found[5] > 10 and found[-3:].min() > 7  # of all directions together
-    assert np.abs(found[[2, 3, 4, *range(6, len(found) - 3)]]).max() < 5
+    assert found[0] > 10 and found[1] > 10 and found[5] > 10 and found[-3:-1].min() > 7  # of both directions together
+    assert np.abs(found[[2, 3, 4, *range(6, len(found) - 3), -1]]).max() < 5
     assert np.abs(sigmas(FarPairs, spread(1), STEADY["tr"])).max() < 5
     # the law knows of it
     with pytest.raises(AssertionError):
@@ -330,17 +327,18 @@ def test_stamps_in_frames_show_what_frames_cannot() -> None:
 
 
 def test_a_few_pairs_are_seen_together_where_no_direction_shows_them() -> None:
-    """Three pairs to the right and three below, two of them up to 1, 3 and 10 ns apart, where chance makes 0.5."""
+    """Two pairs to the right and two below at each of 0.5, 2 and 6 ns, where chance makes less than one in each."""
     rate, exposure = 2000.0, 0.05
     recording = tr(1, grid(6, 10), rate, exposure)
     assert recording.events is not None
     rows = [list(recording.events.row(p)) for p in range(60)]
-    for k, lag in enumerate((0.5e-9, 0.5e-9, 2e-9, 2e-9, 6e-9, 6e-9)):
-        first = 11 + 4 * k
+    for k, lag in enumerate([0.5e-9] * 4 + [2e-9] * 4 + [6e-9] * 4):
+        first = 11 + 3 * k
         rows[first + (1 if k % 2 else 10)].append(float(rows[first][0]) + lag)
     spread = tr_of([np.sort(row) for row in rows], grid(6, 10), exposure, 1e-10, 0.0)
     found = sigmas(Neighbours, spread, partial(tr, layout=grid(6, 10), rates=rate, exposure=exposure))
     words = reduced(Neighbours, recording).where
     cells = {words(k): found[k] for k in range(len(found))}
-    apart = [x for name, x in cells.items() if not name.startswith("side")]
-    assert cells["side neighbours, 0 to 10 ns"] > 4.3 and max(apart) < 3.5
+    for span in ("0 to 1 ns", "1 to 3 ns", "3 to 10 ns"):
+        apart = [cells[f"{way} side neighbours, {span}"] for way in ("horizontal", "vertical")]
+        assert cells[f"side neighbours, {span}"] > max(*apart, 3.0)
