@@ -225,7 +225,8 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     # capture, log of the light factor, its standard error, elasticity
     levels: list[tuple[Capture, float, float, float]] = []
     of_cells = misfits(evaluation.replicate_residuals, evaluation.residuals)
-    together = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, evaluation.residuals)
+    several = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, evaluation.residuals)
+    together = {check.clearest: check for check in several}
     for id, seen in replicates.seen.items():
         checks += _level_checks(replicates.start, seen.capture, seen.total, evaluation.rates[id], levels)
         for name, summary in seen.summaries.items():
@@ -240,6 +241,8 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
                 where = place(summary.where(judged.worst), number)
                 p = max(judged.p_value, LEAST_P)
                 beyond = excess(summary, judged.expected, judged.residuals)
+                if alike is not None and number > 1:
+                    beyond = max(beyond, alike.z**2)
                 own = Check(
                     name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged
                 )
@@ -419,7 +422,7 @@ def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
     weights = [SHARES.get(kind, SHARE_OF_STATISTICS) / tests[kind] for kind in kinds]
     order = sorted(range(len(checks)), key=lambda i: checks[i].p_value / weights[i])
     failing: set[int] = set()
-    left = sum(weights)
+    left = sum(weight * check.tests for weight, check in zip(weights, checks, strict=True))
     for i in order:
         if checks[i].p_value > FALSE_ALARM * weights[i] / max(left, 1e-12):
             break

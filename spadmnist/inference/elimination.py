@@ -179,13 +179,19 @@ def _fit_from_templates(path: ModelPath) -> None:
                 fit_all(path)
         except SpadError:  # it cannot be simulated there
             best = None
-        if best is None or not _is_better(path, before[0]):
+        if best is None or not _is_better(path, before[0], before[4]):
             path.back_to(before)
 
 
-def _is_better(path: ModelPath, before: Evaluation) -> bool:
-    """Whether the squares of the blocks that inform the fit are smaller than before, by more than their noise."""
-    blocks = informing(path.fit) if path.fit is not None else list(before.residuals)
+def _is_better(path: ModelPath, before: Evaluation, fit: Fit | None) -> bool:
+    """Whether the squares are smaller than before, by more than their noise, in the blocks that inform either fit.
+
+    Args:
+        before: the evaluation before.
+        fit: its fit.
+    """
+    fits = [one for one in (fit, path.fit) if one is not None]
+    blocks = sorted({cell for one in fits for cell in informing(one)}) if fits else list(before.residuals)
     rise, noise = rise_of(before, path.evaluation, blocks)
     return -rise > max(_NEEDLESS, RISEN * noise)
 

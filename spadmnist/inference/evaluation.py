@@ -32,7 +32,7 @@ from .light_levels import (
 )
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
-from .repeated_cells import repeated
+from .repeated_cells import Repeated, repeated
 from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
@@ -413,7 +413,7 @@ class BlockCheck:
         p: two-sided p-value, of its sum of squares or its worst cell.
         worst: that cell; z: its residual.
         tests: the number of tests of which p is the smallest p-value.
-        captures: where p is that of several captures together, their number; 1 otherwise.
+        alike: where p is that of several captures together, their check.
     """
 
     cell: Cell
@@ -421,7 +421,7 @@ class BlockCheck:
     worst: int
     z: float
     tests: int = 1
-    captures: int = 1
+    alike: Repeated | None = None
 
 
 def block_checks(
@@ -433,7 +433,8 @@ def block_checks(
         residuals: (cells,) by block.
     """
     out = []
-    together = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, residuals)
+    several = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, residuals)
+    together = {check.cell: check for check in several}
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
@@ -442,10 +443,10 @@ def block_checks(
             continue
         p, worst = evaluation.nulls[cell].p_value(z)
         alike = together.get(cell)
-        number, tests = 1, 1 if alike is None else 2
         if alike is not None and alike.p < p:
-            p, worst, number = alike.p, alike.worst, alike.captures
-        out.append(BlockCheck(cell, p, worst, float(z[worst]), tests, number))
+            out.append(BlockCheck(cell, alike.p, alike.worst, alike.z, 2, alike))
+        else:
+            out.append(BlockCheck(cell, p, worst, float(z[worst]), 1 if alike is None else 2))
     out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 

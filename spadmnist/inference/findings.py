@@ -81,13 +81,16 @@ def _failed(
         ids, *_ = totals_space(replicates, evaluation)
         which = ids[block.worst] if block.worst < len(ids) else None
         return Deviation("rate", which, block.z**2, 0, "all pixels", 0.0, np.zeros(0)), ""
-    seen = replicates.seen[id]
-    summary, z = seen.summaries[name], residuals.get(block.cell, np.zeros(0))
-    expected, _ = evaluation.expected(block.cell, seen.total)
+    cell = _shown(block)
+    id, seen = cell[0], replicates.seen[cell[0]]
+    summary, z = seen.summaries[name], residuals.get(cell, np.zeros(0))
+    expected, _ = evaluation.expected(cell, seen.total)
     text, relative = summary.size(block.worst, float(summary.values[block.worst]), float(expected[block.worst]))
     at = None if summary.axis is None or summary.shape is not None else float(summary.axis[block.worst])
     beyond = excess(summary, expected, z) if z.size else block.z**2
-    where = place(summary.where(block.worst), block.captures)
+    where = summary.where(block.worst)
+    if block.alike is not None:
+        where, beyond = place(where, block.alike.captures), max(beyond, block.z**2)
     return Deviation(name, id, beyond, block.worst, where, relative, z, at), text
 
 
@@ -109,7 +112,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
     for number, members in enumerate(deviations([one for one, _ in seen], passing)[:_PICTURES]):
         alike = [i for i in members if seen[i][0].statistic == seen[members[0]][0].statistic][:_CAPTURES]
         for i in alike:
-            (id, name), (one, size) = failed[i].cell, seen[i]
+            (id, name), (one, size) = _shown(failed[i]), seen[i]
             total, null = replicates.seen[id].total, last.nulls[id, name]
             now = null.expected(total)[0]
             moved = [float(np.sum(step.template.get((id, name), np.zeros(1)) ** 2)) for step in steps]

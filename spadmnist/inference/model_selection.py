@@ -9,6 +9,7 @@ is not attributed to the sensor (`setups`).
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -287,8 +288,9 @@ def _stands_out(path: ModelPath, notes: Notes, largest_p: float) -> bool:
         p = p_now()
     if largest_p < p < _NEARLY * largest_p:
         path.replicates.say("more replicates of the candidates with the best scores")
-        notes.tried = notes.tried + sharper(path.scan, path.evaluation, notes.tried)
-        p = p_now()
+        with contextlib.suppress(OutOfBudget):  # without them nothing stands out
+            notes.tried = notes.tried + sharper(path.scan, path.evaluation, notes.tried)
+            p = p_now()
     return p <= largest_p
 
 

@@ -23,13 +23,19 @@ class Repeated:
     """The check of one statistic in several captures together.
 
     Attributes:
+        cell: the block of the capture with the most detections. The check belongs to it whatever the data are, so that
+            a check that fails under two models is known as the same.
         p: two-sided p-value, of the sum of squares or the worst cell.
-        worst: that cell.
+        worst: that cell; z: its residual, of all captures.
+        clearest: the block in which it deviates most in that direction.
         captures: their number.
     """
 
+    cell: Cell
     p: float
     worst: int
+    z: float
+    clearest: Cell
     captures: int
 
 
@@ -43,8 +49,8 @@ def repeated(
     nulls: Mapping[Cell, Null],
     own: Mapping[Cell, np.ndarray],
     residuals: Mapping[Cell, np.ndarray],
-) -> dict[Cell, Repeated]:
-    """The checks of cells that repeat, each by the block in which its worst cell deviates most.
+) -> list[Repeated]:
+    """The checks of cells that repeat, one for each statistic and set of cells.
 
     Args:
         nulls: null distribution of each block.
@@ -58,7 +64,7 @@ def repeated(
         axis = replicates.seen[cell[0]].summaries[cell[1]].axis
         if axis is not None:  # cells are the same where they lie at the same places
             groups.setdefault((cell[1], axis.tobytes()), []).append(cell)
-    out = {}
+    out = []
     for cells in groups.values():
         if len(cells) < 2:
             continue
@@ -66,5 +72,8 @@ def repeated(
         z, null = (np.sum([of[cell] for cell in cells], axis=0) / root for of in (residuals, own))
         law = replace(nulls[cells[0]], own=np.mean(null**2, axis=1), tail=tail_of(null), recordings=len(null))
         p, worst = law.p_value(z)
-        out[max(cells, key=lambda cell: abs(float(residuals[cell][worst])))] = Repeated(p, worst, len(cells))
+        sign = math.copysign(1.0, float(z[worst]))
+        brightest = max(cells, key=lambda cell: replicates.seen[cell[0]].total)
+        clearest = max(cells, key=lambda cell: sign * float(residuals[cell][worst]))
+        out.append(Repeated(brightest, p, worst, float(z[worst]), clearest, len(cells)))
     return out

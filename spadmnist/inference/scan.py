@@ -463,7 +463,7 @@ class Scan:
             if one.fall > max(9.0, least) and not known:
                 # of those with nearly the largest fall, the one simulated nearest to its best strength
                 same = [t for t in tried if t.candidate.name == one.candidate.name]
-                alike = [one] if one.sharp else [t for t in same if t.fall > _NEARLY * one.fall]
+                alike = [t for t in same if t.fall > _NEARLY * one.fall]
                 best.append(min(alike, key=lambda t: abs(math.log(abs(t.times)))))
                 further += faint_of_other_shape(best[-1], same)
             if len(best) == _SECOND:
@@ -471,9 +471,9 @@ class Scan:
         best = [replace(one, others=of_other_shapes(one, tried)) if one.chips else one for one in best + further]
         out: list[Trial] = []
         sizes: dict[int, float] = {}  # of the signature as it was simulated first, by the trial's id
-        kept = [one for one in best if one.phases or one.sharp]  # these are known, at any strength
+        kept = [one for one in best if one.phases]  # all captures have shown these, at any strength
         for one in best:
-            if one.phases or one.sharp:
+            if one.phases:
                 continue
             # noise hides the shape of a faint signature: it is simulated stronger, unless it is an edge
             size = size_of(self.replicates, evaluation, one.signature)
@@ -487,7 +487,7 @@ class Scan:
                 with self.if_possible(one.candidate, _AGAIN):
                     given = start.scaled()
                     sensors = evaluation.sensors.changed(given, one.phases, one.chips)
-                    out.append(replace(start, values=given, sensors=sensors))
+                    out.append(replace(start, values=given, sensors=sensors, sharp=False))
                     sizes[id(out[-1])] = size
         # random odd pixels are a map as well, even where the map by itself would not be significant
         least = LEAST_P_WITH_ODD_PIXELS if any(one.chips for one in best) else LEAST_P_OF_MAP

@@ -115,11 +115,13 @@ def p_of_best(
         return float(stats.norm.isf(max(best.p_value, LEAST_P) / 2)), min(1.0, best.p_value * max(others, 1))
     directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
     _, own = _p_values(replicates, evaluation, tried if directions else [best, *tried])
-    # the noise of a fitted signature, at a small strength, takes nothing from a test that was sharper
-    looks = [best, *(t for t in tried if t.sharp and t.candidate.name == best.candidate.name and not large)]
-    significance, found, _ = max((best_direction(replicates, evaluation, t) for t in looks), key=lambda look: look[0])
+    significance, found, _ = best_direction(replicates, evaluation, best)
+    # the noise of a fitted signature, at a small strength, takes nothing from the p-value of a test that was sharper;
+    # the significance is that of the fitted one, as of its rivals
+    looks = [t for t in tried if t.sharp and t.candidate.name == best.candidate.name and not large]
+    sharper = min(_p_values(replicates, evaluation, looks)[0], default=1.0)
     if found.size <= 0:
-        return 0.0, 1.0
+        return 0.0, max(_trials_corrected(own, sharper), LEAST_P)
     sides = max(len(best.candidate.strengths) if _sided(best) else 1, 1)
     # no direction by itself may be significant, but all together
     together = min((p for p, _ in _p_values_of_group(replicates, evaluation, directions)), default=1.0)
@@ -127,7 +129,7 @@ def p_of_best(
     if large:  # far from the model the signature is not linear: the evidence itself, in the same units
         significance = max(significance, math.sqrt(max(best.evidence, 0.0) / max(found.spread**2, 0.5)))
     one = float(_p_of_square(significance**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
-    return significance, max(_trials_corrected(own, min(one, together)), LEAST_P)
+    return significance, max(_trials_corrected(own, min(one, together, sharper)), LEAST_P)
 
 
 def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: Trial) -> bool:

@@ -61,7 +61,8 @@ def _at_strength(scan: Scan, evaluation: Evaluation, one: Trial) -> dict[Key, An
             at = float(values[coordinate.key])
             room = room_of(coordinate, coordinate.scaled(at, sign))
             factor = min(STRONG / max(size, 1e-9), BOLDER, max(room, 1.0))
-            values[coordinate.key] = coordinate.scaled(at, sign * factor)
+            there = coordinate.scaled(at, sign * factor)
+            values[coordinate.key] = there if there != coordinate.off else at
     return values
 
 
