@@ -94,6 +94,11 @@ def _failed(
     return Deviation(name, id, beyond, block.worst, where, relative, z, at), text
 
 
+def _shown(block: BlockCheck) -> Cell:
+    """The block that shows a failing check: of several captures together, the one in which it is clearest."""
+    return block.cell if block.alike is None else block.alike.clearest
+
+
 def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:
     """The failing checks of the stated model under that model and under the last one, for figures.
 
