@@ -44,16 +44,15 @@ class Near:
     """Pairs of pixels up to 3 pitches apart, in classes.
 
     names: of the classes; second: of those with a direction, which pixel is the second one, "" for the others; pairs:
-    (class, first pixels, second pixels); steps: on a grid the same as (class, columns, rows) to go; nearest: the
-    classes of the nearest pixels; together: what these are called.
+    (class, first pixels, second pixels); steps: on a grid the same as (class, columns, rows) to go; sides: the
+    classes of side neighbours on a grid.
     """
 
     names: tuple[str, ...]
     second: tuple[str, ...]
     pairs: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     steps: np.ndarray | None
-    nearest: tuple[int, ...]
-    together: str
+    sides: tuple[int, ...]
 
     def sums(self, of_first: np.ndarray, of_second: np.ndarray) -> np.ndarray:
         """(classes,) sums over the pairs of products of what belongs to their pixels, each (pixels,)."""
@@ -68,10 +67,10 @@ class Near:
         return sum(len(first) for _, first, _ in self.pairs)
 
 
-_SIDES, _NEAREST = "side neighbours", "nearest neighbours"  # of a grid, and of a layout with positions
+SIDES = "side neighbours"  # the words for them
 _DIRECTIONS = {
-    (1, 0): (f"horizontal {_SIDES}", "the right-hand one"),
-    (0, 1): (f"vertical {_SIDES}", "the lower one"),
+    (1, 0): (f"horizontal {SIDES}", "the right-hand one"),
+    (0, 1): (f"vertical {SIDES}", "the lower one"),
     (1, 1): ("diagonal neighbours, falling", "the lower one"),
     (-1, 1): ("diagonal neighbours, rising", "the lower one"),
 }
@@ -110,16 +109,13 @@ def _near(rows: int, columns: int, places: bytes | None) -> Near:
     else:
         a = np.repeat(np.arange(rows * columns), np.diff(known.first))
         b, distance = known.step, known.distance
-        bounds = ((_NEAREST, 0.0, 1.25), ("pixels about 2 pitches apart", 1.25, 2.25))
+        bounds = (("nearest neighbours", 0.0, 1.25), ("pixels about 2 pitches apart", 1.25, 2.25))
         for name, low, high in (*bounds, ("pixels about 3 pitches apart", 2.25, np.inf)):
             some = (a < b) & (distance > low) & (distance <= high)
             if some.any():
                 pairs.append((kind(name), a[some].astype(np.int32), b[some].astype(np.int32)))
-    together = _SIDES if known.first is None else _NEAREST
-    nearest = tuple(k for k, name in enumerate(names) if name.endswith(together))
-    return Near(
-        tuple(names), tuple(second), tuple(pairs), np.array(steps, np.int64) if steps else None, nearest, together
-    )
+    sides = tuple(k for k, name in enumerate(names) if name.endswith(SIDES))
+    return Near(tuple(names), tuple(second), tuple(pairs), np.array(steps, np.int64) if steps else None, sides)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ..kernels import jit
 from . import Recording, Statistic, Summary
 from ._counting import Surplus, exposure_in, of_pairs, per_cent, span, tick_of
 from ._frames import at_ends, bits, count_ones, first_stamps, frame_sums, moments, ones_of, some_frames
-from ._walk import REACH, Near, around, lag_edges, latest, near, walk
+from ._walk import REACH, SIDES, Near, around, lag_edges, latest, near, walk
 
 _CLEAR = 3.5  # standard deviations beyond which a single cell is an error of the model; of 100, one in 20 by chance
 _CROWDED = 24  # places for each stamp, up to which all places of a frame are gone through
@@ -159,20 +159,20 @@ def _near_stamps(recording: Recording, near_by: Near) -> list[_Row]:
 
 
 def _together(near_by: Near, number: np.ndarray, both: np.ndarray, edges: np.ndarray, tick: float) -> list[_Row]:
-    """Pairs of the nearest pixels in all directions, by the shorter lags; none where there is one direction.
+    """Pairs of side neighbours in both directions, by the shorter lags; none where there is one direction.
 
     Args:
         number: (classes, bins) pairs.
         both: (classes,) of these by chance at each lag.
         edges: (bins,) ticks, each `tick` s long.
     """
-    some = list(near_by.nearest)
+    some = list(near_by.sides)
     if len(some) < 2:
         return []
     found, chance = number[some].sum(axis=0), both[some].sum() * _lags_in(edges)
     ends = np.concatenate([[0.0], edges * tick])
     close = [b for b in range(edges.size) if ends[b + 1] < 1.01 * _CLOSE]
-    where = [f"{near_by.together}, {span(ends[b], ends[b + 1])}" for b in close]
+    where = [f"{SIDES}, {span(ends[b], ends[b + 1])}" for b in close]
     return [(words, float(found[b]), float(chance[b]), float(chance[b])) for words, b in zip(where, close, strict=True)]
 
 
@@ -190,9 +190,9 @@ def _near_frames(recording: Recording, near_by: Near) -> list[_Row]:
     rows: list[_Row] = []
     for k, name in enumerate(near_by.names):
         rows.append((f"{name}, the same frame", float(pairs[k, 0]), both[k], spread[k] * frames))
-    if len(some := list(near_by.nearest)) > 1:
+    if len(some := list(near_by.sides)) > 1:
         same = float(pairs[some, 0].sum()), float(both[some].sum()), float(spread[some].sum()) * frames
-        rows.append((f"{near_by.together}, the same frame", *same))
+        rows.append((f"{SIDES}, the same frame", *same))
     # the first frame has none before it, the last none behind
     most = both / frames * (frames - 1)
     later = near_by.sums(n - last, mean) + near_by.sums(mean, n - first) - most
