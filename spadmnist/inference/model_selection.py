@@ -51,7 +51,7 @@ _QUICK = 32  # replicates of each capture in a quick diagnosis
 # with fewer replicates one of 16 right models was called crosstalk
 _P_SCORE = 4e-3
 _MAYBE = 100.0  # times that p-value: worth more replicates
-# times that p-value: worth sharper tests, which have raised a score of 3.2 to 4.8: its p-value fell by a factor of 300
+# times that p-value: worth sharper tests, which raise an expected score of 3.2 to 4.5, a p-value 100 times smaller
 _NEARLY = 50.0
 _PLAIN = 1e-6  # p-value of a check that needs no closer look
 _P_LATER_SCORE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed

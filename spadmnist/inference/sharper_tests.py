@@ -1,7 +1,8 @@
 """Sharper score tests: the most significant candidates with more replicates, and at shapes between the templates.
 
 A template of the scan comes from two replicates, at a coarse grid of shapes. Noise and a wrong shape take a part of its
-score: a lifetime 11 % off, at which the best test reaches 5.3, was seen at 3.2 by the template, and at 4.8 by this one.
+score. For a lifetime that is 11 % off, the template of the scan expects a score of 3.2, a sharper one 4.5, and that of the
+true shape from 32 replicates 5.3.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from .scan import Scan
 
 _CANDIDATES = 3  # that are simulated again; the first of them at other shapes, too
-_REPLICATES = 2 * FEW  # of each capture: with four times as many the score of the lifetime rose by 2 % more
+_REPLICATES = 2 * FEW  # of each capture: with four times as many the expected score of that lifetime is 9 % larger
 _LEFT_OUT = 0.05  # of the square of a signature: captures that hold no more of it together are not simulated
 
 
