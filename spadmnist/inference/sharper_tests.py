@@ -1,7 +1,7 @@
 """Sharper score tests: the most significant candidates with more replicates, and at shapes between the templates.
 
 A template of the scan comes from two replicates, at a coarse grid of shapes. Noise and a wrong shape take a part of its
-score. Of a lifetime that is 11 % off, a template of the scan expects a score of 3.2, a sharper one 4.5, and the true shape
+score. Of a lifetime that is 11 % off, a template of the scan expects a score of 3.2, a sharper one 4.5, the true shape
 from 32 replicates 5.3.
 """
 
