@@ -29,7 +29,7 @@ import numpy as np
 
 import spadmnist as sp
 from spadmnist.inference.models import Model
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import CaptureReplicates, Replicates
 from spadmnist.statistics import Statistic, Summary
 from spadmnist.workers import executor
 
@@ -86,7 +86,7 @@ def main():
             replicates = Replicates(model, lab, 0, workers, 2)
             wanted = (Model.same(model), "dark", np.ones(2), np.arange(2, dtype=np.uint64))
             found = replicates.simulate([wanted])  # one task: one worker is started
-        assert not any(isinstance(one, str) for one in found), found
+        assert all(isinstance(one, CaptureReplicates) for one in found), found
         answers.append([{name: values.tolist() for name, values in one.values.items()} for one in found])
     print(json.dumps(answers))
 

@@ -28,7 +28,7 @@ from spadmnist.inference.forward_step import or_as_before
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import CannotSimulate, Replicates
 from spadmnist.inference.results import Step, Value, canonical, table
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.setups import rivals
@@ -79,7 +79,7 @@ def test_a_model_that_cannot_be_simulated_is_told_by_the_bench(error: Exception,
     bad = evaluation.sensors.changed({("crosstalk", "probability"): 0.01})
     good = evaluation.sensors.changed({("dead_time", "duration"): 60e-9})
     first, second, third = signatures(replicates, evaluation, [good, bad, good])
-    assert isinstance(second, str) and second
+    assert isinstance(second, CannotSimulate) and str(second)
     assert isinstance(first, Signature) and isinstance(third, Signature)
     with pytest.raises(SpadError):
         evaluate(replicates, {}, bad)
@@ -100,7 +100,7 @@ def test_a_closed_form_that_fails_is_told_by_the_bench(error: Exception, lab, mo
     bad = evaluation.sensors.changed({("crosstalk", "probability"): 0.01})
     good = evaluation.sensors.changed({("dead_time", "duration"): 60e-9})
     first, second, third = signatures(replicates, evaluation, [good, bad, good])
-    assert isinstance(second, str) and second
+    assert isinstance(second, CannotSimulate) and str(second)
     assert isinstance(first, Signature) and isinstance(third, Signature)
     with pytest.raises(SpadError):
         signature_of_totals(replicates, evaluation, bad)

@@ -21,7 +21,7 @@ from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
 from spadmnist.inference.model_selection import _another
-from spadmnist.inference.replicates import TOTALS
+from spadmnist.inference.replicates import TOTALS, CannotSimulate
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
 from spadmnist.inference.trial import Trial
@@ -248,7 +248,7 @@ def _afterpulsing():
 
 def _with_signatures(scan: Scan, trials: list[Trial]) -> list[Trial]:
     found = signatures(scan.replicates, begin(scan.replicates).evaluation, [t.sensors for t in trials if t.sensors])
-    return [replace(t, signature=s) for t, s in zip(trials, found, strict=True) if not isinstance(s, str)]
+    return [replace(t, signature=s) for t, s in zip(trials, found, strict=True) if not isinstance(s, CannotSimulate)]
 
 
 def test_a_map_makes_no_cascade_that_does_not_end() -> None:

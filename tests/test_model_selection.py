@@ -66,7 +66,7 @@ def test_models_may_be_looked_at_in_captures_of_their_own(lab):
     mixed = signatures(replicates, evaluation, models, only_of=[["flat"], ["dark"]])
     for signature, model, id in zip(mixed, models, ("flat", "dark"), strict=True):
         (alone,) = signatures(replicates, evaluation, [model], only=[id])
-        assert not isinstance(signature, str) and not isinstance(alone, str)
+        assert isinstance(signature, Signature) and isinstance(alone, Signature)
         assert signature.shifts.keys() == alone.shifts.keys() and {cell[0] for cell in signature.shifts} == {id}
         for cell, shift in alone.shifts.items():
             np.testing.assert_array_equal(signature.shifts[cell], shift)
@@ -391,7 +391,7 @@ def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
         else:
             values = {CROSSTALK: 0.05}
         (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)])
-        assert not isinstance(signature, str) and candidate.effect
+        assert isinstance(signature, Signature) and candidate.effect
         assert low <= _share_of_counts(replicates, evaluation, signature) <= high, name
 
 

@@ -17,6 +17,7 @@ from scipy import stats
 
 from .. import twin
 from ..effects import Effect
+from ..errors import SpadError
 from ..measurement import Measurement
 from ..sensor import Sensor
 from . import count_model, map_fits, map_models, pixel_maps
@@ -45,23 +46,29 @@ def _couples(effect: Effect) -> bool:
     return effect.influence() > 0 or effect.moves_dark
 
 
-def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: Candidate) -> Diagnosis | str:
-    """The fit of the map by counts in the dark, or the name of what else informs it.
+class OtherwiseInformed(SpadError):
+    """The counts in the dark alone do not fit a map. The message says why."""
+
+
+def fit_by_counts(replicates: Replicates, measurement: Measurement, candidate: Candidate) -> Diagnosis:
+    """The fit of the map by counts in the dark.
 
     Args:
         replicates: its captures need no summaries.
         candidate: the map.
+    Raises:
+        OtherwiseInformed: where there are no such counts, or other captures inform the map as well.
     """
     assert candidate.carrier is not None
     dark = [id for id, seen in replicates.seen.items() if seen.capture.light.dark and seen.counts is not None]
     if not dark:
-        return "no dark capture with data"
+        raise OtherwiseInformed("no dark capture with data")
     levels = {id: 1.0 if id in replicates.dark else _level(replicates, id) for id in replicates.seen}
     map_ = map_fits.fit_maps(replicates, {}, [candidate], levels, dark)[candidate.carrier]
     information = map_models.information(replicates, {candidate.carrier: map_.values()}, candidate, levels)
     whole = np.maximum(np.sum(list(information.values()), axis=0), 1e-12)
     if float(np.mean(np.sum([information[id] for id in dark], axis=0) / whole)) < 1 - _LIT:
-        return "lit captures inform the map as well"
+        raise OtherwiseInformed("lit captures inform the map as well")
     return _answer(replicates, measurement, candidate, map_, dark)
 
 

@@ -14,7 +14,7 @@ from .joint_fit import RISEN, SAME, WORTH, fit_all, informing, rise_of, without_
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
-from .replicates import FEW, TOTALS, Cell
+from .replicates import FEW, TOTALS, CannotSimulate, Cell
 from .results import Step, title
 from .signature import residuals_at, signatures
 from .trial_fits import fit_trial
@@ -53,7 +53,7 @@ def drop_needless(path: ModelPath) -> None:
         if any(s.candidate.carrier for s in path.steps):
             continue  # a map would have to be fitted anew
         (signature,) = signatures(replicates, path.evaluation, [sensors], FEW)
-        if isinstance(signature, str):
+        if isinstance(signature, CannotSimulate):
             continue
         others = tuple(d for s in path.steps if s is not step for d in s.coordinates)
         z = residuals_at(replicates, path.evaluation, signature)

@@ -33,7 +33,7 @@ from .light_levels import (
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
 from .repeated_cells import Repeated, repeated
-from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, T, joined, no_size
+from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
 _PIECES = 4  # tasks of one capture: the number of workers that share it
@@ -201,7 +201,7 @@ def _evaluate(
     results = dict(zip((id for _, id, _, _ in wanted), replicates.simulate(wanted, pieces=_PIECES), strict=True))
     for id, (centre, stated, expected, factors) in about.items():
         more = results.get(id)
-        if isinstance(more, str):
+        if isinstance(more, CannotSimulate):
             raise SpadError(f"{id}: {more}")
         made = before[id] if more is None else joined([before[id], more]) if id in before else more
         if id in entries and more is not None:
@@ -280,7 +280,7 @@ def _centres(replicates: Replicates, sensors: Model, without: Collection[str] = 
     many = np.arange(_BLINKING, dtype=np.uint64)
     asked = [(sensors, id, np.full(_BLINKING, out[id][1]), many) for id in own if out[id][0] != out[id][1]]
     for (_, id, _, _), made in zip(asked, replicates.simulate(asked) if asked else [], strict=True):
-        if not isinstance(made, str):
+        if not isinstance(made, CannotSimulate):
             logs = np.log(np.maximum(made.totals, 0.5))
             reach = _SCATTERS * float(np.std(logs, ddof=1)) * math.sqrt(1 + 1 / _BLINKING)
             if abs(math.log(max(replicates.seen[id].total, 0.5)) - float(logs.mean())) < reach:
@@ -292,7 +292,7 @@ def _centres(replicates: Replicates, sensors: Model, without: Collection[str] = 
         pilots = replicates.simulate([(sensors, id, np.full(FEW, at[id]), numbers) for id in at]) if at else []
         for id, made in zip(list(at), pilots, strict=True):
             level = at.pop(id)
-            if isinstance(made, str):
+            if isinstance(made, CannotSimulate):
                 continue  # the replicates themselves will say so
             start, stated, expected, half = closed[id]
             logs = np.log(np.maximum(made.totals, 0.5))

@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import plugins, twin
 from ..effects import Effect
+from ..errors import SpadError
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
@@ -192,15 +193,21 @@ class Likelihood:
         return total
 
 
-def recordings(measurement: Measurement, sensor: Sensor, seen: Mapping[str, float]) -> list[Recording] | str:
-    """The recordings of some captures for `maximise`; the name of what stands in its way where they are too large.
+class NoLikelihood(SpadError):
+    """There is no exact likelihood of a model for these data. The message names what stands in its way."""
+
+
+def recordings(measurement: Measurement, sensor: Sensor, seen: Mapping[str, float]) -> list[Recording]:
+    """The recordings of some captures for `maximise`.
 
     Args:
         seen: detections, by capture.
+    Raises:
+        NoLikelihood: where they are too large to be held at once.
     """
     stamps = sum(seen[c.id] for c in measurement.captures if c.id in seen and c.modality == "tr")
     if 4 * stamps > _HELD:
-        return f"{stamps:.3g} time stamps, which are more than the {_HELD / 4:.0e} that are held at once"
+        raise NoLikelihood(f"{stamps:.3g} time stamps, which are more than the {_HELD / 4:.0e} that are held at once")
     return [measurement.recording(id, sensor) for id in seen]
 
 
@@ -220,8 +227,8 @@ def maximise(
     start: Mapping[Key, float] | None = None,
     errors: Mapping[Key, float] | None = None,
     mapped: bool = False,
-) -> MaximumLikelihood | str:
-    """The maximum-likelihood fit of some changes to recordings, or the name of what stands in its way.
+) -> MaximumLikelihood:
+    """The maximum-likelihood fit of some changes to recordings.
 
     Args:
         sensor: the model.
@@ -232,15 +239,17 @@ def maximise(
         mapped: pixels have rates of their own that are not exactly known; then no coordinate that changes a rate is
             fitted.
     Returns:
-        The estimates, or what stands in the way: the time stamps, too, where more of them are close to each other than
-        are held at once. A coordinate that the likelihood does not depend on has its search range as interval.
+        The estimates. A coordinate that the likelihood does not depend on has its search range as interval.
+    Raises:
+        NoLikelihood: of an effect that is not in the likelihood; of a map, a phase or a switch; and where more time
+            stamps are close to each other than are held at once.
     """
     coordinates = tuple(d for candidate in candidates for d in candidate.coordinates)
     fixed = {key: value for candidate in candidates for key, value in candidate.fixed}
     if not coordinates or any(
         candidate.carrier or candidate.phases or not candidate.coordinates for candidate in candidates
     ):
-        return "a map, a phase or a switch"
+        raise NoLikelihood("a map, a phase or a switch")
     values = {**fixed}
     for candidate in candidates:
         for key, value in templates(candidate)[0].items():
@@ -253,11 +262,12 @@ def maximise(
     for one in data:
         for model in (changed, elsewhere):
             if word := not_in_likelihood(model, one.capture):
-                return word
+                raise NoLikelihood(word)
     try:
         return _maximum(Likelihood(sensor, data, coordinates, fixed), data, candidates, values, start, errors, mapped)
     except TooManyGaps:
-        return f"{sum(len(r.events) for r in data if r.events is not None):.3g} time stamps so close to each other"
+        close = sum(len(r.events) for r in data if r.events is not None)
+        raise NoLikelihood(f"{close:.3g} time stamps so close to each other") from None
 
 
 def _maximum(
@@ -268,7 +278,7 @@ def _maximum(
     start: Mapping[Key, float] | None,
     errors: Mapping[Key, float] | None,
     mapped: bool,
-) -> MaximumLikelihood | str:
+) -> MaximumLikelihood:
     """As `maximise`.
 
     Args:
@@ -284,7 +294,7 @@ def _maximum(
 
     function.begin(placed({**given, **(start or {})}))
     if mapped and not function.own:
-        return "maps together with parameters that change the rates"
+        raise NoLikelihood("maps together with parameters that change the rates")
     top = None
     if start is not None:
         u, scales = placed({**given, **start}), {**widths, **(errors or {})}

@@ -19,7 +19,7 @@ from .evaluation import Evaluation, evaluate, square
 from .light_levels import closed_form, level_error
 from .models import InTheDark, Model
 from .reduction import ReducedCapture
-from .replicates import FEW, Replicates, simulated
+from .replicates import FEW, CannotSimulate, Replicates, simulated
 from .results import NONLINEARITY, Step, plain
 from .scan import Scan
 from .setups import SetupExplanation
@@ -129,7 +129,7 @@ def _apart(replicates: Replicates, known: Evaluation, other: Model, capture: Cap
     new.seen = {capture.id: ReducedCapture.of(made)}
     evaluation = evaluate(new, {}, first, _RECORDINGS)
     (signature,) = signatures(new, evaluation, [second], FEW, hasty=False, kept="sure")
-    if isinstance(signature, str):
+    if isinstance(signature, CannotSimulate):
         return 0.0
     return math.sqrt(sum(float(t @ t) for t in template_of(new, evaluation, signature).values()))
 

@@ -13,7 +13,7 @@ from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
 from .levels import FALL_95
 from .models import Model
-from .replicates import FEW, Cell, Replicates
+from .replicates import FEW, CannotSimulate, Cell, Replicates
 from .signature import residuals_at, signatures
 
 _ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian
@@ -72,8 +72,8 @@ def gauss_newton(
     only: Collection[str] = (),
     names: Collection[str] = (),
     thorough: bool = False,
-) -> Fit | str:
-    """A Gauss-Newton fit to the residuals of all cells, damped; a reason where the model cannot be simulated.
+) -> Fit:
+    """A Gauss-Newton fit to the residuals of all cells, damped.
 
     Every point is simulated.
 
@@ -88,6 +88,8 @@ def gauss_newton(
         only, names: the captures that are simulated, and the statistics that are reduced, all where they are empty;
             all other cells are taken as constant.
         thorough: it goes on where the promised fall may be that of noise.
+    Raises:
+        CannotSimulate: where the model cannot be simulated on the way.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
@@ -96,12 +98,13 @@ def gauss_newton(
     def at(u: np.ndarray) -> dict[Key, Any]:
         return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}}
 
-    def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | str]:
+    def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | CannotSimulate]:
         models = [sensors_of(boosted(at(u))) for u in points]
         found = signatures(replicates, evaluation, models, few, only, names_of=[names] * len(points))
         times = stronger[0] ** -stronger[1]
         return [
-            m if isinstance(m, str) else stacked(residuals_at(replicates, evaluation, m, times), keys) for m in found
+            m if isinstance(m, CannotSimulate) else stacked(residuals_at(replicates, evaluation, m, times), keys)
+            for m in found
         ]
 
     def boosted(values: dict[Key, Any]) -> dict[Key, Any]:
@@ -124,9 +127,9 @@ def gauss_newton(
         # promised
         anew = turn == 0 or bool(np.any(np.abs(u - there) > reach))
         found = evaluate([u, *(_points_aside(coordinates, u, steps, seen) if anew else [])])
-        if isinstance(found[0], str):
-            return found[0]
         z = found[0]
+        if isinstance(z, CannotSimulate):
+            raise z
         cost = float(z @ z)
         if best is not None and not anew and best[0] - cost < 0.3 * promised:
             if promised < _WORTH_ANEW + noise:
@@ -198,7 +201,7 @@ def _points_aside(
 
 
 def _differences(
-    found: Sequence[np.ndarray | str],
+    found: Sequence[np.ndarray | CannotSimulate],
     places: Sequence[np.ndarray],
     cells: int,
     which: Sequence[int] | np.ndarray | None = None,
@@ -206,7 +209,7 @@ def _differences(
     """The Jacobian of the residuals by central differences, (cells, coordinates); 0 without a simulation.
 
     Args:
-        found: residuals (cells,) at the points of `_points_aside`, or a reason.
+        found: residuals (cells,) at the points of `_points_aside`.
         places: those points.
         which: the indices of the coordinates.
     """
@@ -215,7 +218,7 @@ def _differences(
         up, down = found[2 * i], found[2 * i + 1]
         k = i if which is None else which[i]
         apart = places[2 * i][k] - places[2 * i + 1][k]
-        if not isinstance(up, str) and not isinstance(down, str) and apart > 0:
+        if not isinstance(up, CannotSimulate) and not isinstance(down, CannotSimulate) and apart > 0:
             out[:, i] = (up - down) / apart
     return out
 
@@ -231,8 +234,8 @@ def gauss_newton_step(
     known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
     before: Fit | None = None,
     only: Callable[[Key], Collection[str]] = lambda key: (),
-) -> Fit | str:
-    """One Gauss-Newton step from an evaluation, with its full number of replicates; a reason where there is none.
+) -> Fit:
+    """One Gauss-Newton step from an evaluation, with its full number of replicates.
 
     Only the Jacobian is from a few more replicates.
 
@@ -247,12 +250,13 @@ def gauss_newton_step(
         before: a fit from an evaluation near by, whose Jacobian still holds.
         only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
             the others.
+    Raises:
+        CannotSimulate: where a model for the Jacobian cannot be simulated.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
     z, u = stacked(evaluation.residuals, keys), point_of(coordinates, values)
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
-    jacobian: np.ndarray | str
     if before is not None and before.coordinates == coordinates:
         jacobian = np.stack([stacked(column_of(before, i, evaluation), keys) for i in range(len(coordinates))], axis=1)
     else:
@@ -260,8 +264,6 @@ def gauss_newton_step(
         # the size of a known column is compared with all of it
         where = [() if d.key in (known or {}) else only(d.key) for d in coordinates]
         jacobian = _jacobian(*given, errors or {}, known or {}, where)
-    if isinstance(jacobian, str):
-        return jacobian
     covariance = covariance_of(jacobian, own)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10) @ (jacobian.T @ z)
@@ -292,8 +294,8 @@ def _jacobian(
     errors: Mapping[Key, float],
     known: Mapping[Key, Mapping[Cell, np.ndarray]],
     only: Sequence[Collection[str]],
-) -> np.ndarray | str:
-    """The Jacobian of the residuals at an evaluation, (cells, coordinates), or a reason.
+) -> np.ndarray:
+    """The Jacobian of the residuals at an evaluation, (cells, coordinates).
 
     Args:
         u: (coordinates,) the point of the evaluation; the others as in `gauss_newton_step`.
@@ -309,7 +311,7 @@ def _jacobian(
         h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_KNOWN_ASIDE) * (h[i] / _ASIDE)
     points = _points_aside(coordinates, u, h)
     values_there = [{d.key: d.value(float(x)) for d, x in zip(coordinates, p, strict=True)} for p in points]
-    ends: list[np.ndarray | str] = [np.zeros(0)] * len(points)
+    ends: list[np.ndarray | CannotSimulate] = [np.zeros(0)] * len(points)
     for bare in (False, True):
         some = [k for k in range(len(points)) if (k // 2 in columns) == bare]
         made = signatures(
@@ -321,8 +323,8 @@ def _jacobian(
             only_of=[only[k // 2] for k in some],
         )
         for k, m in zip(some, made, strict=True):
-            if isinstance(m, str):
-                return m
+            if isinstance(m, CannotSimulate):
+                raise m
             ends[k] = stacked(residuals_at(replicates, evaluation, m), keys)
     jacobian = _differences(ends, points, cells)
     for i, slope in columns.items():
@@ -375,7 +377,9 @@ def profile_intervals(
     def squares(models: Sequence[Model]) -> np.ndarray:
         keys, found = list(evaluation.residuals), signatures(replicates, evaluation, models, few)
         z = [
-            np.full(1, math.nan) if isinstance(m, str) else stacked(residuals_at(replicates, evaluation, m), keys)
+            np.full(1, math.nan)
+            if isinstance(m, CannotSimulate)
+            else stacked(residuals_at(replicates, evaluation, m), keys)
             for m in found
         ]
         return np.array([float(one @ one) for one in z])

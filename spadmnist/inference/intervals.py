@@ -10,12 +10,12 @@ from ..measurement import Measurement
 from .candidates import with_values
 from .coordinates import Coordinate, Key
 from .evaluation import evaluate, square
-from .exact_likelihood import maximise, not_in_likelihood, recordings
+from .exact_likelihood import NoLikelihood, maximise, not_in_likelihood, recordings
 from .gauss_newton import error_scale
 from .joint_fit import fit_all, model_of
 from .model_path import ModelPath, keys_of
 from .pixel_maps import HALF_95
-from .replicates import FEW
+from .replicates import FEW, CannotSimulate
 from .results import Value
 from .signature import IGNORED, captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED
@@ -37,9 +37,6 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
     if any(not_in_likelihood(path.evaluation.sensors.one, capture) for capture in captures):
         return
     replicates.say("the likelihood of the data")
-    data = recordings(measurement, replicates.start, {id: seen.total for id, seen in replicates.seen.items()})
-    if isinstance(data, str):
-        return
     own = {key for candidate in wanted for key in keys_of(candidate, path)}
     sensor = with_values(replicates.start, {key: x for key, x in path.values.items() if key not in own})
     start = {d.key: float(path.values[d.key]) for d in coordinates}
@@ -50,10 +47,12 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
             assert v.low is not None and v.high is not None
             errors[coordinate.key] = abs(coordinate.coordinate(v.high) - coordinate.coordinate(v.low)) / (2 * HALF_95)
     mapped = any(step.candidate.carrier for step in path.steps)
-    found = maximise(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
-    del data  # the replicates need the memory
-    if isinstance(found, str):
+    try:
+        data = recordings(measurement, replicates.start, {id: seen.total for id, seen in replicates.seen.items()})
+        found = maximise(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
+    except NoLikelihood:
         return
+    del data  # the replicates need the memory
     largest_move, failed = 0.0, {block.cell for block in path.failed}
     before = dict(path.values), path.evaluation, [dict(step.values) for step in path.steps]
     for step in path.steps:
@@ -159,7 +158,9 @@ def open_ends(path: ModelPath) -> None:
     for (step, coordinate, end), signature in zip(
         tests, signatures(replicates, evaluation, models, 2 * FEW, only_of=some), strict=True
     ):
-        if not isinstance(signature, str) and square(residuals_at(replicates, evaluation, signature)) < now + EXCLUDED:
+        if isinstance(signature, CannotSimulate):
+            continue
+        if square(residuals_at(replicates, evaluation, signature)) < now + EXCLUDED:
             v = step.values[coordinate.parameter]
             assert v.low is not None and v.high is not None
             step.values[coordinate.parameter] = replace(v, low=min(v.low, end), high=max(v.high, end))

@@ -18,7 +18,7 @@ from .evaluation import Evaluation, evaluate, square, stacked
 from .gauss_newton import Fit, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
-from .replicates import FEW, TOTALS, Cell, Replicates
+from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .results import Step, Value
 from .signature import IGNORED, captures_showing, residuals_at, signatures
 
@@ -157,20 +157,21 @@ def _gauss_newton(
     while turn < _AGAIN:
         turn += 1
         here = {d.key: path.values[d.key] for d in coordinates}
-        closer = gauss_newton_step(
-            replicates,
-            evaluation,
-            coordinates,
-            here,
-            functools.partial(path.model_at, evaluation),
-            _recordings(evaluation),
-            errors,
-            known,
-            near,
-            functools.partial(_shown, path) if where_shown else lambda key: (),
-        )
-        if isinstance(closer, str):
-            path.no_fit_because = closer
+        try:
+            closer = gauss_newton_step(
+                replicates,
+                evaluation,
+                coordinates,
+                here,
+                functools.partial(path.model_at, evaluation),
+                _recordings(evaluation),
+                errors,
+                known,
+                near,
+                functools.partial(_shown, path) if where_shown else lambda key: (),
+            )
+        except CannotSimulate as error:
+            path.no_fit_because = str(error)
             path.approximate = path.approximate or borrowed_columns
             if rejected is not None:
                 fit, path.approximate = rejected, True
@@ -281,7 +282,7 @@ def _bounded(path: ModelPath, fit: Fit) -> Fit:
     there = {d.key: d.value(float(x)) for d, x in zip(coordinates, fit.point, strict=True)}
     (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], _recordings(evaluation))
     now = square(evaluation.residuals)
-    if isinstance(signature, str) or square(residuals_at(replicates, evaluation, signature)) > now + _LOST:
+    if isinstance(signature, CannotSimulate) or square(residuals_at(replicates, evaluation, signature)) > now + _LOST:
         return replace(fit, point=point_of(coordinates, path.values), residuals=evaluation.residuals)
     return fit
 

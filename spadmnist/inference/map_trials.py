@@ -20,7 +20,7 @@ from .evidence import evidence_of
 from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
-from .replicates import Replicates
+from .replicates import CannotSimulate, Replicates
 from .score_test import PIXELS, p_of_map, sigmas_of
 from .signature import Signature, residuals_at, signatures, template_of
 from .trial import Trial, is_pattern, of_scene, tie
@@ -201,14 +201,14 @@ def random_map_trials(
         (wide,) = signatures(
             scan.replicates, evaluation, [_with_random_map(evaluation.sensors, candidate, _SIGMAS[-2])]
         )
-        if isinstance(wide, str) or _cosine(scan, evaluation, wide, like.signature) < _LIKE:
+        if isinstance(wide, CannotSimulate) or _cosine(scan, evaluation, wide, like.signature) < _LIKE:
             continue
         for _ in range(3):  # ever closer to the best width
             models = [_with_random_map(evaluation.sensors, candidate, float(sigma)) for sigma in sigmas]
             for sigma, sensors, signature in zip(
                 sigmas, models, signatures(scan.replicates, evaluation, models), strict=True
             ):
-                if isinstance(signature, str):
+                if isinstance(signature, CannotSimulate):
                     continue
                 residuals = residuals_at(scan.replicates, evaluation, signature)
                 fall = square(evaluation.residuals) - square(residuals)

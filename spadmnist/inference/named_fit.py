@@ -22,7 +22,7 @@ from .candidates import Candidate, candidates
 from .comparison import comparison_with
 from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
-from .exact_likelihood import MaximumLikelihood, maximise, recordings
+from .exact_likelihood import MaximumLikelihood, NoLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import Fit, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
@@ -78,23 +78,22 @@ def fit_named(
         workers.greet(golden.answer, None)
         if counts_in_the_dark.may_fit(sensor.resolved(), wanted):
             replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
-            answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
-            if not isinstance(answer, str):
+            try:
+                answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
                 say("by the counts in the dark alone; compare checks the new model in all other statistics")
                 return answer
-            say(f"not by the counts of dark captures alone: {answer}")
+            except counts_in_the_dark.OtherwiseInformed as error:
+                say(f"not by the counts of dark captures alone: {error}")
         replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)
         path = begin(replicates)
         start, wrong = path.evaluation, bool(path.failed)
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))
-        exact: MaximumLikelihood | str = "a mean alone"
-        if all(capture.mean is None for capture in measurement.captures):
-            totals = {id: seen.total for id, seen in replicates.seen.items()}
-            data = recordings(measurement, replicates.start, totals)
-            exact = data if isinstance(data, str) else maximise(replicates.start, data, wanted)
-            del data  # the replicates need the memory
-        if isinstance(exact, str):
-            say(f"by simulation, for there is no likelihood of {exact}")
+        exact: MaximumLikelihood | None = None
+        try:
+            exact = _maximum_likelihood(measurement, replicates, wanted)
+        except NoLikelihood as error:  # it holds the recordings, whose memory the replicates need
+            say(f"by simulation, for there is no likelihood of {error}")
+        if exact is None:
             _by_simulation(path, wanted)
         else:
             _by_likelihood(path, wanted, exact)
@@ -128,7 +127,17 @@ def fit_named(
         )
 
 
-def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[str], np.ndarray]:
+def _maximum_likelihood(
+    measurement: Measurement, replicates: Replicates, wanted: Sequence[Candidate]
+) -> MaximumLikelihood:
+    """The maximum-likelihood fit of the wanted changes to all captures; raises NoLikelihood where there is none."""
+    if any(capture.mean is not None for capture in measurement.captures):
+        raise NoLikelihood("a mean alone")
+    totals = {id: seen.total for id, seen in replicates.seen.items()}
+    return maximise(replicates.start, recordings(measurement, replicates.start, totals), wanted)
+
+
+def _covariance(path: ModelPath, exact: MaximumLikelihood | None) -> tuple[list[str], np.ndarray]:
     """(names "effect.parameter" of the fitted parameters, their covariance in SI).
 
     Its diagonal is that of the 95 % intervals, taken as symmetric. The correlations are those of the likelihood, or
@@ -136,7 +145,7 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | str) -> tuple[list[s
     """
     free: tuple[Key, ...] = ()
     correlations = np.zeros((0, 0))
-    if not isinstance(exact, str):
+    if exact is not None:
         free, correlations = exact.free, exact.correlations
     elif path.fit is not None:
         free, matrix = tuple(coordinate.key for coordinate in path.fit.coordinates), path.fit.covariance

@@ -14,7 +14,7 @@ from .coordinates import Key
 from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
 from .models import phase_parameters
-from .replicates import FEW, TOTALS, Cell, Replicates
+from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .signature import Signature, residuals_at, residuals_shifted, signatures
 from .spectral_lines import Line
 
@@ -105,21 +105,25 @@ class PeriodicSignature:
 
 def simulate_phases(
     replicates: Replicates, evaluation: Evaluation, keys: Sequence[Key], values: Mapping[Key, Any], few: int
-) -> PeriodicSignature | str:
-    """The signature of a periodic effect at any phase, or the reason why it cannot be simulated.
+) -> PeriodicSignature:
+    """The signature of a periodic effect at any phase.
 
     Args:
         keys: the parameters that are phases.
         values: the other parameters, SI.
         few: replicates of each capture.
+    Raises:
+        CannotSimulate: where it cannot be simulated at one of the phases.
     """
     turns = [2 * math.pi * k / _TURNS for k in range(_TURNS)]
     pairs = [(id, key) for id in replicates.seen for key in keys]
     models = [evaluation.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
     found = signatures(replicates, evaluation, models, few, _lit(replicates))
-    made = [m for m in found if not isinstance(m, str)]
-    if len(made) < len(found):
-        return next(m for m in found if isinstance(m, str))
+    made: list[Signature] = []
+    for one in found:
+        if isinstance(one, CannotSimulate):
+            raise one
+        made.append(one)
     return PeriodicSignature.of(made, turns)
 
 
@@ -138,8 +142,8 @@ class PeriodicSignatures:
         values: Mapping[Key, Any],
         line: Line | None,
         few: int = FEW,
-    ) -> PeriodicSignature | str:
-        """The signature of a candidate at any phase, or the reason why it cannot be simulated.
+    ) -> PeriodicSignature:
+        """The signature of a candidate at any phase.
 
         That under an earlier model is used again, also of a frequency that no data distinguish from that of the line:
         it chooses what is fitted, and the fit simulates it anew.
@@ -147,6 +151,8 @@ class PeriodicSignatures:
         Args:
             values: SI; line: that of the data at its frequency.
             few: replicates of each capture, at least.
+        Raises:
+            CannotSimulate: as `simulate_phases`.
         """
         within = {d.key: line.error if line and d.kind == "frequency" else 0.0 for d in candidate.shapes}
         for name, known, number, found in self._known:
@@ -155,8 +161,7 @@ class PeriodicSignatures:
             ):
                 return found
         made = simulate_phases(replicates, evaluation, candidate.phases, values, few)
-        if not isinstance(made, str):
-            self._known.append((candidate.name, dict(values), few, made))
+        self._known.append((candidate.name, dict(values), few, made))
         return made
 
 
@@ -181,7 +186,7 @@ def choose_phase(
     left = []
     models = [evaluation.sensors.changed(values, some) for some in pairs]
     for signature in signatures(replicates, evaluation, models, _MANY, _lit(replicates)):
-        if isinstance(signature, str):
+        if isinstance(signature, CannotSimulate):
             return dict(phases)
         squares = dict.fromkeys(phases, 0.0)
         for (id, _), z in residuals_at(replicates, evaluation, signature).items():
@@ -246,8 +251,11 @@ def evaluate_start(replicates: Replicates) -> tuple[Evaluation, dict[tuple[str, 
     """(evaluation of the stated sensor, fitted phases of its periodic effects by (capture, parameter))."""
     evaluation = evaluate(replicates, {}, remember=True)
     keys = phase_parameters(replicates.start)
-    swing = simulate_phases(replicates, evaluation, keys, {}, FEW) if keys else ""
-    if isinstance(swing, str):
+    if not keys:
+        return evaluation, {}
+    try:
+        swing = simulate_phases(replicates, evaluation, keys, {}, FEW)
+    except CannotSimulate:
         return evaluation, {}
     *_, found = swing.best_fit(replicates, evaluation, [1.0])
     mirrored = {id: swing.mirror_phase(id, p, 1.0) for id, p in found.items()}

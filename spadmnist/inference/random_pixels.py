@@ -26,7 +26,7 @@ from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
 from .gauss_newton import Fit, gauss_newton_step
 from .models import Model
-from .replicates import FEW, Replicates
+from .replicates import FEW, CannotSimulate, Replicates
 from .signature import IGNORED, captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 
@@ -80,8 +80,6 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     for _ in range(_TURNS):
         try:
             found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW, only=lambda key: some)
-            if isinstance(found, str):
-                break
             at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)
             if best is None or ratio(there) > best[0]:
                 best, vain = (ratio(there), there, at), 0
@@ -100,8 +98,8 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
         return one
     _, there, fit = best
     (signature,) = signatures(replicates, evaluation, [there.sensors], only=some)
-    if isinstance(signature, str):
-        raise SpadError(signature)
+    if isinstance(signature, CannotSimulate):
+        raise signature
     residuals = residuals_at(replicates, evaluation, signature)
     one.evaluation, one.sensors, one.fit = there, there.sensors, replace(fit, square=square(there.residuals))
     one.values, one.times = dict(fit.values), 1.0

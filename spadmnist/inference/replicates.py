@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from .. import twin
-from ..errors import UNABLE, EffectError, why
+from ..errors import UNABLE, SpadError, why
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
@@ -43,13 +43,16 @@ _SIMULATING = 0.4
 _SCALES = 8  # replicates whose scales are averaged, however many there are
 
 
-class Fault(str):
-    """The reason why a model cannot be simulated, where an effect's own code has failed."""
+class CannotSimulate(SpadError):
+    """A model that cannot be simulated. Among the results of several models it stands in the place of that of its own.
 
+    The message is the reason.
+    """
 
-def why_not(error: BaseException) -> str:
-    """The reason why a model cannot be simulated, as text; a `Fault` where an effect's own code has failed."""
-    return (Fault if isinstance(error, EffectError) else str)(why(error))
+    @classmethod
+    def because(cls, error: BaseException) -> CannotSimulate:
+        """The error that says why a model cannot be simulated, of any error that was raised."""
+        return error if isinstance(error, cls) else cls(why(error))
 
 
 @dataclass
@@ -99,8 +102,8 @@ class _Task:
     second: bool | None
 
 
-def _simulate(task: _Task) -> CaptureReplicates | str:
-    """The replicates of one capture, reduced, in a worker; a reason where there are none."""
+def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
+    """The replicates of one capture, reduced, in a worker."""
     capture, photons, numbers = task.capture, task.photons, task.numbers
     totals: list[int] = []
     found: dict[str, list[Summary]] = {}
@@ -131,7 +134,7 @@ def _simulate(task: _Task) -> CaptureReplicates | str:
                 take(recording)
                 del recording  # before the next one is made
     except UNABLE as error:
-        return why_not(error)
+        return CannotSimulate.because(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
     return CaptureReplicates(
         numbers,
@@ -279,8 +282,8 @@ class Replicates:
         pieces: int = 1,
         hasty: bool = False,
         names: Sequence[Collection[str]] | None = None,
-    ) -> list[CaptureReplicates | str]:
-        """The replicates of each (model, capture, photons, numbers), in their order; a reason where there are none.
+    ) -> list[CaptureReplicates | CannotSimulate]:
+        """The replicates of each (model, capture, photons, numbers), in their order.
 
         Args:
             wanted: photons in photons/s on a pixel, (replicates,); numbers (replicates,).
@@ -291,7 +294,7 @@ class Replicates:
             OutOfBudget: where the budget does not allow them.
         """
         tasks: list[list[_Task]] = []
-        out: list[CaptureReplicates | str] = [""] * len(wanted)
+        out: list[CaptureReplicates | CannotSimulate] = [CannotSimulate()] * len(wanted)
         some_of = names or [()] * len(wanted)
         entries = [self._name(one, pieces, hasty, some) for one, some in zip(wanted, some_of, strict=True)]
         most, work = 0.0, [0.0] * len(wanted)  # bytes of a replicate; s of two idle cores
@@ -310,7 +313,7 @@ class Replicates:
                     rest = self.seed, self.dead, hasty, some_of[k], second
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
-                tasks[k], out[k] = [], why_not(error)
+                tasks[k], out[k] = [], CannotSimulate.because(error)
         self.budget.spend(sum(work))
         self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
         for k, some in enumerate(tasks):
@@ -320,10 +323,10 @@ class Replicates:
         owners = [k for k, some in enumerate(tasks) for _ in some]
         given = {f"replicates of {wanted[k][1]} ({n + 1} of {len(owners)})": n for n, k in enumerate(owners)}
         every = [task for some in tasks for task in some]
-        simulated: dict[int, dict[int, CaptureReplicates | str]] = {k: {} for k in owners}
+        simulated: dict[int, dict[int, CaptureReplicates | CannotSimulate]] = {k: {} for k in owners}
         count = 0
 
-        def done(key: str, one: CaptureReplicates | str) -> None:
+        def done(key: str, one: CaptureReplicates | CannotSimulate) -> None:
             nonlocal count
             n, count = given[key], count + 1
             k = owners[n]
@@ -359,9 +362,9 @@ def _share_of_work(capture: Capture, names: Collection[str]) -> float:
     return _SIMULATING + (1 - _SIMULATING) * share if names else 1.0
 
 
-def _whole(parts: Sequence[CaptureReplicates | str]) -> CaptureReplicates | str:
-    """The parts of one capture together; a reason where one of them has failed."""
-    wrong = [part for part in parts if isinstance(part, str)]
+def _whole(parts: Sequence[CaptureReplicates | CannotSimulate]) -> CaptureReplicates | CannotSimulate:
+    """The parts of one capture together; the error of one of them where there is one."""
+    wrong = [part for part in parts if isinstance(part, CannotSimulate)]
     return wrong[0] if wrong else joined([part for part in parts if isinstance(part, CaptureReplicates)])
 
 

@@ -19,7 +19,7 @@ from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
 from .phases import NEAR, TIMES, PeriodicSignatures
-from .replicates import FEW, Replicates
+from .replicates import FEW, CannotSimulate, Replicates
 from .score_test import best_direction, sigmas_of
 from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
 from .spectral_lines import Line, spectral_lines
@@ -215,9 +215,7 @@ class Scan:
             with self.if_possible(candidate, _LOOKING, wholly=False):
                 of_it = _SCAN if only else FEW  # a look at some captures chooses what is fitted, which simulates anew
                 swing = self._periodic.signature(self.replicates, evaluation, candidate, tried, line, of_it)
-            if swing is None or isinstance(swing, str):
-                if swing is not None:
-                    self.not_tried(candidate.kind, candidate.effect, candidate.parameter, _LOOKING, swing)
+            if swing is None:
                 continue
             fall, times, found = swing.best_fit(self.replicates, evaluation)
             phases = {(id, key): p for id, p in found.items() for key in candidate.phases}
@@ -257,8 +255,8 @@ class Scan:
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):
             other = downs.get(i)
-            if isinstance(up, str) or isinstance(other, str):
-                said = up if isinstance(up, str) else str(other)
+            if isinstance(up, CannotSimulate) or isinstance(other, CannotSimulate):
+                said = str(up if isinstance(up, CannotSimulate) else other)
                 self.not_tried(one.candidate.kind, one.candidate.effect, one.candidate.parameter, _LOOKING, said)
                 continue
             one.signature = up if other is None else odd_and_even(self.replicates, evaluation, up, other, few)

@@ -22,7 +22,7 @@ from .evaluation import Evaluation, square
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM
 from .light_levels import closed_form, totals_space
 from .models import InTheDark
-from .replicates import TOTALS, Replicates
+from .replicates import TOTALS, CannotSimulate, Replicates
 from .results import plain
 from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures
@@ -259,9 +259,9 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
     ]
 
 
-def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature | str) -> bool:
+def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature | CannotSimulate) -> bool:
     """Whether the other statistics agree with what explains the totals."""
-    if isinstance(signature, str):
+    if isinstance(signature, CannotSimulate):
         return False
     residuals = residuals_at(scan.replicates, evaluation, signature)
     others = {c: z for c, z in residuals.items() if c != TOTALS}

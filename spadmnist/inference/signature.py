@@ -19,7 +19,7 @@ from .evaluation import Evaluation, far_wider, square
 from .light_levels import matched_light, needed_light, totals_space
 from .models import Model
 from .null_distribution import residuals_of
-from .replicates import FEW, TOTALS, CaptureReplicates, Cell, Replicates, joined, why_not
+from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, joined
 from .shifts import beyond_noise, mean_shift
 
 # factor on the scatter of the model's log totals: up to it, the scatter of another model is taken as the same
@@ -144,8 +144,8 @@ def signatures(
     kept: Kept = "likely",
     only_of: Sequence[Collection[str]] | None = None,
     names_of: Sequence[Collection[str]] | None = None,
-) -> list[Signature | str]:
-    """The signature of each model, or the reason why it cannot be simulated.
+) -> list[Signature | CannotSimulate]:
+    """The signature of each model, or the error that says why it cannot be simulated.
 
     Args:
         models: the changed models.
@@ -159,7 +159,7 @@ def signatures(
     """
     numbers = np.arange(few, dtype=np.uint64)
     ids_of = [[id for id in evaluation.made if not some or id in some] for some in only_of or [only] * len(models)]
-    wanted, unable, names = [], dict[int, str](), list[Collection[str]]()
+    wanted, unable, names = [], dict[int, CannotSimulate](), list[Collection[str]]()
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         own = []
         try:
@@ -167,24 +167,23 @@ def signatures(
                 level = evaluation.rates[id].level * matched_light(replicates, evaluation, sensors.mean_sensor(id), id)
                 own.append((sensors, id, level * evaluation.factors[id][numbers.astype(int)], numbers))
         except UNABLE as error:
-            unable[k], own = why_not(error), []
+            unable[k], own = CannotSimulate.because(error), []
         wanted += own
         names += [names_of[k] if names_of else ()] * len(own)
     simulated = replicates.simulate(wanted, hasty=hasty, names=names)
     if kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
         simulated = _more_replicates(replicates, evaluation, wanted, simulated, hasty, names)
     results = iter(simulated)
-    out: list[Signature | str] = []
+    out: list[Signature | CannotSimulate] = []
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         if k in unable:
             out.append(unable[k])
             continue
         made = {id: next(results) for id in ids}
-        wrong = [m for m in made.values() if isinstance(m, str)]
         try:
-            out.append(wrong[0] if wrong else _signature(replicates, evaluation, sensors, made, kept))  # type: ignore[arg-type]
+            out.append(_signature(replicates, evaluation, sensors, made, kept))
         except UNABLE as error:
-            out.append(why_not(error))
+            out.append(CannotSimulate.because(error))
     return out
 
 
@@ -192,10 +191,10 @@ def _more_replicates(
     replicates: Replicates,
     evaluation: Evaluation,
     wanted: Sequence[tuple[Model, str, np.ndarray, np.ndarray]],
-    made: list[CaptureReplicates | str],
+    made: list[CaptureReplicates | CannotSimulate],
     hasty: bool,
     names: Sequence[Collection[str]],
-) -> list[CaptureReplicates | str]:
+) -> list[CaptureReplicates | CannotSimulate]:
     """The replicates, and more of them where the totals of a few deviate from the closed form.
 
     Light that fluctuates gives another total in every replicate, and a few of them may deviate alike.
@@ -239,8 +238,12 @@ def _shift_of_totals(
 
 
 def _signature(
-    replicates: Replicates, evaluation: Evaluation, sensors: Model, made: dict[str, CaptureReplicates], kept: Kept
-) -> Signature | str:
+    replicates: Replicates,
+    evaluation: Evaluation,
+    sensors: Model,
+    made: Mapping[str, CaptureReplicates | CannotSimulate],
+    kept: Kept,
+) -> Signature:
     shifts: dict[Cell, np.ndarray] = {}
     noise: dict[Cell, float] = {}
     logs = {}
@@ -248,6 +251,8 @@ def _signature(
     for id in evaluation.rates.keys() - made.keys():  # a capture that is not simulated: the closed form gives its total
         logs[id] = needed_light(replicates, evaluation, sensors.mean_sensor(id), id)
     for id, other in made.items():
+        if isinstance(other, CannotSimulate):
+            raise other
         base, some = evaluation.made[id], other.numbers.astype(int)
         assert some[-1] == len(some) - 1  # the first replicates are compared with the first of the model's own
         null_total = evaluation.rates[id]
@@ -262,7 +267,7 @@ def _signature(
             if cell not in evaluation.residuals:
                 continue
             if values.shape[1] != len(evaluation.residuals[cell]):
-                return f"{id}: its {name} comes out in other bins than those of the measurement"
+                raise CannotSimulate(f"{id}: its {name} comes out in other bins than those of the measurement")
             null = evaluation.nulls[cell]
             nothing = nothing and np.array_equal(values, base.values[name][some])
             # chips with odd pixels may have many more detections; the expectation holds within the range of the

@@ -18,7 +18,7 @@ from .error_budget import Rung
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95
 from .laws import law_of
 from .reduction import halves_of
-from .replicates import Cell, Replicates
+from .replicates import CannotSimulate, Cell, Replicates
 from .signature import residuals_at, signatures
 
 _SAME_PLACE = 0.02  # relative, on the axis: cells of two captures at the same place
@@ -52,7 +52,8 @@ def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:
         residuals = there.residuals
         if rung.placebo is not None:
             (signature,) = signatures(half, there, [there.sensors.changed(rung.placebo)])
-            residuals = there.residuals if isinstance(signature, str) else residuals_at(half, there, signature)
+            if not isinstance(signature, CannotSimulate):
+                residuals = residuals_at(half, there, signature)
         own = _with_halves(rung.evaluation.replicate_residuals, there.replicate_residuals, apart)
         left = _with_halves(rung.left, residuals, apart)
         if rung.fit is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -9,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SpadError
 from .coordinates import Coordinate, Key, is_edge, point_of, room_of
 from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
-from .replicates import FEW, TOTALS, Replicates
+from .replicates import FEW, TOTALS, CannotSimulate, Replicates
 from .signature import (
     IGNORED,
     captures_informing,
@@ -69,9 +69,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         some = captures_informing(replicates, evaluation, template)
     names = _statistics_of(replicates, evaluation, template) if boost == 1 else []
 
-    def fit(
-        values: Mapping[Key, Any], rounds: int = rounds, coordinates: Sequence[Coordinate] = coordinates
-    ) -> Fit | str:
+    def fit(values: Mapping[Key, Any], rounds: int = rounds, coordinates: Sequence[Coordinate] = coordinates) -> Fit:
         return gauss_newton(
             replicates,
             evaluation,
@@ -85,8 +83,6 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         )
 
     found = fit(given)
-    if isinstance(found, str):
-        raise SpadError(found)
     for coordinate in one.candidate.coordinates:
         if coordinate.whole and coordinate.key in given:
             found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
@@ -98,8 +94,8 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
     if not one.faint:  # the signature at the fitted values may differ from that of the trial
         (there,) = signatures(replicates, evaluation, [one.sensors])
-        if isinstance(there, str):
-            raise SpadError(there)
+        if isinstance(there, CannotSimulate):
+            raise there
         one.there, residuals = there, residuals_at(replicates, evaluation, there)
         found = replace(found, residuals=residuals, square=square(residuals))
     one.fit, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
@@ -156,7 +152,7 @@ def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Ma
     models = [evaluation.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
     templates = []
     for signature in signatures(replicates, evaluation, models, 2 * FEW, kept="sure"):
-        if isinstance(signature, str):
+        if isinstance(signature, CannotSimulate):
             return 1.0, 1.0
         templates.append(stacked(template_of(replicates, evaluation, signature), list(evaluation.residuals)))
     far, near = templates
@@ -193,9 +189,7 @@ def _probe(
     return found
 
 
-def _strengths_anew(
-    one: Trial, found: Fit, fit: Callable[[Mapping[Key, Any], int, Sequence[Coordinate]], Fit | str]
-) -> Fit:
+def _strengths_anew(one: Trial, found: Fit, fit: Callable[[Mapping[Key, Any], int, Sequence[Coordinate]], Fit]) -> Fit:
     """The fit with its strengths fitted once more at the shapes and edges of the best probes.
 
     The strengths before are those of another minimum.
@@ -207,8 +201,11 @@ def _strengths_anew(
     moving = [i for i, d in enumerate(found.coordinates) if d not in one.candidate.shapes and not is_edge(d)]
     if not moving:
         return found
-    again = fit(found.values, _ROUNDS_AFTER_PROBES, [found.coordinates[i] for i in moving])
-    if isinstance(again, str) or again.square >= found.square:
+    try:
+        again = fit(found.values, _ROUNDS_AFTER_PROBES, [found.coordinates[i] for i in moving])
+    except CannotSimulate:
+        return found
+    if again.square >= found.square:
         return found
     jacobian = {cell: x.copy() for cell, x in found.jacobian.items()}
     for cell, x in again.jacobian.items():
@@ -243,7 +240,7 @@ def _nearest(
     best = found.square - 6
     made = signatures(replicates, evaluation, models, FEW, only, names_of=[names] * len(models))
     for tried, x, signature in zip(tries, steps, made, strict=True):
-        if isinstance(signature, str):
+        if isinstance(signature, CannotSimulate):
             continue
         residuals = residuals_at(replicates, evaluation, signature)
         if square(residuals) < best:
@@ -268,8 +265,6 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     stronger_by = max(1.0, min(math.sqrt(STRONG / max(size, 1e-9)), room))
     strong = {**given, **{d.key: d.scaled(float(given[d.key]), stronger_by) for d in coordinates}}
     swing = simulate_phases(replicates, evaluation, one.candidate.phases, strong, _PHASE_REPLICATES)
-    if isinstance(swing, str):
-        raise SpadError(swing)
     _, times, found = swing.best_fit(replicates, evaluation, [x / stronger_by for x in (0.5, *NEAR, 2.0)])
     one.values = {**strong, **{d.key: d.scaled(float(strong[d.key]), times) for d in coordinates}}
     mirrored = {id: swing.mirror_phase(id, p, times) for id, p in found.items()}
@@ -296,7 +291,7 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
 
 
 def _fit_whole_number(
-    found: Fit, coordinate: Coordinate, fit: Callable[[Mapping[Key, Any]], Fit | str]
+    found: Fit, coordinate: Coordinate, fit: Callable[[Mapping[Key, Any]], Fit]
 ) -> tuple[Fit, dict[Key, tuple[float, float]]]:
     """(best fit with a whole number, intervals by coordinate).
 
@@ -310,10 +305,11 @@ def _fit_whole_number(
 
     def there(value: float, start: Fit) -> None:
         begun[value] = float(start.values[coordinate.key])
-        one = fit({**start.values, coordinate.key: value})
-        if not isinstance(one, str) and one.square < squares.get(value, math.inf):
-            best[value], squares[value] = one, one.square
         squares.setdefault(value, math.inf)
+        with contextlib.suppress(CannotSimulate):
+            one = fit({**start.values, coordinate.key: value})
+            if one.square < squares[value]:
+                best[value], squares[value] = one, one.square
 
     step = _NEXT[0]
     while True:

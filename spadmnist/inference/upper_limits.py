@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .evaluation import Evaluation
-from .replicates import FEW, Replicates
+from .replicates import FEW, CannotSimulate, Replicates
 from .results import plain
 from .scan import Scan
 from .score_test import ScoreTest, score_test
@@ -156,7 +156,7 @@ def _as_strong(
     out: list[Signature | None] = []
     for (_, _, ids), number in zip(asked, signs, strict=True):
         up, down = next(made), next(made) if number == 2 else None
-        if isinstance(up, str) or isinstance(down, str):
+        if isinstance(up, CannotSimulate) or isinstance(down, CannotSimulate):
             out.append(None)
         else:
             out.append((up if down is None else odd_and_even(replicates, evaluation, up, down, FEW)).only(ids))
