@@ -20,7 +20,9 @@ from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import Evaluation, evaluate, square, stacked
 from spadmnist.inference.exact_likelihood import NoLikelihood, maximise
 from spadmnist.inference.gauss_newton import (
+    Effort,
     Fit,
+    JacobianBy,
     covariance_of,
     error_scale,
     gauss_newton,
@@ -319,7 +321,7 @@ def test_a_number_that_nothing_follows_stays_as_it_is():
     evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: z}, own, {})
     values = {coordinate.key: 0.01 for coordinate in coordinates}
     before = Fit(coordinates, point_of(coordinates, values), np.eye(2), {cell: z}, {cell: jacobian}, 0.0, dict(values))
-    found = gauss_newton_step(None, evaluation, coordinates, values, lambda v: v, before=before)
+    found = gauss_newton_step(None, evaluation, coordinates, values, lambda v: v, JacobianBy(before=before))
     assert found.values["any", "b"] == pytest.approx(0.01)
     assert np.log(found.values["any", "a"] / 0.01) == pytest.approx(-0.5, abs=5 * 0.5 / np.sqrt(30))
 
@@ -425,7 +427,7 @@ def test_what_gains_nothing_by_slopes_of_its_own_is_not_gone_after(monkeypatch):
 
     closed_form(monkeypatch, lambda a: 5 + a + rng.standard_normal(30) * (1 + 3 * len(asked)), asked)
     evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: np.zeros(30)}, {cell: rng.standard_normal((64, 30))}, {})
-    gauss_newton(None, evaluation, [coordinate], {coordinate.key: 0.0}, lambda v: v, rounds=8)
+    gauss_newton(None, evaluation, [coordinate], {coordinate.key: 0.0}, lambda v: v, Effort(rounds=8))
     assert 1 <= sum(n > 1 for n in asked) <= 4
 
 

@@ -304,8 +304,8 @@ def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
         kinds[-1] |= _LAST
         offsets, counts = np.array([0, len(gaps)]), np.array([len(times)])
         hazard, used = np.zeros(len(gaps)), np.zeros(1, np.int64)
-        about = counts, end, dead, chance, lifetime, rate, 500e-12, 0.0
-        base, awake = _followed(gaps, kinds, offsets, *about, hazard, used)
+        pixel = dead, chance, lifetime, rate
+        base, awake = _followed((gaps, kinds, offsets), (counts, end), pixel, (500e-12, 0.0), (hazard, used))
         rest = hazard, offsets, used, counts, awake
         return math.exp(float(base[0] + _of_rates(*rest, rate)[0][0]))
 

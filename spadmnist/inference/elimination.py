@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ..errors import SpadError
 from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
-from .gauss_newton import Fit, column_of, gauss_newton
+from .gauss_newton import Effort, Fit, column_of, gauss_newton
 from .joint_fit import RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
 from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
@@ -67,10 +68,10 @@ def drop_needless(path: ModelPath) -> None:
         if at_first_order is not None and square(at_first_order) - now > _NEEDED:
             continue
         point = {d.key: rest[d.key] for d in others}
-        given = replicates, path.evaluation, others, point, sensors.changed, 2
-        closer = gauss_newton(*given, thorough=True) if others else None
-        if isinstance(closer, Fit):
-            loss = closer.square - now
+        if others:
+            with contextlib.suppress(CannotSimulate):
+                effort = Effort(rounds=2, thorough=True)
+                loss = gauss_newton(replicates, path.evaluation, others, point, sensors.changed, effort).square - now
         if loss < _NEEDLESS:
             replicates.say(f"{title(step.candidate)} is no longer needed")
             path.steps.remove(step)

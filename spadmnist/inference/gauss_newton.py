@@ -60,18 +60,35 @@ class Fit:
         return coordinate.value(u), *coordinate.interval(u - half, u + half)
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much a Gauss-Newton fit simulates, and of what.
+
+    Attributes:
+        rounds: half the number of steps, at most.
+        few: replicates of each capture.
+        stronger: (factor, power). A faint effect is simulated `factor` times as strong, and its signature divided by
+            factor^power.
+        only, names: the captures that are simulated, and the statistics that are reduced, all where they are empty;
+            all other cells are taken as constant.
+        thorough: it goes on where the promised fall may be that of noise.
+    """
+
+    rounds: int = 3
+    few: int = FEW
+    stronger: tuple[float, float] = (1.0, 1.0)
+    only: Collection[str] = ()
+    names: Collection[str] = ()
+    thorough: bool = False
+
+
 def gauss_newton(
     replicates: Replicates,
     evaluation: Evaluation,
     coordinates: Sequence[Coordinate],
     values: Mapping[Key, Any],
     sensors_of: Callable[[Mapping[Key, Any]], Model],
-    rounds: int = 3,
-    few: int = FEW,
-    stronger: tuple[float, float] = (1.0, 1.0),
-    only: Collection[str] = (),
-    names: Collection[str] = (),
-    thorough: bool = False,
+    effort: Effort = Effort(),
 ) -> Fit:
     """A Gauss-Newton fit to the residuals of all cells, damped.
 
@@ -81,48 +98,43 @@ def gauss_newton(
         coordinates: what is fitted.
         values: the start, SI; the other values stay.
         sensors_of: values -> model.
-        rounds: half the number of steps, at most.
-        few: replicates of each capture.
-        stronger: (factor, power). A faint effect is simulated `factor` times as strong, and its signature divided by
-            factor^power.
-        only, names: the captures that are simulated, and the statistics that are reduced, all where they are empty;
-            all other cells are taken as constant.
-        thorough: it goes on where the promised fall may be that of noise.
     Raises:
         CannotSimulate: where the model cannot be simulated on the way.
     """
     coordinates = tuple(coordinates)
     keys = list(evaluation.residuals)
     fixed = dict(values)
+    factor = effort.stronger[0]
 
     def at(u: np.ndarray) -> dict[Key, Any]:
         return {**fixed, **{d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}}
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | CannotSimulate]:
         models = [sensors_of(boosted(at(u))) for u in points]
-        found = signatures(replicates, evaluation, models, few, only, names_of=[names] * len(points))
-        times = stronger[0] ** -stronger[1]
+        names = [effort.names] * len(points)
+        found = signatures(replicates, evaluation, models, effort.few, effort.only, names_of=names)
+        times = factor ** -effort.stronger[1]
         return [
             m if isinstance(m, CannotSimulate) else stacked(residuals_at(replicates, evaluation, m, times), keys)
             for m in found
         ]
 
     def boosted(values: dict[Key, Any]) -> dict[Key, Any]:
-        if stronger[0] == 1:
+        if factor == 1:
             return values
-        up = {d.key: d.scaled(float(values[d.key]), stronger[0]) for d in coordinates if d.off is not None}
+        up = {d.key: d.scaled(float(values[d.key]), factor) for d in coordinates if d.off is not None}
         return {**values, **up}
 
     u = point_of(coordinates, values)
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)  # (replicates, cells)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    begun, noise = 0.0, 0.0 if thorough else _NOISE * max(len(coordinates) - 1, 0)
+    begun, noise = 0.0, 0.0 if effort.thorough else _NOISE * max(len(coordinates) - 1, 0)
     jacobian, there, damping, promised, vain = np.zeros((0, len(coordinates))), u, 0.0, 0.0, 0
     limit = np.array([1.2 if d.log else 0.5 * (d.high - d.low) for d in coordinates])
     reach = np.array([_SAME if d.log else _SAME * (d.high - d.low) for d in coordinates])
     seen = np.ones(len(coordinates), bool)  # which coordinates are informed
-    for turn in range(2 * rounds):
+    for turn in range(2 * effort.rounds):
         # a Jacobian holds for a while: it is made anew where the point has moved on, or the fall was less than
         # promised
         anew = turn == 0 or bool(np.any(np.abs(u - there) > reach))
@@ -223,17 +235,34 @@ def _differences(
     return out
 
 
+@dataclass(frozen=True)
+class JacobianBy:
+    """By what a Jacobian is found.
+
+    Attributes:
+        few: replicates of each capture.
+        errors: standard deviations of coordinates, as far as they are known; a Jacobian at an edge holds no further.
+        known: columns, (cells,) by block, of which only the size is uncertain; the noise of a faint effect hides its
+            shape.
+        before: a fit from an evaluation near by, whose Jacobian still holds.
+        only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
+            the others.
+    """
+
+    few: int = FEW
+    errors: Mapping[Key, float] = field(default_factory=dict)
+    known: Mapping[Key, Mapping[Cell, np.ndarray]] = field(default_factory=dict)
+    before: Fit | None = None
+    only: Callable[[Key], Collection[str]] = lambda key: ()
+
+
 def gauss_newton_step(
     replicates: Replicates,
     evaluation: Evaluation,
     coordinates: Sequence[Coordinate],
     values: Mapping[Key, Any],
     sensors_of: Callable[[Mapping[Key, Any]], Model],
-    few: int = FEW,
-    errors: Mapping[Key, float] | None = None,
-    known: Mapping[Key, Mapping[Cell, np.ndarray]] | None = None,
-    before: Fit | None = None,
-    only: Callable[[Key], Collection[str]] = lambda key: (),
+    by: JacobianBy | None = None,
 ) -> Fit:
     """One Gauss-Newton step from an evaluation, with its full number of replicates.
 
@@ -242,28 +271,19 @@ def gauss_newton_step(
     Args:
         values: the values of the evaluation, SI.
         sensors_of: values -> model.
-        few: replicates of each capture for the Jacobian.
-        errors: standard deviations of coordinates, as far as they are known; the Jacobian at an edge holds no
-            further.
-        known: columns of the Jacobian, (cells,) by block, of which only the size is uncertain; the noise of a faint
-            effect hides its shape.
-        before: a fit from an evaluation near by, whose Jacobian still holds.
-        only: the captures that are simulated for the column of a coordinate; all where it is empty. The column is 0 in
-            the others.
+        by: by what the Jacobian is found.
     Raises:
         CannotSimulate: where a model for the Jacobian cannot be simulated.
     """
-    coordinates = tuple(coordinates)
+    coordinates, by = tuple(coordinates), by or JacobianBy()
     keys = list(evaluation.residuals)
     z, u = stacked(evaluation.residuals, keys), point_of(coordinates, values)
     own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
-    if before is not None and before.coordinates == coordinates:
-        jacobian = np.stack([stacked(column_of(before, i, evaluation), keys) for i in range(len(coordinates))], axis=1)
+    if by.before is not None and by.before.coordinates == coordinates:
+        columns = [stacked(column_of(by.before, i, evaluation), keys) for i in range(len(coordinates))]
+        jacobian = np.stack(columns, axis=1)
     else:
-        given = replicates, evaluation, coordinates, u, values, sensors_of, few
-        # the size of a known column is compared with all of it
-        where = [() if d.key in (known or {}) else only(d.key) for d in coordinates]
-        jacobian = _jacobian(*given, errors or {}, known or {}, where)
+        jacobian = _jacobian(replicates, evaluation, coordinates, u, sensors_of, by)
     covariance = covariance_of(jacobian, own)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10) @ (jacobian.T @ z)
@@ -288,25 +308,24 @@ def _jacobian(
     evaluation: Evaluation,
     coordinates: Sequence[Coordinate],
     u: np.ndarray,
-    values: Mapping[Key, Any],
     sensors_of: Callable[[Mapping[Key, Any]], Model],
-    few: int,
-    errors: Mapping[Key, float],
-    known: Mapping[Key, Mapping[Cell, np.ndarray]],
-    only: Sequence[Collection[str]],
+    by: JacobianBy,
 ) -> np.ndarray:
     """The Jacobian of the residuals at an evaluation, (cells, coordinates).
 
     Args:
         u: (coordinates,) the point of the evaluation; the others as in `gauss_newton_step`.
-        only: of each coordinate, as there.
     """
     keys = list(evaluation.residuals)
     cells = sum(len(evaluation.residuals[key]) for key in keys)
     h = np.array([_ASIDE if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
-    near = np.array([errors.get(d.key, math.inf) for d in coordinates])
+    near = np.array([by.errors.get(d.key, math.inf) for d in coordinates])
     h = np.minimum(h, np.maximum(8 * near, _CLOSE))
-    columns = {i: stacked(_column(known[d.key], evaluation), keys) for i, d in enumerate(coordinates) if d.key in known}
+    known = [d.key in by.known for d in coordinates]
+    # the size of a known column is compared with all of it
+    only = [() if one else by.only(d.key) for d, one in zip(coordinates, known, strict=True)]
+    every = [(i, by.known[d.key]) for i, d in enumerate(coordinates) if known[i]]
+    columns = {i: stacked(_column(slope, evaluation), keys) for i, slope in every}
     for i, slope in columns.items():  # so far that the shift is visible
         h[i] = np.clip(2 / max(math.sqrt(float(slope @ slope)), 1e-9), *_KNOWN_ASIDE) * (h[i] / _ASIDE)
     points = _points_aside(coordinates, u, h)
@@ -318,7 +337,7 @@ def _jacobian(
             replicates,
             evaluation,
             [sensors_of(values_there[k]) for k in some],
-            few,
+            by.few,
             kept="all" if bare else "likely",
             only_of=[only[k // 2] for k in some],
         )

@@ -15,7 +15,7 @@ from ..errors import SpadError
 from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
-from .gauss_newton import Fit, column_of, gauss_newton_step
+from .gauss_newton import Fit, JacobianBy, column_of, gauss_newton_step
 from .models import Model
 from .pixel_maps import HALF_95, map_values
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
@@ -158,18 +158,10 @@ def _gauss_newton(
         turn += 1
         here = {d.key: path.values[d.key] for d in coordinates}
         try:
-            closer = gauss_newton_step(
-                replicates,
-                evaluation,
-                coordinates,
-                here,
-                functools.partial(path.model_at, evaluation),
-                _recordings(evaluation),
-                errors,
-                known,
-                near,
-                functools.partial(_shown, path) if where_shown else lambda key: (),
-            )
+            only = functools.partial(_shown, path) if where_shown else lambda key: ()
+            by = JacobianBy(_recordings(evaluation), errors, known, near, only)
+            model = functools.partial(path.model_at, evaluation)
+            closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, by)
         except CannotSimulate as error:
             path.no_fit_because = str(error)
             path.approximate = path.approximate or borrowed_columns

@@ -24,13 +24,13 @@ from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, NoLikelihood, maximise, recordings
 from .findings import nuisances, remainder, traces
-from .gauss_newton import Fit, gauss_newton_step, profile_intervals
+from .gauss_newton import JacobianBy, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
 from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
 from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .pixel_maps import HALF_95
-from .replicates import FEW, REPLICATES, Replicates
+from .replicates import FEW, REPLICATES, CannotSimulate, Replicates
 from .results import Diagnosis, Step, Value, title
 from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of
@@ -224,11 +224,11 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
         replicates.say("intervals")
         # the values of the evaluation, one step away from the fitted ones
         here = {d.key: path.evaluation.values.get(d.key, path.values[d.key]) for d in coordinates}
-        sensors, few = functools.partial(path.model_at, path.evaluation), 2 * FEW
-        fit = gauss_newton_step(replicates, path.evaluation, coordinates, here, sensors, few, edge_errors(path))
-        if isinstance(fit, Fit):
+        sensors, by = functools.partial(path.model_at, path.evaluation), JacobianBy(2 * FEW, edge_errors(path))
+        with contextlib.suppress(CannotSimulate):  # the intervals stay those of the fit
+            fit = gauss_newton_step(replicates, path.evaluation, coordinates, here, sensors, by)
             fit = replace(fit, point=point_of(coordinates, path.values))
-            ends = profile_intervals(replicates, path.evaluation, fit, sensors, few)
+            ends = profile_intervals(replicates, path.evaluation, fit, sensors, by.few)
     maps = {s.candidate.carrier: s.map for s in path.steps if s.candidate.carrier and s.map is not None}
     for step in path.steps:
         extra = dict(zip([d.key for d in step.coordinates], variances_by_pixels(path, step, maps), strict=True))

@@ -98,21 +98,23 @@ def _risen(x, tick, sigma):
 
 
 @kernels.jit
-def _followed(gaps, kinds, offsets, counts, end, dead, chance, lifetime, rate, tick, sigma, hazard, used):
+def _followed(near, seen, pixel, stamps, out):
     """(log-probability of all that does not depend on the rate, time awake in s), (pixels,) each.
 
     Args:
-        gaps, kinds, offsets: the gaps that may be short, as `Stamps.near` has them.
-        counts: (pixels,) events.
-        end: exposure, s.
-        dead: (pixels,) dead time, s.
-        chance: (traps, pixels) probability that a detection fills a trap.
-        lifetime: (traps,) s.
-        rate: (pixels,) 1/s, approximate, for the probability that a trap caused an event.
-        tick, sigma: s, of the stamps.
-        hazard: (gaps,) output: the hazard of traps at events, 1/s; from a pixel's offset on, the first `used`.
-        used: (pixels,) output: the number of those.
+        near: (gaps, kinds, offsets) of the gaps that may be short, as `Stamps.near` has them.
+        seen: (counts, end): (pixels,) events; exposure, s.
+        pixel: (dead, chance, lifetime, rate): (pixels,) dead time, s; (traps, pixels) probability that a detection
+            fills a trap; (traps,) s; (pixels,) 1/s, approximate, for the probability that a trap caused an event.
+        stamps: (tick, sigma), s.
+        out: (hazard, used): (gaps,) the hazard of traps at events, 1/s, from a pixel's offset on, the first `used`;
+            (pixels,) the number of those.
     """
+    gaps, kinds, offsets = near
+    counts, end = seen
+    dead, chance, lifetime, rate = pixel
+    tick, sigma = stamps
+    hazard, used = out
     pixels, traps = counts.size, lifetime.size
     base, awake = np.zeros(pixels), np.zeros(pixels)
     full, old, own, emptied, blind = np.zeros((5, traps))
@@ -328,8 +330,9 @@ class Stamps:
         if not (self.given and all(np.array_equal(a, b) for a, b in zip(given, self.given, strict=True))):
             self._look(float(dead.max(initial=0.0)) + max(_LONG * lifetime.max(initial=0.0), self.tick + 8 * blur))
             about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
-            what = self.counts, end, dead, chance, lifetime, about, self.tick, blur
-            self.parts = np.array(_followed(*self.near, *what, self.hazard, self.used))
+            pixel = dead, chance, lifetime, about
+            out = self.hazard, self.used
+            self.parts = np.array(_followed(self.near, (self.counts, end), pixel, (self.tick, blur), out))
             self.given = given
         base, awake = self.parts
         rest = self.hazard, self.near[2], self.used, self.counts, awake

@@ -24,7 +24,7 @@ from .budget import OutOfBudget
 from .candidates import with_values
 from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
-from .gauss_newton import Fit, gauss_newton_step
+from .gauss_newton import Fit, JacobianBy, gauss_newton_step
 from .models import Model
 from .replicates import FEW, CannotSimulate, Replicates
 from .signature import IGNORED, captures_showing, residuals_at, signatures, template_of
@@ -77,9 +77,10 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
             pass  # with more replicates there is no such model
     best: tuple[float, Evaluation, Fit] | None = None
     vain = 0
+    by = JacobianBy(2 * FEW, only=lambda key: some)
     for _ in range(_TURNS):
         try:
-            found = gauss_newton_step(replicates, there, coordinates, here, model, 2 * FEW, only=lambda key: some)
+            found = gauss_newton_step(replicates, there, coordinates, here, model, by)
             at = replace(found, point=point_of(coordinates, here), values=dict(here), residuals=there.residuals)
             if best is None or ratio(there) > best[0]:
                 best, vain = (ratio(there), there, at), 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from .coordinates import Coordinate, Key, is_edge, point_of, room_of
 from .evaluation import Evaluation, block_checks, failing, square, stacked
-from .gauss_newton import Fit, covariance_of, gauss_newton
+from .gauss_newton import Effort, Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
 from .replicates import FEW, TOTALS, CannotSimulate, Replicates
@@ -76,10 +76,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
             coordinates,
             values,
             lambda v: evaluation.sensors.changed(v, one.phases, one.chips),
-            rounds,
-            stronger=(boost, power),
-            only=some,
-            names=names,
+            Effort(rounds, stronger=(boost, power), only=some, names=names),
         )
 
     found = fit(given)
