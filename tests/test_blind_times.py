@@ -19,7 +19,7 @@ from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.pixel_maps import by_counts
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.score_test import p_of_map
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -170,7 +170,7 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> dict[float, tuple[Repli
     for spread in (0.0, 0.03):
         own = DEAD * np.exp(spread * np.random.default_rng(2).standard_normal(SIDE**2))
         data = twin.simulate(with_values(sensor, {DURATION: own}), plan, folder / f"lab {spread}", 5)
-        out[spread] = Replicates(sensor, measurements.open(data), 0, Serial(), 16), own
+        out[spread] = Replicates(sensor, measurements.open(data), 0, Execution(Serial()), 16), own
     return out
 
 

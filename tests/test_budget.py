@@ -24,7 +24,7 @@ from spadmnist.inference.comparison import compare
 from spadmnist.inference.journal import Journal
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.next_step import after_comparison, after_diagnosis
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.results import Diagnosis, canonical, sentence, table
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
@@ -219,7 +219,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_answer(lab, few, tmp_path
 
 def test_what_a_journal_holds_is_of_this_model_capture_light_and_seed(lab):
     sensor, data = lab()
-    replicates = Replicates(sensor, data, 0, Serial(), 4)
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 4)
     seen, photons, numbers = replicates.seen["flat"], np.full(4, 1e5), np.arange(4, dtype=np.uint64)
     other = sensor.with_values({"dead_time.duration": 51e-9})
     names = [

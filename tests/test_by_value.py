@@ -29,7 +29,7 @@ import numpy as np
 
 import spadmnist as sp
 from spadmnist.inference.models import Model
-from spadmnist.inference.replicates import CaptureReplicates, Replicates
+from spadmnist.inference.replicates import CaptureReplicates, Execution, Replicates
 from spadmnist.statistics import Statistic, Summary
 from spadmnist.workers import executor
 
@@ -83,7 +83,7 @@ def main():
     answers = []
     for jobs in (1, 2):
         with executor(jobs) as workers:
-            replicates = Replicates(model, lab, 0, workers, 2)
+            replicates = Replicates(model, lab, 0, Execution(workers), 2)
             wanted = (Model.same(model), "dark", np.ones(2), np.arange(2, dtype=np.uint64))
             found = replicates.simulate([wanted])  # one task: one worker is started
         assert all(isinstance(one, CaptureReplicates) for one in found), found

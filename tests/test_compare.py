@@ -23,7 +23,7 @@ from spadmnist.inference.light_levels import CaptureNull, _score
 from spadmnist.inference.null_distribution import learn
 from spadmnist.inference.reduction import ReducedCapture
 from spadmnist.inference.replicate_cache import recall
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.measurement import Measurement
 from spadmnist.recording import Capture, Light, Recording
 from spadmnist.sensor import Sensor
@@ -171,7 +171,7 @@ def test_the_misfit_is_that_of_a_diagnosis() -> None:
     """
     data = measured(sensor(flicker={"amplitude": 0.2, "frequency": 20.0}), "str", 8)
     found = compared(sensor(), data)
-    replicates = Replicates(sensor(), data, 0, Serial(), 48)
+    replicates = Replicates(sensor(), data, 0, Execution(Serial()), 48)
     state = evaluate(replicates, {})
     of_checks = {(c.capture, c.statistic): c.misfit for c in found.checks}
     said = misfits(state.replicate_residuals, state.residuals)

@@ -34,7 +34,7 @@ from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.models import Model
 from spadmnist.inference.named_fit import _named, fit_named
 from spadmnist.inference.pixel_maps import PixelMap, map_values, summary
-from spadmnist.inference.replicates import TOTALS, Replicates
+from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.inference.results import sentence
 from spadmnist.recording import Capture, Light
 from spadmnist.streams import Streams
@@ -92,7 +92,7 @@ def test_a_dead_time_is_fitted_and_a_map_found(tmp_path, made):
     sensor, captures, map_ = made
     data = measured(tmp_path, sensor, captures)
     with Serial() as workers:
-        replicates = Replicates(sensor, data, 0, workers, 16)
+        replicates = Replicates(sensor, data, 0, Execution(workers), 16)
         evaluation = evaluate(replicates, {})
         candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")
         levels = light_levels_of(replicates, evaluation)

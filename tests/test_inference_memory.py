@@ -18,7 +18,7 @@ from spadmnist.inference import exact_likelihood, memory, point_process
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.exact_likelihood import NoLikelihood, maximise
 from spadmnist.inference.point_process import Stamps
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Loky, Serial, executor
@@ -135,7 +135,7 @@ def test_what_one_worker_cannot_hold_is_refused_before_it_is_reduced(
     with pytest.raises(
         InputError, match=r"^dark: a simulated recording of it takes about .* GB of memory, .*: cut the"
     ):
-        Replicates(sensor, data, 0, Serial(), 4)
+        Replicates(sensor, data, 0, Execution(Serial()), 4)
 
 
 def test_a_model_whose_replicates_are_too_large_cannot_be_simulated(

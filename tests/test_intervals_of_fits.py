@@ -20,7 +20,7 @@ from spadmnist.inference.coordinates import coordinate_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_fits import fit_codes
 from spadmnist.inference.pixel_maps import code_periods
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.setups import _of_exposure
 from spadmnist.inference.signature import Signature
 from spadmnist.inference.trial import Trial
@@ -163,7 +163,7 @@ def test_an_exposure_is_no_light_level(modality: str) -> None:
     longer = lit("flat", modality, rate, frames=2000, frame_time=1.1 * FRAME, **more)
     made = sp.simulate(model, [longer], seed=5).recording("flat")
     data = in_memory("longer", model.layout, [dataclasses.replace(made, capture=stated)])
-    replicates = Replicates(model, data, 0, Serial(), 24)
+    replicates = Replicates(model, data, 0, Execution(Serial()), 24)
     evaluation = evaluate(replicates, {})
     level, error, _ = evaluation.rates["flat"].level_of(replicates.seen["flat"].total)
     log = math.log(level / float(evaluation.rates["flat"].stated or 1.0))

@@ -22,7 +22,7 @@ from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.named_fit import fit_named
 from spadmnist.inference.pixel_maps import _DOUBT, PixelMap
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Serial
@@ -56,7 +56,7 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Serial(), 8)
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
     candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
     found = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")].values()
     counts = replicates.seen["dark"].counts
@@ -79,7 +79,7 @@ def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     truth = with_values(sensor, {("dark_counts", "rate"): rates})
     plan = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Serial(), 8)
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
     candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
     map_ = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")]
     counts = replicates.seen["dark"].counts
@@ -108,7 +108,7 @@ def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> N
     truth = with_values(sensor, {("detection", "relative"): relative / relative.mean()})
     wanted = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, wanted, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Serial(), 8)
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
     share = replicates.seen["flat"].total / SIDE**2 / 1500
     assert 0.97 < share < 0.99
     candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")

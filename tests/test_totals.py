@@ -20,7 +20,7 @@ from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, fai
 from spadmnist.inference.findings import nuisances
 from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_TOTALS
 from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, of_mean, totals_space
-from spadmnist.inference.replicates import TOTALS, Replicates
+from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Serial
@@ -82,7 +82,7 @@ def test_a_sensor_without_dark_counts_is_not_judged_by_how_many_there_are(lab) -
     """Nothing is expected, and no factor on nothing is more: what adds some is found by all else."""
     sensor, data = lab()
     bare = Sensor(sensor.layout, [e for e in sensor.effects if e.name != "dark_counts"], sensor.rules)
-    replicates = Replicates(bare, data, 0, Serial(), 16)
+    replicates = Replicates(bare, data, 0, Execution(Serial()), 16)
     evaluation = evaluate(replicates, {})
     assert replicates.seen["dark"].total > 300 and totals_space(replicates, evaluation)[0] == ["flat"]
     assert np.all(np.isfinite(evaluation.residuals[TOTALS]))
@@ -104,7 +104,7 @@ def test_an_effect_that_does_not_say_what_it_adds_is_simulated_as_bright_as_the_
     own = Sensor(sensor.layout, [*sensor.effects, Unsaid(probability=0.2, lifetime=200e-9)], sensor.rules)
     flat = sp.Capture("flat", "tr", wavelength=500e-9, irradiance=1e-3, relative_uncertainty=0.02, exposure=20e-3)
     data = sp.simulate(own, [flat], seed=1)
-    replicates = Replicates(own, data, 0, Serial(), 16)
+    replicates = Replicates(own, data, 0, Execution(Serial()), 16)
     evaluation = evaluate(replicates, {})
     made, total = evaluation.made["flat"].totals, replicates.seen["flat"].total
     assert made.min() < total < made.max()

@@ -11,7 +11,7 @@ from spadmnist import measurement as measurements
 from spadmnist.inference.candidates import Candidate, candidates
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.model_path import ModelPath, accept
-from spadmnist.inference.replicates import Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import Signature, signatures
 from spadmnist.inference.trial import Trial
@@ -69,7 +69,7 @@ def labs(tmp_path: Path) -> Lab:
 
 
 def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Replicates:
-    return Replicates(*made, 0, Serial(), replicates)
+    return Replicates(*made, 0, Execution(Serial()), replicates)
 
 
 def quiet(replicates: Replicates) -> Scan:

@@ -36,7 +36,7 @@ from .models import Model
 from .null_distribution import Judgement
 from .phases import evaluate_start
 from .repeated_cells import place, repeated
-from .replicates import REPLICATES, TOTALS, Replicates
+from .replicates import REPLICATES, TOTALS, Execution, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
@@ -194,8 +194,8 @@ def compare(
     """
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
-        told = progress or (lambda capture, share: None)
-        simulations = Replicates(sensor, measurement, seed, workers, replicates, say, progress=told)
+        by = Execution(workers, say, progress or (lambda capture, share: None))
+        simulations = Replicates(sensor, measurement, seed, by, replicates)
         evaluation, _ = evaluate_start(simulations)
         return comparison_of(simulations, evaluation, tolerance)
 

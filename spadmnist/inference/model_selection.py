@@ -40,7 +40,7 @@ from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import completed
 from .journal import Journal
 from .model_path import ModelPath, begin
-from .replicates import REPLICATES, TOTALS, Replicates
+from .replicates import REPLICATES, TOTALS, Execution, Replicates
 from .results import Diagnosis
 from .score_test import p_of_any
 from .sharper_tests import sharper
@@ -93,14 +93,14 @@ def diagnose(
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
         number = _QUICK if quick else REPLICATES
-        given = sensor, measurement, seed, workers, number, say
-        replicates = Replicates(*given, budget=budget, journal=journal)
+        given = sensor, measurement, seed, Execution(workers, say, budget=budget, journal=journal), number
+        replicates = Replicates(*given)
         short = setups.stopped_early(replicates)
         if short:
             exposures = {
                 id: replicates.seen[id].capture.conditions.exposure * share for id, (share, _) in short.items()
             }
-            replicates = Replicates(*given, exposures, budget=budget, journal=journal)
+            replicates = Replicates(*given, exposures)
         return _diagnosed(replicates, max_steps, quick, short, keep or (lambda found: None))
 
 

@@ -30,7 +30,7 @@ from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_
 from .levels import LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .pixel_maps import HALF_95
-from .replicates import FEW, REPLICATES, CannotSimulate, Replicates
+from .replicates import FEW, REPLICATES, CannotSimulate, Execution, Replicates
 from .results import Diagnosis, Step, Value, title
 from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of
@@ -77,14 +77,14 @@ def fit_named(
     with executor(jobs) as workers:
         workers.greet(golden.answer, None)
         if counts_in_the_dark.may_fit(sensor.resolved(), wanted):
-            replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say, reduced=False)
+            replicates = Replicates(sensor, measurement, seed, Execution(workers, say), REPLICATES, reduced=False)
             try:
                 answer = counts_in_the_dark.fit_by_counts(replicates, measurement, wanted[0])
                 say("by the counts in the dark alone; compare checks the new model in all other statistics")
                 return answer
             except counts_in_the_dark.OtherwiseInformed as error:
                 say(f"not by the counts of dark captures alone: {error}")
-        replicates = Replicates(sensor, measurement, seed, workers, REPLICATES, say)
+        replicates = Replicates(sensor, measurement, seed, Execution(workers, say), REPLICATES)
         path = begin(replicates)
         start, wrong = path.evaluation, bool(path.failed)
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))

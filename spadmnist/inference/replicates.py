@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -147,6 +147,24 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
     )
 
 
+@dataclass(frozen=True)
+class Execution:
+    """By whom models are simulated, within which budget, and who is told.
+
+    Attributes:
+        say: called with what is being done.
+        progress: called with a capture and the share of the simulations under way that is done.
+        budget: of work; the default has no end.
+        journal: what was simulated before, and is not simulated again.
+    """
+
+    workers: Executor
+    say: Callable[[str], None] = lambda what: None
+    progress: Callable[[str, float], None] = lambda capture, share: None
+    budget: Budget = field(default_factory=Budget)
+    journal: Journal | None = None
+
+
 class Replicates:
     """The measurement, reduced once, and the workers that simulate models of it."""
 
@@ -155,34 +173,28 @@ class Replicates:
         sensor: Sensor,
         measurement: Measurement,
         seed: int,
-        workers: Executor,
+        execution: Execution,
         number: int,
-        say: Callable[[str], None] = lambda what: None,
         exposures: Mapping[str, float] | None = None,
         reduced: bool = True,
-        progress: Callable[[str, float], None] = lambda capture, share: None,
-        budget: Budget | None = None,
-        journal: Journal | None = None,
     ):
         """Reduce the measurement.
 
         Args:
             sensor: the stated model, which the measurement must fit.
             number: replicates of each capture.
-            say: called with what is being done.
             exposures: s, of captures whose exposure is not what the measurement states.
             reduced: with all statistics of the captures; without them only counts can be compared.
-            progress: called with a capture and the share of the simulations under way that is done.
-            budget: of work; without it there is no end to it.
-            journal: what was simulated before, and is not simulated again.
         """
         measurement.check_sensor(sensor)
         self.start = sensor.resolved()
-        self.seed, self.workers, self.number, self.say, self.progress = seed, workers, number, say, progress
+        self.seed, self.number, self.workers = seed, number, execution.workers
+        self.say, self.progress = execution.say, execution.progress
+        self.budget, self.journal = execution.budget, execution.journal
         self.dead = self.start.nominal_dead_time
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
-        self.simulations, self.budget, self.journal = 0, budget or Budget(), journal
+        self.simulations = 0
         self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:
