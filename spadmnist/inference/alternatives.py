@@ -13,9 +13,10 @@ from .scan import Scan
 from .signature import residuals_at
 from .trial import Trial, at_end, tie
 
-_NAMED = 4  # alternatives of a step
-# of the evidence for a shape at the end of its range: a candidate with as much is confused with it, because another
-# law may be the right one
+# alternatives of a step that its answer names, at most; a rule of thumb
+_NAMED = 4
+# of the evidence for a shape at the end of its range: a candidate with more is confused with it, because another law
+# may be the right one. Slow afterpulsing had been explained as the fast one; the value is a rule of thumb
 _ALMOST = 0.8
 
 

@@ -18,18 +18,28 @@ from .. import kernels
 from ..recording import Recording
 from .levels import FALL_95
 
-# of the dead time, in ticks, and in s: the delay after the shortest interval beyond which no blur is left and other
-# intervals are as dense as at the edge
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# of the dead time, in ticks, and in s: the largest of them is the delay after the shortest interval beyond which no
+# blur is left and other intervals are as dense as at the edge; they are counted from there on
 _BEHIND, _TICKS, _BLURRED = 0.1, 10.0, 1e-9
-_LONG = 3.0  # times that delay: the width of the window in which later intervals are counted
-_PRIOR_INTERVALS = 4.0  # intervals: the weight of the array's own density in that of a pixel
-_FINE, _ROUGH = 257, 40  # grid points in the middle range, where most edges lie, and in each of the two outer ranges
-_MOST = (0.02, 0.98)  # quantiles of the pixels between which the middle range lies
+# times that delay: the width of the window in which later intervals are counted; a wider one has more of them, farther
+# from the edge
+_LONG = 3.0
+# intervals: the weight of the array's own density in that of a pixel; it decides for pixels with few intervals
+_PRIOR_INTERVALS = 4.0
+# grid points in the middle range, where most edges lie, and in each of the two outer ranges: resolution against time
+_FINE, _ROUGH = 257, 40
+_MOST = (0.02, 0.98)  # quantiles of the pixels between which the middle range lies: the fine grid covers it
 _LEAST, _HIGHEST = 0.05, 20.0  # of the listed dead time: no edge is looked for below and above
-_NEARLY = 0.2  # of the listed dead time: the mean delay of a shortest interval below which it informs the edge
-_FAR = 6.0  # times the blur: the largest delay of the edge after the shortest interval
-_OTHERS = 0.001  # share of pixels of any dead time in the prior: a larger one would hold the tails of the normal part
-_WIDTHS = 60  # number of widths that are tried
+# of the listed dead time: the mean delay of a shortest interval below which it informs the edge; the other pixels are
+# left out of the map
+_NEARLY = 0.2
+# times the blur: how far the grid reaches beyond the shortest intervals; a normal law has 1e-9 beyond it
+_FAR = 6.0
+# share of pixels of any dead time in the prior: a larger one would hold the tails of the normal part, a smaller one
+# would pull odd pixels to the others
+_OTHERS = 0.001
+_WIDTHS = 60  # widths of the pixels' law that are tried before the best one is refined: resolution against time
 
 
 @dataclass(frozen=True)

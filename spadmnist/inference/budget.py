@@ -17,13 +17,16 @@ from ..recording import Capture
 
 # s of two idle cores, measured with `rules: device` and all statistics: per detection with a stamp, per detection in
 # frames, per bit that is drawn without its events (of those that are rarer, 0 or 1), per pixel of a frame, and per
-# recording
+# recording. They are the work that the budget counts
 _STAMP, _IN_FRAMES, _DRAWN_BIT, _PIXEL_FRAME, _RECORDING = 1.5e-7, 5e-8, 1e-8, 1e-9, 2e-3
 # a budget in min or h, which the units of sensor files do not have; their length, s
 _LONG, _LONG_UNITS = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(min|h)\s*", re.ASCII), {"min": 60.0, "h": 3600.0}
-_SLOW = 3.0  # times the budget, after which the clock ends a run
+# The others are rules of thumb.
+# times the budget, by the clock: a longer run ends, because its machine is far slower than two idle cores
+_SLOW = 3.0
 _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis
-# shares of the budget after which no further step, and no further fit or test of the steps, begins
+# shares of the budget after which no further step, and no further fit or test of the steps, begins; the rest is for
+# the fits and tests, and for limits and advice
 STEPS, FITS = 0.75, 0.9
 
 

@@ -22,10 +22,14 @@ from ..recording import Capture
 from ..sensor import Sensor
 from .coordinates import Coordinate, Key, Values, coordinate_of, is_edge
 
-_SHAPES = 4  # the largest number of values of a shape within its search range
-_MOST = 6  # the largest number of templates per strength of one candidate
-_BEYOND = 3.0  # factor by which a listed value at an end of the search range may leave it
-_TURNED = 1.02  # factor on a parameter, to test whether the dead times follow it
+# the largest number of values of a shape within its search range: how near a template is to the true shape, against the
+# time of a scan; a rule of thumb
+_SHAPES = 4
+_MOST = 6  # the largest number of templates per strength of one candidate: the time of a scan; a rule of thumb
+# factor by which the search range reaches beyond a listed value at its end or outside, so that this may rise and fall;
+# a rule of thumb
+_BEYOND = 3.0
+_TURNED = 1.02  # factor on a parameter, to test whether the dead times follow it; any that is not rounded off does
 
 
 @dataclass(frozen=True)

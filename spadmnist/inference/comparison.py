@@ -39,7 +39,8 @@ from .repeated_cells import place, repeated
 from .replicates import REPLICATES, TOTALS, Execution, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
-_ENOUGH = 20.0  # detections of a pixel from which on its ratio is informative
+# expected detections from which on, in every pixel, its ratio between two wavelengths is compared; a rule of thumb
+_ENOUGH = 20.0
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,12 @@ from ..plugins import Parameter
 
 Key = tuple[str, str]  # (effect, parameter)
 Values = Mapping[Key, Any]  # parameter values, SI units
-_BEYOND = 0.3  # of a logarithm, or of the search range: how far an interval may extend beyond the search range
-_LEAST = 1e-6  # of the search range: the least distance to its upper end on the scale of that distance
+# of a logarithm, or of the search range: how far an interval may extend beyond that range. What is seen within is
+# taken to hold so far; a rule of thumb
+_BEYOND = 0.3
+# of the search range: the least distance to its upper end on the scale of that distance. It keeps the logarithm finite;
+# any far below a distance that is fitted does
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True)

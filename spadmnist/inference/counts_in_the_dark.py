@@ -28,9 +28,13 @@ from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
 
-_SURE = 1e-3  # p-value below which a misfit is significant
-_WIDER = 1.1  # factor by which afterpulses and the errors of a map may raise the misfit
-_LIT = 0.02  # share of the information on a map in lit captures that is neglected, at most
+# p-value below which a misfit is significant, of the stated model or of that with the map; a rule of thumb
+_SURE = 1e-3
+# factor by which afterpulses and the errors of a map may raise the misfit of a right map beyond that; a rule of thumb
+_WIDER = 1.1
+# share of the information on a map in lit captures that is neglected, at most: with more of it, models are simulated; a
+# rule of thumb
+_LIT = 0.02
 
 
 def may_fit(sensor: Sensor, wanted: Sequence[Candidate]) -> bool:

@@ -24,11 +24,16 @@ from ..statistics import Statistic, Summary
 from .laws import law_of
 from .levels import LEAST_FALL
 
-_LIKE = 0.5  # least cosine of the residuals of two captures that look at the same place
-# chi square, 20 standard deviations: beyond it the scales of different laws have no common measure, and all is certain
+# least cosine of the residuals of two captures that look at the same place: with more, two failing checks of a
+# statistic without an axis are one deviation; a rule of thumb
+_LIKE = 0.5
+# chi square, 20 standard deviations: beyond it the scales of different laws have no common measure, and all is certain.
+# Deviations are then in the order of how specific their statistics are; a rule of thumb
 _CERTAIN = 400.0
 LISTED = 8  # deviations that a terminal lists: what fits on a screen
-_NEAR = 0.1  # relative: the most by which two places on an axis differ that are the same
+# relative: the most by which two places on an axis differ that are the same, so that two failing checks are one
+# deviation; a rule of thumb
+_NEAR = 0.1
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,20 @@ from .results import Step, title
 from .signature import residuals_at, signatures
 from .trial_fits import fit_trial
 
-_MOSTLY = 0.95  # of the excess misfit: a step that explains as much is kept, whatever is left in its own cells
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# of the excess misfit: a single step that explains more is kept, whatever is left in its own cells
+_MOSTLY = 0.95
 _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
-_VAIN = 2  # steps that explain too little of their own cells, after which no further one is tried
-_CLEARLY = 1e-6  # p-value of a check that fails clearly: noise of a fit to first order does not make it
-_NEEDED = 90.0  # in chi square: a step is kept if a fit to first order without it is worse by more
-_NEEDLESS = 9.0  # in chi square: a step is dropped if the fit without it is worse by less
+# steps that explain too little of their own cells, after which no further one is tried: no effect here is the right one
+_VAIN = 2
+# p-value of a check that fails clearly: noise of a fit to first order does not make it. A map without which more checks
+# do is kept without a fit
+_CLEARLY = 1e-6
+# in chi square: a step is kept if a fit to first order without it is worse by more, far above `_NEEDLESS`; otherwise it
+# is fitted again
+_NEEDED = 90.0
+# in chi square: a step is dropped if the fit without it is worse by less; 3 standard deviations of one number
+_NEEDLESS = 9.0
 
 
 def drop_needless(path: ModelPath) -> None:

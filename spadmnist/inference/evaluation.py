@@ -35,17 +35,25 @@ from .null_distribution import Judgement, Null, learn, replicate_residuals, scat
 from .repeated_cells import Repeated, repeated
 from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
-_GOLDEN = (math.sqrt(5) - 1) / 2  # turns: the golden ratio, by which each next point falls into the widest gap
-_PIECES = 4  # tasks of one capture: the number of workers that share it
-_MOVED = 1.0  # sum of squares of a signature in one statistic, in variances, above which the statistic counts
-_WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts
-_OTHER_SCATTER = 3.0  # standard errors of that log: a cell beyond has another scatter; 3 of 1000 do so by chance
-_NOISE = 3.0  # standard deviations of a mean total: what is beyond it is no noise
-# replicates at the stated rates where pixels blink; standard deviations of their totals within which a total is one
+# turns: the golden ratio, by which each next light level of the replicates falls into the widest gap, for any number
+_GOLDEN = (math.sqrt(5) - 1) / 2
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+_PIECES = 4  # tasks of one capture, at most: the number of workers that share it
+# sum of squares of a signature in one statistic, in variances, above which its cells count in the likelihood ratio: a
+# smaller one is less than the noise of one number
+_MOVED = 1.0
+_WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts, a factor of 10
+# standard errors of that log: a cell beyond has another scatter and counts; by the normal law 3 of 1000 do by chance
+_OTHER_SCATTER = 3.0
+_NOISE = 3.0  # standard deviations of a mean total: the light level is moved for what is beyond it, which is no noise
+# replicates at the stated rates where pixels blink; standard deviations of their totals within which a total is one of
+# them, so that the capture is simulated at these rates
 _BLINKING, _SCATTERS = 16, 4.0
 _PILOTS = 5  # rounds of a few replicates in which the level is found that gives the measured total, at most
-_SAME_TOTAL = 1e-5  # of a log: totals that differ by less are the same, far below the noise of any capture
-_FLUCTUATES = 3.0  # factor on the scatter of totals beyond which the light fluctuates
+# of a log: totals that differ by less are the same, far below the noise of any capture, and replicates are borrowed
+_SAME_TOTAL = 1e-5
+# factor on the scatter of totals beyond which the light fluctuates: a step is then judged by its scatter
+_FLUCTUATES = 3.0
 
 
 @dataclass

@@ -24,9 +24,11 @@ from .trial import Trial, is_pattern
 # the largest number of trials that are fitted, random odd pixels and their map not counted; the share of the largest
 # fall of the squares below which none is. Guesses: as much as a fit costs, and what nonlinearity makes of a prediction
 _FITTED, NEAR = 3, 0.4
-# share of a trial's score that remains once another trial is in the model: from it on, the two do not compete
+# share of a trial's score that remains once another trial is in the model: from it on, the two do not compete and are
+# steps of their own; a rule of thumb
 _UNMOVED = 0.9
-_MOSTLY = 0.5  # of the squares of a signature: the plain meaning of "it lies in counts"
+# of the squares of a signature: the plain meaning of "it lies in counts"; a map is then as clear as odd pixels
+_MOSTLY = 0.5
 
 
 def evidence_of(replicates: Replicates, evaluation: Evaluation, one: Trial) -> float:

@@ -27,15 +27,22 @@ from .light_levels import closed_form, level_for
 from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 
-EDGE_FALL = 5.99  # the same for an edge sharper than the intervals are dense: its law is exponential, not normal
-_FAR = 100.0  # of the log-likelihood: a start that is lower than the maximum by more is dropped
-_HIGHER = 0.05  # of the log-likelihood: a value that is higher by more shows that a maximum is none
-_ROUGH = 0.3, 0.5  # tolerances of `by_simplex`: near enough for a parabola
+# fall of twice the log-likelihood at the ends of a 95 % interval, of an edge sharper than the intervals are dense: its
+# law is exponential, not normal, and this is that quantile of chi square with two degrees of freedom
+EDGE_FALL = 5.99
+# of the log-likelihood: a start that may be lower than the maximum by more is dropped for a search from the templates;
+# a rule of thumb
+_FAR = 100.0
+# of the log-likelihood: a value that is higher by more shows that a maximum is none; a rule of thumb
+_HIGHER = 0.05
+# tolerances of `by_simplex`: of its first size, and of the log-likelihood; near enough for a parabola, a rule of thumb
+_ROUGH = 0.3, 0.5
 # bytes of the time stamps and gaps of all captures, at most; more is fitted by simulation. Chosen so that they and the
 # program together take less than `memory.MOST`
 _HELD = 800_000_000
-_LIKELIHOODS = 2  # that are held at once: of the model, and of the model without a change
-_SHARP = 0.1  # of a lifetime: the blur of the stamps must be smaller
+_LIKELIHOODS = 2  # plain meaning: that are held at once, of the model, and of the model without a change
+# of a lifetime: the blur of the stamps must be smaller, or the model is fitted by simulation; a rule of thumb
+_SHARP = 0.1
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,12 @@ from .setups import SetupExplanation
 from .signature import signatures, template_of
 from .trial import Trial
 
+# They decide which captures are advised, and how long the advice takes. All are rules of thumb: no measurement that is
+# kept chose them.
 _RECORDINGS = 16  # replicates of a capture that was not taken yet
-_MOST_EVENTS = 6e5  # detections of such a capture, at most
+_MOST_EVENTS = 6e5  # detections of a longer capture, at most; a brighter one may have twice as many
 _LONG = 100.0  # s of a long dark capture
-_LONGER = 10.0  # factor on the exposure of a capture that is taken again, at most
+_LONGER = 10.0  # factor on the exposure of a lit capture that is taken again, at most
 _MOST_FRAMES = 4.0  # the same for frames, which cost time even where they are empty
 
 

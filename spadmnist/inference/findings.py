@@ -21,10 +21,14 @@ from .repeated_cells import place
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
-_PICTURES, _CAPTURES = 6, 4  # deviations that have pictures, and captures of each, at most
-_MOVED = 9.0  # sum of squares of a signature in a check, in variances, above which the step moves it
-_ENTRIES = 20  # checks that are listed as unexplained, at most
-_SEPARATED = 4.0  # standard deviations of a signature in statistics where the mimic has none: with more it is excluded
+# deviations that have pictures, and captures of each, at most: the length of a page; rules of thumb
+_PICTURES, _CAPTURES = 6, 4
+# sum of squares of a signature in a check, in variances, above which a picture names the step as what moves it: 3
+# standard deviations of one number, a rule of thumb
+_MOVED = 9.0
+_ENTRIES = 20  # checks that are listed as unexplained, at most: the length of an answer; a rule of thumb
+# standard deviations of a signature in statistics where the mimic has none: with more it is excluded; a rule of thumb
+_SEPARATED = 4.0
 _REGISTRY = Statistic.registry
 
 

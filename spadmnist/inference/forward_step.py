@@ -27,8 +27,9 @@ from .score_test import explains_its_signature, p_of_best
 from .trial import Trial, is_pattern, tie
 from .trial_fits import fit_trial
 
-CLOSER = REPLICATES  # replicates of each capture for a closer look
-# of the excess misfit: a step that leaves as many failing checks, and does not explain its own cells, falls short below
+CLOSER = REPLICATES  # replicates of each capture for a closer look: as many as without `quick`
+# of the excess misfit: a step that leaves as many failing checks, and does not explain its own cells, falls short
+# below, and the search does not go on from it; a rule of thumb
 _LEAST_FALL_OF_MISFIT = 0.05
 
 

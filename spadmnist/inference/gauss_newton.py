@@ -16,19 +16,24 @@ from .models import Model
 from .replicates import FEW, CannotSimulate, Cell, Replicates
 from .signature import residuals_at, signatures
 
-_ASIDE = 0.2  # of a logarithm: the step to both sides for a column of the Jacobian
-_CLOSE = 0.02  # the least such step
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# of a logarithm: the step to both sides for a column of the Jacobian, the longest one; known errors make it shorter
+_ASIDE = 0.2
+_CLOSE = 0.02  # the least such step, however small the known error
 _KNOWN_ASIDE = (0.1, 0.7)  # (least, most) of that step for a column that is known but for its size
-_KNOWN_SIZE = 2.5  # the largest factor on the size of a known column
-_SAME = 0.35  # of a logarithm, or of the search range: how far a Jacobian holds
+_KNOWN_SIZE = 2.5  # the largest factor on the size of a known column, so that noise does not change it further
+# of a logarithm, or of the search range: how far a Jacobian holds; beyond it is simulated anew
+_SAME = 0.35
 # of the root of the fall so far: a smaller promised fall ends the fit; it is far less than what separates two
 # candidates
 _PROMISING = 0.1
 # in chi square: a smaller promised fall asks for no new Jacobian; and the fall that noise alone promises, for each
 # further coordinate
 _WORTH_ANEW, _NOISE = 4.0, 2.0
-_VAIN = 2  # steps in a row without a fall, the second one shorter, after which the rest is noise
-_BLIND = 0.05  # squared norm of a column of the Jacobian below which the coordinate is not informed
+_VAIN = 2  # steps in a row without a fall, the second one shorter, after which the rest is noise and the fit ends
+# squared norm of a column of the Jacobian below which the coordinate is not informed, with a standard error above 4.5:
+# it then stays where it is, and its error is infinite
+_BLIND = 0.05
 
 
 @dataclass

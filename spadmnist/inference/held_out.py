@@ -10,7 +10,8 @@ from .evaluation import stacked
 from .gauss_newton import Fit
 from .replicates import TOTALS, Cell
 
-# least share of the information on a coordinate in the other captures, for a capture to be left out of the fit
+# least share of the information on a coordinate in the other captures, for a capture to be left out of the fit;
+# otherwise each of its cells is left out by itself. A rule of thumb
 _INFORMED_BY_OTHERS = 0.3
 
 

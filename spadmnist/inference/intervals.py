@@ -20,7 +20,8 @@ from .results import Value
 from .signature import IGNORED, captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED
 
-_MOVED = 0.5  # standard deviations: a larger move of a coordinate needs another evaluation
+# standard deviations: a larger move of a coordinate by the exact likelihood needs another evaluation; a rule of thumb
+_MOVED = 0.5
 
 
 def sharpen(path: ModelPath, measurement: Measurement) -> None:

@@ -25,21 +25,25 @@ from .signature import IGNORED, captures_showing, residuals_at, signatures
 if TYPE_CHECKING:
     from .model_path import ModelPath
 
-_AGAIN = 4  # iterations: further fits of all coordinates at the model with the step
-SAME = 0.35  # of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+_AGAIN = 4  # iterations: further fits of all coordinates at the model with the step, at most
+# of a coordinate as it is (a logarithm, or SI): how far a Jacobian holds; it is simulated anew after a longer step
+SAME = 0.35
 # in chi square: a fall beyond which the fitted model is simulated; and that beyond which a rough fit does so
 WORTH, _WORTH_AT_ONCE = 6.0, 30.0
 # of a rough fit: moves at most; and in chi square the promised fall for which a rejected Jacobian is simulated anew
 _MOVES, _WORTH_A_JACOBIAN = 2, 300.0
-_MANY = 32  # replicates for a Jacobian where they fluctuate
-_STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates
-_INFORMING = (
-    0.99  # of the squared norm of a column of the Jacobian: the largest blocks with so much inform a coordinate
-)
+_MANY = 32  # replicates for a Jacobian where they fluctuate, at most: its noise against the time
+_STEP = 0.01  # of a coordinate: the step for the derivative of the pixels' rates; they are smooth on a scale of 1
+# of the squared norm of a column of the Jacobian: the largest blocks with so much inform a coordinate. Whether the
+# squares have risen is judged by these, too: the others have noise only
+_INFORMING = 0.99
 RISEN = 3.0  # standard deviations of the noise of the squares: a larger rise ends the fit
 _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shapes held
 _KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
-_LOST = 30.0  # in chi square: a rise beyond which a fitted step is not taken
+# in chi square: a rise beyond which the last step, which is not simulated, is not taken. An echo had moved by 0.1 ns
+# into the next bin, and its line was lost
+_LOST = 30.0
 
 
 def fit_all(

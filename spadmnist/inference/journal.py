@@ -23,9 +23,11 @@ from .reduction import ReducedCapture
 from .replicates import CaptureReplicates
 
 FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
-# bytes of all entries, beyond which nothing is added: the quick diagnosis of the tutorial, of two steps, writes 0.3 GB
+# bytes of all entries, beyond which nothing is added, so that a search that goes on simulates more again: the quick
+# diagnosis of the tutorial, of two steps, writes 0.3 GB. A rule of thumb
 _MOST_BYTES = 2 << 30
-_LARGEST = 1 << 28  # bytes of one entry that is read or written; the largest of the tutorial has 5 MB
+# bytes of one entry that is read or written, at most: the largest of the tutorial has 5 MB. A rule of thumb
+_LARGEST = 1 << 28
 
 
 class Journal:

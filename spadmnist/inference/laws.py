@@ -11,16 +11,24 @@ from typing import ClassVar
 import numpy as np
 from scipy import special, stats
 
-_LEAST = 1e-300  # in place of 0 in a denominator or a tail probability
-_LEAST_RATIO = 1e-3  # of a power relative to its mean: a smaller one is rounded up to this
-_LEAST_POWER = 0.3  # of the mean of a power in a spectrum: the least that a shift may leave
-# of the mean square of one normal score, whose variance is 2: the least that the mean of several may have
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+_LEAST = 1e-300  # in place of 0 in a denominator or a tail probability: near the least number of a double
+# of a power relative to its mean: a smaller one is rounded up to this. Few detections may have a power of exactly 0
+_LEAST_RATIO = 1e-3
+# of the mean of a power in a spectrum: the least that a shift may leave, because random detections keep their power
+_LEAST_POWER = 0.3
+# least variance of the squared score of one power, an eighth of that of independent ones (2): the mean of several has
+# at least this over their number. Without a detection all replicates have the same powers, and right models had failed
 _LEAST_OF_SQUARES = 0.25
-_MANY = 200.0  # expected counts beyond which Anscombe's residual is normal enough
-_FEW = 20.0  # expected counts: below it, a cell does not determine its own dependence on the light
-_EVENTS = 25.0  # expected independent events from which on a count is nearly normal
-_LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion
-_LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged
+# expected counts beyond which Anscombe's residual is normal enough; the score of fewer is that of their mid-p value
+_MANY = 200.0
+# expected counts: below it, a cell does not determine its own dependence on the light, and shares one with all such
+# cells; nor is a shift in it taken without a test of its own
+_FEW = 20.0
+# expected independent events from which on a count is nearly normal: the cells below decide the tails of a score
+_EVENTS = 25.0
+_LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion, for empty cells
+_LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged, for empty cells
 _LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
 
 _Both = tuple[np.ndarray | float, np.ndarray | float]  # of this model and of the other

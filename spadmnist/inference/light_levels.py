@@ -28,24 +28,24 @@ from .replicates import Replicates
 if TYPE_CHECKING:
     from .evaluation import Evaluation
 
+# A value without another reason is a rule of thumb: no measurement that is kept chose it.
 SPREAD = 3.0  # standard deviations of the stated level: half the range over which the light of the replicates varies
 LEAST_SPREAD = 0.01  # of a logarithm: the least half range of the light of the replicates
-_WIDE = 0.15  # of a logarithm: half the widest range of the light of the replicates, that of an uncertainty of 5 %
-_NOISE = 4.0  # standard deviations of the counts: within it a total is the expected one
+# of a logarithm: the largest half range by an uncertainty, of 5 %: over a wider one no regression on the total holds
+_WIDE = 0.15
+_NOISE = 4.0  # standard deviations of the counts: within it a total is the expected one, and the stated level is taken
 # of a logarithm: the noise of the counts beyond which it extends the range of the replicates; the most that it counts
 _MUCH, _MOST_NOISE = 0.05, 0.7
 _DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
-_CLOSED = 5e-4  # relative error of the closed forms, at most
+_CLOSED = 5e-4  # relative error of the closed forms, at most: it adds to the scatter where the mean alone is known
 LEAST_ELASTICITY = 0.01  # the least elasticity of a total that informs the light level
-# of a logarithm, lit and dark: the most that a level is changed for the same number of detections
-_MOST_LIGHT, _MOST_DARK = 1.5, 9.0
+_MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm, lit and dark: the most that a level moves for as many detections
 # expected detections: the least that inform the level; below the other, none are expected
 _LEAST_TOTAL, _NEVER = 5.0, 0.5
 _SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
-_FEW_COUNTS = 30.0  # expected detections of a lit capture: the logarithm of fewer is not normal
-# levels among which the largest total is looked for; relative: a fall that is none
-_COARSE, _FLAT = 37, 1e-6
-_FAINT = 1e-6  # of the stated light: as good as none
+_FEW_COUNTS = 30.0  # expected detections of a lit capture: the logarithm of fewer is not normal, they have a score
+_COARSE, _FLAT = 37, 1e-6  # levels among which the largest total is looked for; relative: a fall that is none
+_FAINT = 1e-6  # of the stated light: as good as none, for the total in the dark
 
 
 @dataclass(frozen=True)

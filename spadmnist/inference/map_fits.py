@@ -48,10 +48,10 @@ from .replicates import Replicates
 from .statistic_maps import fit_by_statistic
 
 # Logarithms of a parameter relative to the array, unless another unit is named. Those of an iteration decide how fast a
-# fit moves, not where it ends. They are rules of thumb: no measurement that is kept chose them.
+# fit moves, not where it ends. All but `_MANY` are rules of thumb: no measurement that is kept chose them.
 _FIRST_WIDTH = 0.3  # of a prior before its width is estimated
 _FIRST_PRECISION = 1e-6  # of that prior: no pixel is held before the width is estimated
-_WIDTHS = (1e-4, 3.0)  # least and largest width of a prior: none to speak of, a factor of 20
+_WIDTHS = (1e-4, 3.0)  # bounds of the width of a prior: none to speak of, a factor of 20
 _DIFFERENCE = 0.02  # by which derivatives are taken: counts are smooth on a scale of 1
 _LARGEST_STEP = 0.7  # of an estimate in an iteration: a factor of 2, beyond which a linear model says little
 _LARGEST_FREE_STEP = 2.0  # the same without a prior, for which little holds an estimate back
@@ -59,7 +59,7 @@ _LARGEST_SHIFT = 0.5  # of the mean of all pixels in an iteration
 _LEVEL_STEP = 2.0  # factor: the most that a light level changes in an iteration
 # probability of a child of an avalanche, at most: at 1 a cascade does not end, here it has ten avalanches in the mean
 _CASCADE_ENDS = 0.9
-_MANY = 128  # values, the median of whose distances gives their width within 10 %
+_MANY = 128  # values, the median of whose distances gives their width within 10 % (normal law); fewer are clipped
 _CLIPPED = 3  # how often odd ones of fewer values are left out, each time by the width of the rest
 _FREE_TURNS = 2  # iterations before the prior's width is estimated, so that the maps have their shape by then
 

@@ -18,7 +18,8 @@ from .models import Model
 from .pixel_maps import ALONE, CODES, PixelMap, groups_of, spread_p
 from .replicates import Replicates
 
-_NEEDED = 1e-4  # p-value of a map that is needed in addition to others
+# p-value of a map that is needed in addition to others: the least needed one is left out above it; a rule of thumb
+_NEEDED = 1e-4
 
 
 def information(

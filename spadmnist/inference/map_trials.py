@@ -29,16 +29,19 @@ if TYPE_CHECKING:
     from .scan import Scan
 
 MAKING_A_MAP = "making a map"  # the stage at which a map may fail
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 # the largest p-value of a map that is tried, and of one with random odd pixels
 LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS = 1e-3, 0.05
-# of a logarithm: widths of the pixels' differences that counts do not show
+# of a logarithm: widths of the pixels' differences that counts do not show, which are tried first; the last but one is
+# compared with the candidate's signature
 _SIGMAS = (0.003, 0.006, 0.012, 0.024, 0.05, 0.1)
 # information on a pixel by its counts, in inverse variances: with more of it, a map is fitted, not drawn
 _INFORMED = 50.0
 # in chi square: the least evidence for a pattern that says as much as the map (one-sided p of 8e-4 with one number)
 _LITTLE = 8.0
-_LIKE = 0.4  # cosine of two signatures: below it they are not alike
-_LEAST_SPREAD = 0.05  # the least mean square of a map that is tried, relative to its noise
+_LIKE = 0.4  # cosine of two signatures: below it they are not alike, and no random map is tried
+# the least mean square of a map that is tried, relative to its noise: in others all pixels are alike
+_LEAST_SPREAD = 0.05
 
 
 def map_trials_of(

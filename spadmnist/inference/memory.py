@@ -13,13 +13,15 @@ from ..sensor import BYTES_PER_EVENT, Sensor
 
 # bytes that all processes take together with one worker or two; chosen so that a computer of 4 GB has room for it
 MOST = 1_500_000_000
-_EACH = MOST // 2  # bytes more for each worker beyond two: who asks for many has the memory for them
+_EACH = MOST // 2  # bytes more for each worker beyond two: who asks for many has the memory for them; a rule of thumb
 # bytes of the main process (220 to 350 MB were measured), and of a worker without its replicate: the program and freed
-# memory that it keeps (90 to 400 MB were measured)
+# memory that it keeps (90 to 400 MB were measured). They decide how many workers there are
 _PROGRAM, _WORKER = 350_000_000, 300_000_000
-_EVENTS_AT_ONCE = 4e6  # events that are simulated at once: of several small replicates, or of a part of a large one
-_ORDERED = 1 << 24  # detections whose order in time is held at once, 8 bytes each
-_STRETCH = 1.5e7  # expected events of the frames that are simulated at once, of a large capture
+# The rest is how the simulator and the statistics divide their work; they decide the memory of a replicate.
+# events that are simulated at once: of several small replicates, as in `replicates`, or of a part of a large one
+_EVENTS_AT_ONCE = 4e6
+_ORDERED = 1 << 24  # detections whose order in time is held at once, 8 bytes each, as in `statistics._order`
+_STRETCH = 1.5e7  # expected events of the frames that are simulated at once, of a large capture: half of that of `twin`
 
 
 def replicate_bytes(sensor: Sensor, capture: Capture, events: float, recorded: float, half: bool = False) -> float:

@@ -20,12 +20,15 @@ from scipy import optimize
 
 from .levels import OPTIMISM_OF_A_PARAMETER
 
-_FAR_OFF = 4.0  # standard deviations from most pixels at which a value is cut off: odd pixels make no pattern
-_LEAST = 1e-3  # of the noise: the least standard deviation of a random effect, which is none
-_STARTS = (0.1, 1.0)  # of the spread of all values: standard deviations of a group at which a search starts
-_ROUNDING = 1e-9  # relative: smaller differences of a shape are those of rounding
+# standard deviations from most pixels at which a value is cut off: odd pixels make no pattern; a rule of thumb
+_FAR_OFF = 4.0
+# of the noise: the least standard deviation of a random effect, which is none; any far below 1 does
+_LEAST = 1e-3
+# of the spread of all values: standard deviations of a group at which a search starts; rules of thumb
+_STARTS = (0.1, 1.0)
+_ROUNDING = 1e-9  # relative: smaller differences of a shape are those of rounding; any well above 1e-16 does
 _SEARCH = {"xatol": 0.01, "fatol": 0.01, "maxiter": 100}  # of a logarithm, of a log-likelihood: they decide nothing
-_LEAST_PIXELS = 3  # fewer have no pattern
+_LEAST_PIXELS = 3  # fewer have no pattern: a mean and a difference take two
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class PatternEvidence:
     pixels: float
 
 
+# plain meaning: no evidence, where a pattern cannot be judged; any other is more
 NO_PATTERN = PatternEvidence(-math.inf, -math.inf, 0.0)
 
 

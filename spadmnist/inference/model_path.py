@@ -30,9 +30,9 @@ from .trial import Trial
 # of a coordinate (a logarithm, mostly): a move by which it is decided whether the coordinate changes the model. Any
 # that is not rounded off does
 _ASIDE = 0.01
-_INFORMS = (
-    0.05  # of the largest mean information of a capture on a map: with less of it, a capture hardly moves the map
-)
+# of the largest mean information of a capture on a map: with less of it, a capture hardly moves the map: this is not
+# fitted again for a trial that only such captures show. A rule of thumb
+_INFORMS = 0.05
 
 
 @dataclass

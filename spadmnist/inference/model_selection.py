@@ -45,16 +45,19 @@ from .results import Diagnosis
 from .score_test import p_of_any
 from .sharper_tests import sharper
 
-MAX_STEPS = 12  # of one diagnosis, by default
-_QUICK = 32  # replicates of each capture in a quick diagnosis
-# p-value of a signature that is followed where no check fails. It is below the false-alarm rate of the checks; at 3e-3
-# with fewer replicates one of 16 right models was called crosstalk
+MAX_STEPS = 12  # of one diagnosis, by default: the search ends; a rule of thumb
+_QUICK = 32  # replicates of each capture in a quick diagnosis: its time against its noise; a rule of thumb
+# p-value of a signature that is followed where no check fails. It is below the false-alarm rate of the checks: followed
+# up to that one, one of 16 right models was called crosstalk, at 3e-3 with fewer replicates. Else a rule of thumb
 _P_SCORE = 4e-3
-_MAYBE = 100.0  # times that p-value: worth more replicates
+# times that p-value: worth more replicates, lest a few decide; a rule of thumb
+_MAYBE = 100.0
 # times that p-value: worth sharper tests, which raise an expected score of 3.2 to 4.5, a p-value 100 times smaller
 _NEARLY = 50.0
-_PLAIN = 1e-6  # p-value of a check that needs no closer look
-_P_LATER_SCORE = 5e-4  # the p-value of a signature that is followed after steps that explain all that failed
+# p-value of a check that needs no closer look, by the fit of all numbers or more replicates; a rule of thumb
+_PLAIN = 1e-6
+# the p-value of a signature that is followed after steps that explain all that failed; a rule of thumb
+_P_LATER_SCORE = 5e-4
 
 
 def diagnose(

@@ -21,8 +21,10 @@ from .laws import Law, law_of
 if TYPE_CHECKING:
     from .replicates import CaptureReplicates
 
-_BEYOND = 1.0  # of the range of the replicates' totals: how far beyond it they inform expectations
-_LEAST = 1e-300  # in place of a variance of 0
+# of the range of the replicates' totals: how far beyond it they inform expectations. Farther off, where wrong models
+# had been called right, the expectation is that of the end; a rule of thumb
+_BEYOND = 1.0
+_LEAST = 1e-300  # in place of a variance of 0: near the least number of a double
 
 
 @dataclass(frozen=True)

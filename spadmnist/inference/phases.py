@@ -18,15 +18,19 @@ from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .signature import Signature, residuals_at, residuals_shifted, signatures
 from .spectral_lines import Line
 
-# factors on the simulated strength: at first, and about the best of these
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# factors on the simulated strength that are tried: at first, and about the best of these
 TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
 NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
-_NEARER = (0.92, 0.96, 1.04, 1.08)  # factors about the best of `NEAR`
+_NEARER = (0.92, 0.96, 1.04, 1.08)  # factors about the best of `NEAR`: they decide the strength within 4 %
 _PHASES = 24  # phases that are tried for each capture
 _FINELY = 360  # steps of a whole turn in the search for the other phase of the same total
-_TURNS = 8  # phases that are simulated
-_MANY = 16  # replicates that decide between the two phases of the same total
-_SIDES = 9.0  # in chi square: the least fall in a capture for which the other phase is taken
+# phases that are simulated: five amplitudes are fitted to them, so that five are the fewest
+_TURNS = 8
+# replicates that decide between the two phases of the same total: few hide the drift of a short capture
+_MANY = 16
+# in chi square: the least fall in a capture for which the other phase is taken; 3 standard deviations of one number
+_SIDES = 9.0
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step between two phases: the finer grid about the best one
 
 

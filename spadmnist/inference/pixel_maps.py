@@ -17,29 +17,38 @@ from .coordinates import Key
 from .mixed_model import PatternEvidence
 from .results import Value
 
-TAILS = 3.0  # degrees of freedom of the prior, a Student t
-# of the information on a map, in the mean over its pixels: a capture with a larger share is needed to fit it
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# degrees of freedom of the prior, a Student t: few, so that odd pixels do not widen it
+TAILS = 3.0
+# of the information on a map, in the mean over its pixels: a capture with a larger share is needed to fit it, and is
+# not judged by a map that is fitted without it
 ALONE = 0.6
 # of a logarithm: the noise of an estimate below which a pixel is informed by itself; the least width of the prior
 INFORMED, LEAST_WIDTH = 0.2, 1e-3
 # relative standard error of the variance of many pixels by the median of their distances, times the root of their
-# number: twice that of the width, 1.166 for a normal law
+# number: about twice that of the width, 1.166 for a normal law
 _DOUBT = 2.34
-_HOT = (0.001, 0.01, 0.03, 0.1)  # shares of hot pixels that are tried
-_MOST_FOR_WIDTH = 16_384  # pixels whose likelihood gives the width of their law: drawn at random from more
-TURNS = 16  # iterations of a fit of maps
-MOST = 10.0  # of a logarithm: the most that a value deviates from that of the array
-# standard deviations beyond which a pixel is odd; of a logarithm, the width of the prior of odd pixels
+# shares of hot pixels that are tried for the width of pixels with few counts; the likeliest is taken
+_HOT = (0.001, 0.01, 0.03, 0.1)
+# pixels whose likelihood gives the width of their law: drawn at random from more, to save time
+_MOST_FOR_WIDTH = 16_384
+TURNS = 16  # iterations of a fit of maps: the last ones decide how near to its end it comes
+# of a logarithm: the most that a value deviates from that of the array, a factor of 22,000; and the largest variance of
+# an estimate that counts. Hot pixels are thousands of times as hot
+MOST = 10.0
+# standard deviations beyond which a pixel is odd where a fit begins; of a logarithm, the width of odd pixels' prior
 ODD, WIDE = 3.5, 2.0
 CODES = "codes"  # the statistic of the codes
-_PERIODS = (256, 140, 100)  # the periods that `statistics.codes` folds codes with
-# the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law
+_PERIODS = (256, 140, 100)  # plain meaning: the periods that `statistics.codes` folds codes with
+# the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law,
+# which ends while it is smooth
 GRID, ROUNDS = (-4.0, 8.0, 97), 100
 # reliability, the share of the variance of values that their estimates have: above the first a value is known well, its
 # spread being too small by 1 %; below the second it spreads as if it had so much, lest noise be blown up five times
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
-NOTHING = 3.0  # standard deviations of a logarithm, from which on nothing is known of it
-HALF_95 = 1.96  # standard deviations: half of a 95 % interval
+# standard deviations of a logarithm, from which on nothing is known of it: of a scene, such a pixel is left out
+NOTHING = 3.0
+HALF_95 = 1.96  # standard deviations: half of a 95 % interval of a normal law
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,18 @@ from ..recording import Recording
 from ..sensor import Sensor
 from ..streams import Draws
 
-DENSE = 4.0  # intervals within the width of an edge, beyond which its estimate is normal
-_LEAST = 1e-9  # the least probability that an interval ends before the dead time: a wrong stamp is not impossible
-_PROBES = 4096  # events that are stamped to measure the blur, at least
-_LONG = 20.0  # lifetimes after which a trap is empty
-_PIECE = 1 << 20  # gaps that are looked at together
-# of a gap that may be short: itself, its hazard, its kind; and itself once more while the pieces are put together
+# intervals within the width of an edge, beyond which its estimate is normal; with fewer its interval is that of an
+# exponential law (`exact_likelihood.EDGE_FALL`). A rule of thumb
+DENSE = 4.0
+# the least probability that an interval ends before the dead time: a wrong stamp is not impossible, and costs 20.7 of
+# the log-likelihood; a rule of thumb
+_LEAST = 1e-9
+# events that are stamped to measure the blur, at least: by the normal law their standard deviation is known to 1.1 %
+_PROBES = 4096
+_LONG = 20.0  # lifetimes after which a trap is empty: 2e-9 of its content is left
+_PIECE = 1 << 20  # gaps that are looked at together: memory against time, and no result depends on it; a rule of thumb
+# of a gap that may be short: itself, its hazard, its kind; and itself once more while the pieces are put together.
+# Plain meaning: they decide how many gaps have room
 BYTES_OF_A_GAP = 8 + 8 + 1 + 8
 _FOLLOWS, _LAST = 1, 2  # kinds of gaps: after another short one; to the end of the exposure
 # (pixels,) rates -> (log-likelihood, its derivative by the rate, minus about the second one), (pixels,) each

@@ -15,8 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-_NOTHING = 1e-5  # of the log-likelihood: with a smaller change it does not depend on a coordinate
-_TINY = 1e-9  # of a coordinate: no distance
+# of the log-likelihood: with a smaller change it does not depend on a coordinate, which then has no interval; far below
+# what moves an interval, a rule of thumb
+_NOTHING = 1e-5
+_TINY = 1e-9  # of a coordinate: no distance, but rounding; any well above 1e-16 and far below an interval does
 
 
 def by_simplex(

@@ -30,11 +30,15 @@ from .replicates import FEW, CannotSimulate, Replicates
 from .signature import IGNORED, captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 _OF_A_SHAPE = 8  # replicates of each capture by which shapes are compared: few, for there may be a dozen shapes
 _TURNS = 6  # steps at most; from the nearest of the shapes four were enough for dark counts that blink
-_VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise
-_PROMISED = 5.0  # in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian
-_FALSE_HITS = 0.5  # expected number of pixels in the array that are taken as hit although they are not
+_VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise and the fit ends
+# in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian, and the fit ends
+_PROMISED = 5.0
+# expected number of pixels in the array that are taken as hit although they are not: less than one. It is the level of
+# the test of each pixel; where a typical hit would not pass it, the counts identify no pixel
+_FALSE_HITS = 0.5
 _ENOUGH = 0.1  # of what a hit adds in the mean: the least excess of a pixel that is taken as hit
 _MOST = 0.4  # share of the pixels: with more of them hit, the median of all is no longer that of the others
 _LEVEL = 10.0  # detections of most pixels, from which on their median gives the level and their scatter

@@ -29,7 +29,8 @@ from .reduction import own_statistics
 from .replicates import CaptureReplicates
 
 SUFFIX = ".replicates"  # of the name of an entry's file
-_MOST_BYTES = 1 << 30  # bytes of all entries together
+# bytes of all entries together: the oldest of more are removed, and simulated anew; a rule of thumb
+_MOST_BYTES = 1 << 30
 
 
 def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:

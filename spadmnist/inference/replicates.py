@@ -33,14 +33,22 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Cell = tuple[str, str]  # (capture, statistic)
 TOTALS = ("", "rates")  # the block of the totals of all captures
-FEW = 4  # replicates of each capture that give the difference between two models
-REPLICATES = 96  # replicates of each capture, by default
-_EVENTS_AT_ONCE = 4_000_000  # detections that are simulated at a time, in as many replicates as hold them
-_FEW_EVENTS = 100_000  # detections and bits of frames, of which a replicate takes little memory
+# replicates of each capture that give the difference between two models: with the same random numbers it has little
+# noise. A rule of thumb
+FEW = 4
+# replicates of each capture, by default: the noise of null distributions against the time; a rule of thumb
+REPLICATES = 96
+# detections that are simulated at a time, in as many replicates as hold them: memory against time, and no result
+# depends on it; a rule of thumb
+_EVENTS_AT_ONCE = 4_000_000
+# detections and bits of frames, of which a replicate takes little memory: that of fewer is not counted; a rule of thumb
+_FEW_EVENTS = 100_000
 # of the work of a recording: its simulation; the rest are its statistics. Measured: 40 of 200 to 320 ns a detection in
-# time stamps (0.13 to 0.24), 100 to 220 of 270 to 350 ns in first stamps (0.3 to 0.63); a value between the two
+# time stamps (0.13 to 0.24), 100 to 220 of 270 to 350 ns in first stamps (0.3 to 0.63); a value between the two. It
+# decides what the budget counts where some statistics are reduced
 _SIMULATING = 0.4
-_SCALES = 8  # replicates whose scales are averaged, however many there are
+# replicates whose scales are averaged, however many there are, so that more of them change no scale; a rule of thumb
+_SCALES = 8
 
 
 class CannotSimulate(SpadError):

@@ -40,22 +40,22 @@ from .trial import (
 from .trial_fits import STRONG
 
 _LOOKING, _AGAIN = "the first look", "the second look"  # the stages at which a candidate may fail
-_SCAN = 2  # replicates of each capture for the first look
-_SECOND = 6  # candidates in the second look
+# A value without another reason is a rule of thumb: no measurement that is kept chose it.
+_SCAN = 2  # replicates of each capture for the first look: its noise against the time of all candidates
+_SECOND = 6  # candidates in the second look, at most
 # of the largest fall: with less of it a candidate has no second look. By a first look at some captures it may be too
 # small by a factor of a few; a later step finds it again
 _HOPELESS = 0.05
 _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
-# of a logarithm: an edge whose best strength is farther from the simulated one is simulated there, too
+# of a logarithm: an edge whose best strength is farther off is simulated where it was seen, too; one of Z 114 was lost
 _FAR_OFF = 0.4
 # factor on the size of a signature: by more, another model has another scatter, and the signature is simulated anew
 _CHANGED = 1.15
-_LEAST_SIZE = 6.0  # standard deviations: a signature below it is none
-_SATURATED = 300.0  # standard deviations: a signature beyond it says little of a smaller one
-_STEPS = 3  # how often a weaker or a stronger edge is tried
-_INSTANT = 0.03  # of a frame: shorter times are the same without stamps
-# times the strength at which a periodic candidate is tried: its power grows as the square
-_PERIODIC_STRENGTHS = (1.0, 4.0)
+_LEAST_SIZE = 6.0  # standard deviations: a fainter signature is none, and is tried stronger
+_SATURATED = 300.0  # standard deviations: a signature beyond it says little of a smaller one; an edge is tried weaker
+_STEPS = 3  # how often a weaker or a stronger edge is tried, at most
+_INSTANT = 0.03  # of a frame: shorter times are the same without stamps, and one template of them is tried
+_PERIODIC_STRENGTHS = (1.0, 4.0)  # factors on the strength of a periodic candidate: its power grows as the square
 
 
 class Scan:

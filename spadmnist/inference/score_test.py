@@ -29,12 +29,18 @@ from .trial import Trial, shape_of
 # statistics of the pixels' counts: each by itself, and their distribution
 PIXELS, _LAWS = "pixel_map", ("spread", "tails", "outliers")
 _EDGES = "early_intervals"  # the statistic of the differences between the pixels' dead times
-_NOISE_SHARE = 0.25  # of the data's projection on a signature: as much may be the noise of a few replicates
-_LITTLE = 0.1  # factor on the strength at which the quadratic part is negligible
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# of the data's projection on a signature: as much may be the noise of a few replicates, so that a step too faint for
+# its cells must explain more than that
+_NOISE_SHARE = 0.25
+_LITTLE = 0.1  # factor on the strength at which the quadratic part is negligible; the score there is tried, too
 _HELD = 0.9  # shrinkage: the weight of the correlation between directions of a candidate, from few replicates
-_SMALL, _FOLDS = 32, 4  # cells of a statistic whose covariance can be estimated, at most; folds of the replicates
+# cells of a statistic whose covariance can be estimated, at most, those of others being taken as independent; folds of
+# the replicates, each tested with the covariance of the others
+_SMALL, _FOLDS = 32, 4
 _LEAST_VARIANCE = 0.3  # the least variance of a cell in the shrunk covariance; a residual has about 1
-# the scatter beyond which the cells of a signature are dependent; the least degrees of freedom then
+# the scatter beyond which the cells of a signature are dependent, and its score has the tails of few; the least degrees
+# of freedom then
 _TOGETHER, _FEWEST = 1.25, 3.0
 # safety factor on the variance of independent squares; the ratio to it from which on values are dependent
 _SURER, _JOINED = 1.1, 1.6

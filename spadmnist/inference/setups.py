@@ -28,11 +28,14 @@ from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures
 from .trial import Trial
 
-TIE = 6.0  # in chi square: explanations nearer than that are a tie
-_VERIFIED = 3  # rivals that are simulated
-_FURTHEST = 7.0  # of a logarithm: the largest factor on an exposure
-_MOST = 300.0  # of a logarithm: beyond any light
-_MISSING = 20.0  # detections missing at the end of a capture that stopped early
+TIE = 6.0  # in chi square: explanations nearer than that are a tie, and all are named; a rule of thumb
+_VERIFIED = 3  # rivals of the set-up that are simulated, the best ones: the time of a step; a rule of thumb
+# of a logarithm: the largest factor on an exposure that is looked for, 1,100; a rule of thumb
+_FURTHEST = 7.0
+_MOST = 300.0  # of a logarithm: beyond any light; a larger one would overflow a double
+# detections missing at the end of a capture that stopped early: by Poisson's law so many are missing by chance with a
+# probability of 2e-9
+_MISSING = 20.0
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,12 @@ from .trial_fits import STRONG
 if TYPE_CHECKING:
     from .scan import Scan
 
-_CANDIDATES = 3  # that are simulated again; the first of them at other shapes, too
-_REPLICATES = 2 * FEW  # of each capture: with four times as many the expected score of that lifetime is 9 % larger
-_LEFT_OUT = 0.05  # of the square of a signature: captures that hold no more of it together are not simulated
+# candidates that are simulated again; the first of them at other shapes, too: the time of a test; a rule of thumb
+_CANDIDATES = 3
+# replicates of each capture: with four times as many the expected score of that lifetime is 9 % larger
+_REPLICATES = 2 * FEW
+# of the square of a signature: captures that hold no more of it together are not simulated; a rule of thumb
+_LEFT_OUT = 0.05
 
 
 def sharper(scan: Scan, evaluation: Evaluation, tried: Sequence[Trial]) -> list[Trial]:

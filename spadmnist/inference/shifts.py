@@ -10,9 +10,13 @@ from scipy import stats
 
 from .null_distribution import Null
 
-# p-values below which a shift is significant: by the mean square of a block, and by one cell (5.5 sigma, two-sided)
+# p-values below which a shift is significant: by the mean square of a block, and by one cell (5.5 sigma, two-sided).
+# Others count as 0: right models had resembled a loss of the readout at 6 to 8 sigma, by templates that were noise of
+# two replicates. How small they are is a rule of thumb
 _P_BLOCK, _P_CELL = 1e-4, 4e-8
-_LEAST_LINE = 100.0  # in variances: the least square of a shift in one cell of a spectrum
+# in variances: the least square of a shift in one cell of a spectrum; a smaller one counts as 0, lest noise of a few
+# replicates be a line. A rule of thumb
+_LEAST_LINE = 100.0
 
 
 def mean_shift(new: np.ndarray, old: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, float, float]:

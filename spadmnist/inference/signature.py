@@ -22,17 +22,19 @@ from .null_distribution import residuals_of
 from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, joined
 from .shifts import beyond_noise, mean_shift
 
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 # factor on the scatter of the model's log totals: up to it, the scatter of another model is taken as the same
 _SAME_SCATTER = 1.5
-_P_TOTALS = 2.3e-4  # one-sided p-value (3.5 sigma) below which totals deviate from the closed form
-_SURE_SQUARE = 30.0  # in variances: the square of a shift that is never noise
-_NEIGHBOURS = 9  # neighbouring powers, the median of which holds no line
+# one-sided p-value (3.5 sigma) below which totals deviate from the closed form, which holds otherwise
+_P_TOTALS = 2.3e-4
+_SURE_SQUARE = 30.0  # in variances: the square of a shift that is never noise; a smaller one of a power has no sign
+_NEIGHBOURS = 9  # neighbouring powers, the median of which holds no line: that of a bin's own noise
 # of the square of a signature, as a share and in variances: captures with so little are not simulated
 IGNORED = 0.01, 4.0
 # of the square of a signature: captures with as much of it give the values of a first fit. With 0.75 a probability and
 # a lifetime that one capture hardly tells apart lost 160 of 2970 in chi square
 _MOST_OF_IT = 0.95
-_SURELY = 8  # replicates of each capture where the totals of a few deviate from the closed form
+_SURELY = 8  # replicates of each capture where the totals of a few deviate from the closed form, lest these decide
 Kept = Literal["sure", "likely", "all"]  # which shifts are kept of what a few replicates show
 
 

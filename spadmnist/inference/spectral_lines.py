@@ -13,23 +13,26 @@ from .evaluation import Evaluation
 from .null_distribution import Null
 from .replicates import TOTALS, Replicates
 
-_CLEAR = 1e-3  # p-value of a line, with the trials factor of all frequencies
-_MOST = 2  # the largest number of lines
-_APART = 2.5  # bins of the shortest capture: the least distance of two lines
-# bins to each side that are averaged; standard deviations beyond which the model has a line of its own
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# p-value of a line, with the trials factor of all frequencies: periodic effects are tried only where there is one
+_CLEAR = 1e-3
+_MOST = 2  # the largest number of lines: each periodic effect is tried at all of them
+# bins of the shortest capture: the least distance of two lines; nearer ones are one line that leaks
+_APART = 2.5
+# bins to each side that are averaged for the model's mean; standard deviations beyond which it has a line itself
 _NEIGHBOURS, _OWN = 12, 3.0
 # bins to each side that a line leaks into; standard deviations beyond which the bins around are raised
 _NEXT, _RAISED = 2, 3.0
-_AROUND = [
-    d for d in range(-_NEIGHBOURS, _NEIGHBOURS + 1) if abs(d) > _NEXT
-]  # bins of the average, relative to the bin
+# bins of the average of the data, relative to the bin: without those that it leaks into
+_AROUND = [d for d in range(-_NEIGHBOURS, _NEIGHBOURS + 1) if abs(d) > _NEXT]
 _OTHERS = 2  # the largest neighbouring bins, which may be another line, are left out
-_WITHIN, _PLACES = 1.2, 481  # bins to both sides within which the frequency is fitted; grid points
+# bins to both sides within which the frequency is fitted; grid points, 200 to a bin
+_WITHIN, _PLACES = 1.2, 481
 _STRENGTHS = np.linspace(0.7, 1.1, 17)  # factors on the amplitude in the data, a part of which is noise
-# the least number of periods in the longest capture; with fewer it is a drift, whose powers are those of a line near
-# 0
+# the least number of periods in the longest capture; with fewer it is a drift, whose powers are those of a line near 0:
+# a drift of Z 12.7 had been explained as a flicker of 0.6 periods
 _LEAST_PERIODS = 1.5
-_SIGN = 2.0  # standard deviations of a bin that informs the frequency
+_SIGN = 2.0  # standard deviations of a bin that informs the frequency: spectra with less are left out of its fit
 
 
 @dataclass(frozen=True)

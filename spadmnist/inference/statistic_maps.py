@@ -22,10 +22,14 @@ from .pixel_maps import PixelMap, groups_of, mean_of
 from .replicates import Replicates
 
 # logarithms of the value relative to the array: the grid on which all pixels are looked for, and how many points cover
-# those that are found; a factor of 20 to both sides, 40 points to the width of a typical posterior
+# those that are found; a factor of 20 to both sides, 40 points to the width of a typical posterior; rules
+# of thumb
 _GRID, _FINE = np.linspace(-3.0, 3.0, 61), 121
-_INFORMED = 0.8  # of the standard deviation of a flat prior on the grid: a pixel with a smaller error is informed
-_BEYOND = 4.0  # standard errors beyond the outermost pixels that the fine grid covers
+# of the standard deviation of a flat prior on the grid: a pixel with a smaller error is informed, and the fine grid
+# covers it; a rule of thumb
+_INFORMED = 0.8
+# standard errors beyond the outermost pixels that the fine grid covers: a normal law has 3e-5 beyond, on each side
+_BEYOND = 4.0
 
 
 def fit_by_statistic(

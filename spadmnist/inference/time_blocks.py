@@ -21,9 +21,13 @@ from .reduction import halves_of
 from .replicates import CannotSimulate, Cell, Replicates
 from .signature import residuals_at, signatures
 
-_SAME_PLACE = 0.02  # relative, on the axis: cells of two captures at the same place
-_FEWER = 2  # the number of replicates of a half is that of a whole capture over this, but not below the least
-_LEAST = 16  # replicates of a half
+# relative, on the axis: cells of two captures at the same place, whose Jacobian is the same but for the detections; a
+# rule of thumb
+_SAME_PLACE = 0.02
+# the number of replicates of a half is that of a whole capture over this, but not below the least: two halves
+# then take about as long as the whole. A rule of thumb
+_FEWER = 2
+_LEAST = 16  # replicates of a half, at least: the noise of its null distribution; a rule of thumb
 
 
 def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:

@@ -21,10 +21,11 @@ from .replicates import TOTALS, Cell
 from .signature import Signature
 
 Phases = Mapping[tuple[str, Key], float]  # (capture, parameter) -> rad
-BOLDER = 3.0  # times the strength of a faint signature, to simulate its shape
-_RAISED = 12.0  # the factor on a strength without a signature for another trial
+# times the strength of a faint signature, to simulate its shape, which noise hides; a rule of thumb
+BOLDER = 3.0
+_RAISED = 12.0  # the factor on a strength without a signature for another trial; a rule of thumb
 # in chi square, constant and per root of the evidence: two candidates nearer than that are a tie, because a few
-# replicates blur the difference
+# replicates blur the difference; rules of thumb
 _TIE, _BLURRED = 8.0, 0.3
 
 

@@ -28,18 +28,24 @@ from .signature import (
 )
 from .trial import Trial
 
-_HARDLY = 1e-3, 1.0  # of the square of a signature, as a share and in variances: statistics with so little are left out
+# Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
+# of the square of a signature, as a share and in variances: other statistics are left out, unless they fail
+_HARDLY = 1e-3, 1.0
 _ASIDE = 0.1  # of a logarithm: the step for the derivative of a periodic candidate by its strength
-STRONG = 60.0  # standard deviations of a signature that noise hardly blurs
-_PROBES = (0.1, 0.03, 0.01, 0.003)  # of a logarithm: the distances of the probes about a fitted shape or edge
+# standard deviations of a signature that noise hardly blurs: fainter effects are simulated at a larger strength
+STRONG = 60.0
+# of a logarithm: the distances of the probes about a fitted shape or edge, where no gradient leads
+_PROBES = (0.1, 0.03, 0.01, 0.003)
 _FINE = (0.0015, 0.0007)  # the same, of an edge: it may be known to some 10 ps
 _ROUNDS_AFTER_PROBES = 2  # of the strengths' fit at the best probe, see `gauss_newton`; as for a whole number
-# of a logarithm: the first distances of an edge; how often they are repeated
+# of a logarithm: the first distances of an edge; how often they are repeated, at most
 _FAR, _MOVES = (0.6, 0.3, 0.15), 6
-_POWERS = (0.85, 2.3)  # powers with which a signature may grow if it is simulated at another strength
-_LINE = 0.25  # of the square of a signature, in one cell of a spectrum: then it is a line
+# powers with which a signature may grow if it is simulated at another strength: about linear to about quadratic
+_POWERS = (0.85, 2.3)
+# of the square of a signature, in one cell of a spectrum: then it is a line, and is simulated at its own strength
+_LINE = 0.25
 _LEAST_BOOST = 1.5  # the least factor on the strength for which a stronger simulation is worth it
-_PHASE_REPLICATES = 6  # replicates for phases: a periodic model draws other random numbers
+_PHASE_REPLICATES = 6  # replicates for phases: a periodic model draws other random numbers, so that it has more noise
 _NEXT = 0.35, 0.1  # of a whole number's logarithm: the first step to its neighbours, and the shortest
 # in chi square: the least fall for another whole number; the rise beyond which one is excluded
 _BETTER, EXCLUDED = 2.0, 6.0

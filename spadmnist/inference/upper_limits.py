@@ -14,11 +14,15 @@ from .score_test import ScoreTest, score_test
 from .signature import Signature, captures_showing, odd_and_even, signatures, template_of
 from .trial import Trial, shape_of
 
-_ONE_SIDED = 1.645  # standard deviations of a one-sided limit of 95 %
-_CLEARLY, _HARDLY = 15.0, 0.5  # standard deviations of a signature: one that noise does not hide, and one that it does
-_LEFT_OUT = 0.1  # of the square of a signature: the share in captures that are not simulated for its growth
-_SATURATED = 1000.0  # standard deviations of a signature that hardly grows any more
-_LOOKS = 5  # simulations at other strengths, at most
+_ONE_SIDED = 1.645  # standard deviations of a one-sided limit of 95 % by a normal law
+# The others are rules of thumb: no measurement that is kept chose them.
+# standard deviations of a signature: one that noise does not hide, by which the growth is measured; one that it hides
+_CLEARLY, _HARDLY = 15.0, 0.5
+# of the square of a signature: the share in captures that are not simulated for its growth
+_LEFT_OUT = 0.1
+# standard deviations of a signature that hardly grows any more: above it every shape is followed down to its limit
+_SATURATED = 1000.0
+_LOOKS = 5  # simulations at other strengths, and iterations of a quadratic limit, at most
 # (factor on the strength at the limit if the signature were linear, size of the signature, trial)
 _Shape = tuple[float, float, Trial]
 
