@@ -30,7 +30,7 @@ from .candidates import with_values
 from .coordinates import Key, Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
-from .levels import FALSE_ALARM, LEAST_P, SHARE_OF_STATISTICS, SHARES
+from .levels import FALSE_ALARM, HALF_95, LEAST_P, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .models import Model
 from .null_distribution import Judgement
@@ -377,7 +377,13 @@ def light_of(
     name = "light"
     nuisances = [
         Nuisance(
-            None, name, math.exp(best), math.exp(best - 1.96 * spread), math.exp(best + 1.96 * spread), pull, common
+            None,
+            name,
+            math.exp(best),
+            math.exp(best - HALF_95 * spread),
+            math.exp(best + HALF_95 * spread),
+            pull,
+            common,
         )
     ]
     checks = [
@@ -402,8 +408,8 @@ def light_of(
                     capture.id,
                     name,
                     math.exp(log),
-                    math.exp(log - 1.96 * e),
-                    math.exp(log + 1.96 * e),
+                    math.exp(log - HALF_95 * e),
+                    math.exp(log + HALF_95 * e),
                     z,
                     capture.light.own_uncertainty,
                 )

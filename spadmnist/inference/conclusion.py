@@ -12,6 +12,7 @@ from .comparison import Comparison
 from .error_budget import Rung
 from .evaluation import BlockCheck, Evaluation, mean_misfit, misfit_null_95
 from .findings import levels_of, nuisances, remainder, traces
+from .levels import HALF_95
 from .model_path import ModelPath
 from .results import Diagnosis, Step, Value, plain
 from .trial import Trial
@@ -168,7 +169,7 @@ def too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
     """
     out = []
     for id, (share, error) in short.items():
-        factor = {"value": plain(share), "low": plain(share - 1.96 * error), "high": plain(share + 1.96 * error)}
+        factor = {"value": plain(share), "low": plain(share - HALF_95 * error), "high": plain(share + HALF_95 * error)}
         out.append({"capture": id, "quantity": "exposure", "factor": factor, "confused": False})
     return out
 

@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import SpadError
 from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
 from .gauss_newton import Effort, Fit, column_of, gauss_newton
-from .joint_fit import RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
-from .levels import LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
+from .joint_fit import LOST, RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
+from .levels import CLEARLY, LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
 from .replicates import FEW, TOTALS, CannotSimulate, Cell
@@ -26,9 +26,6 @@ _MOSTLY = 0.95
 _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
 # steps that explain too little of their own cells, after which no further one is tried: no effect here is the right one
 _VAIN = 2
-# p-value of a check that fails clearly: noise of a fit to first order does not make it. A map without which more checks
-# do is kept without a fit
-_CLEARLY = 1e-6
 # in chi square: a step is kept if a fit to first order without it is worse by more, far above `_NEEDLESS`; otherwise it
 # is fitted again
 _NEEDED = 90.0
@@ -70,7 +67,7 @@ def drop_needless(path: ModelPath) -> None:
         if path.fit is not None:  # its last step, which promises less than WORTH, is not simulated
             now = max(min(now, square(path.fit.residuals)), now - WORTH)
         loss = square(z) - now
-        if loss > 30 and not others:
+        if loss > LOST and not others:
             continue
         at_first_order = _fitted_anew(path, z, without=step)
         if at_first_order is not None and square(at_first_order) - now > _NEEDED:
@@ -129,7 +126,7 @@ def _fail_clearly(path: ModelPath, evaluation: Evaluation) -> int:
     if residuals is None:
         return 0
     found = failing(block_checks(path.replicates, evaluation, residuals))
-    return sum(block.p < _CLEARLY and block.cell not in evaluation.exact for block in found)
+    return sum(block.p < CLEARLY and block.cell not in evaluation.exact for block in found)
 
 
 def _fitted_anew(

@@ -11,7 +11,7 @@ import numpy as np
 
 from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
-from .levels import FALL_95
+from .levels import FALL_95, HALF_95
 from .models import Model
 from .replicates import FEW, CannotSimulate, Cell, Replicates
 from .signature import residuals_at, signatures
@@ -60,7 +60,7 @@ class Fit:
 
     def interval(self, i: int) -> tuple[float, float, float]:
         """(value, low, high) of a coordinate: the estimate and its 95 % interval, in the parameter's unit."""
-        coordinate, half = self.coordinates[i], 1.96 * math.sqrt(max(float(self.covariance[i, i]), 0.0))
+        coordinate, half = self.coordinates[i], HALF_95 * math.sqrt(max(float(self.covariance[i, i]), 0.0))
         u = float(self.point[i])
         return coordinate.value(u), *coordinate.interval(u - half, u + half)
 

@@ -13,8 +13,8 @@ from .evaluation import evaluate, square
 from .exact_likelihood import NoLikelihood, maximise, not_in_likelihood, recordings
 from .gauss_newton import error_scale
 from .joint_fit import fit_all, model_of
+from .levels import HALF_95
 from .model_path import ModelPath, keys_of
-from .pixel_maps import HALF_95
 from .replicates import FEW, CannotSimulate
 from .results import Value
 from .signature import IGNORED, captures_showing, residuals_at, signatures

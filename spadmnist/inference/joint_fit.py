@@ -16,8 +16,9 @@ from . import count_model, map_models, pixel_maps
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
 from .gauss_newton import Fit, JacobianBy, column_of, gauss_newton_step
+from .levels import HALF_95
 from .models import Model
-from .pixel_maps import HALF_95, map_values
+from .pixel_maps import map_values
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .results import Step, Value
 from .signature import IGNORED, captures_showing, residuals_at, signatures
@@ -43,7 +44,7 @@ _FARTHEST = 1.2  # of a coordinate: the longest step of a strength with the shap
 _KEPT = 0.3  # of a promised fall of the squares: with less of it, a Jacobian of fits near by is not used any more
 # in chi square: a rise beyond which the last step, which is not simulated, is not taken. An echo had moved by 0.1 ns
 # into the next bin, and its line was lost
-_LOST = 30.0
+LOST = 30.0
 
 
 def fit_all(
@@ -278,7 +279,7 @@ def _bounded(path: ModelPath, fit: Fit) -> Fit:
     there = {d.key: d.value(float(x)) for d, x in zip(coordinates, fit.point, strict=True)}
     (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], _recordings(evaluation))
     now = square(evaluation.residuals)
-    if isinstance(signature, CannotSimulate) or square(residuals_at(replicates, evaluation, signature)) > now + _LOST:
+    if isinstance(signature, CannotSimulate) or square(residuals_at(replicates, evaluation, signature)) > now + LOST:
         return replace(fit, point=point_of(coordinates, path.values), residuals=evaluation.residuals)
     return fit
 

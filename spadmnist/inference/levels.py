@@ -14,10 +14,14 @@ FALSE_ALARM = 0.01
 SHARES = {"light": 0.25, "rate": 0.25}
 SHARE_OF_TOTALS = sum(SHARES.values())  # of the allowed false alarms: the light and the totals together
 SHARE_OF_STATISTICS = 1 - SHARE_OF_TOTALS  # of the allowed false alarms: all statistics together, the rest
+# p-value of a check that fails clearly. Others are decided by the fit of all numbers and by more replicates, and the
+# noise of a fit to first order fails none so clearly. A rule of thumb
+CLEARLY = 1e-6
 # in chi square: the least evidence for a step that is accepted; a rule of thumb
 LEAST_EVIDENCE = 12.0
 # of twice the log-likelihood, at the ends of a 95 % interval: that quantile of chi square with one degree of freedom
 FALL_95 = 3.84
+HALF_95 = 1.96  # standard deviations: half of a 95 % interval of a normal law
 # in chi square: the optimism of one fitted parameter (Akaike, IEEE Trans. Autom. Control 19 (1974) 716); evidence is
 # less by so much
 OPTIMISM_OF_A_PARAMETER = 2.0

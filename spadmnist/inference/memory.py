@@ -17,9 +17,10 @@ _EACH = MOST // 2  # bytes more for each worker beyond two: who asks for many ha
 # bytes of the main process (220 to 350 MB were measured), and of a worker without its replicate: the program and freed
 # memory that it keeps (90 to 400 MB were measured). They decide how many workers there are
 _PROGRAM, _WORKER = 350_000_000, 300_000_000
+# detections that are simulated at a time, in as many replicates as hold them: memory against time, and no result
+# depends on it; a rule of thumb
+EVENTS_AT_ONCE = 4_000_000
 # The rest is how the simulator and the statistics divide their work; they decide the memory of a replicate.
-# events that are simulated at once: of several small replicates, as in `replicates`, or of a part of a large one
-_EVENTS_AT_ONCE = 4e6
 _ORDERED = 1 << 24  # detections whose order in time is held at once, 8 bytes each, as in `statistics._order`
 _STRETCH = 1.5e7  # expected events of the frames that are simulated at once, of a large capture: half of that of `twin`
 
@@ -33,7 +34,7 @@ def replicate_bytes(sensor: Sensor, capture: Capture, events: float, recorded: f
         half: every other block of time is taken out of it.
     """
     c, readouts, pixels = capture.conditions, (capture.modality,), sensor.layout.pixels
-    at_once = max(sensor.at_once(events, readouts), min(events, _EVENTS_AT_ONCE))
+    at_once = max(sensor.at_once(events, readouts), min(events, EVENTS_AT_ONCE))
     tick = capture.tick or sensor.tick
     if capture.modality == "tr":
         own, file = (_size(c.exposure, one) * recorded for one in (sensor.tick, tick))

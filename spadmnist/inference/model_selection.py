@@ -39,6 +39,7 @@ from .forward_step import (
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import completed
 from .journal import Journal
+from .levels import CLEARLY
 from .model_path import ModelPath, begin
 from .replicates import REPLICATES, TOTALS, Execution, Replicates
 from .results import Diagnosis
@@ -54,8 +55,6 @@ _P_SCORE = 4e-3
 _MAYBE = 100.0
 # times that p-value: worth sharper tests, which raise an expected score of 3.2 to 4.5, a p-value 100 times smaller
 _NEARLY = 50.0
-# p-value of a check that needs no closer look, by the fit of all numbers or more replicates; a rule of thumb
-_PLAIN = 1e-6
 # the p-value of a signature that is followed after steps that explain all that failed; a rule of thumb
 _P_LATER_SCORE = 5e-4
 
@@ -229,14 +228,14 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
-    if all(block.p > _PLAIN for block in path.failed) or scan.only_rates(path.evaluation):
+    if all(block.p > CLEARLY for block in path.failed) or scan.only_rates(path.evaluation):
         complete(path)  # what no check shows plainly, and what the set-up may explain, is decided by the whole fit
     failed, number = path.failed, len(path.steps) + 1
     waiting, notes.waiting = notes.waiting, []
-    plainly = any(block.p <= _PLAIN for block in failed) and not scan.only_rates(path.evaluation)
+    plainly = any(block.p <= CLEARLY for block in failed) and not scan.only_rates(path.evaluation)
     if waiting and plainly and added_from(path, notes, failed, waiting):
         return True
-    if failed and not path.steps and min(b.p for b in failed) > _PLAIN and has_few_replicates(path):
+    if failed and not path.steps and min(b.p for b in failed) > CLEARLY and has_few_replicates(path):
         path.evaluation = with_more_replicates(path)  # lest the scatter of few replicates decide
         failed = path.failed
     if not failed:

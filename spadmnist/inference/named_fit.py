@@ -27,9 +27,8 @@ from .findings import nuisances, remainder, traces
 from .gauss_newton import JacobianBy, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
 from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
-from .levels import LEAST_P
+from .levels import HALF_95, LEAST_P
 from .model_path import ModelPath, accept, begin, material
-from .pixel_maps import HALF_95
 from .replicates import FEW, REPLICATES, CannotSimulate, Execution, Replicates
 from .results import Diagnosis, Step, Value, title
 from .score_test import p_of_map
@@ -167,7 +166,7 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | None) -> tuple[list[
         value = results.get(key)
         if value is not None and value.low is not None and value.high is not None:
             at.append(i)
-            errors.append((value.high - value.low) / (2 * 1.96))
+            errors.append((value.high - value.low) / (2 * HALF_95))
     return [".".join(free[i]) for i in at], correlations[np.ix_(at, at)] * np.outer(errors, errors)
 
 

@@ -184,7 +184,7 @@ def choose_phase(
 
     Args:
         keys, values: as there.
-        phases, mirrored: rad, by capture; see `PeriodicSignature.mirrored`.
+        phases, mirrored: rad, by capture; see `PeriodicSignature.mirror_phase`.
     """
     pairs = [{(id, key): p for id, p in some.items() for key in keys} for some in (phases, mirrored)]
     left = []

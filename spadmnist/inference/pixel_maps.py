@@ -48,7 +48,6 @@ GRID, ROUNDS = (-4.0, 8.0, 97), 100
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
 # standard deviations of a logarithm, from which on nothing is known of it: of a scene, such a pixel is left out
 NOTHING = 3.0
-HALF_95 = 1.96  # standard deviations: half of a 95 % interval of a normal law
 
 
 @dataclass(frozen=True)

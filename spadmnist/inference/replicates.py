@@ -38,9 +38,6 @@ TOTALS = ("", "rates")  # the block of the totals of all captures
 FEW = 4
 # replicates of each capture, by default: the noise of null distributions against the time; a rule of thumb
 REPLICATES = 96
-# detections that are simulated at a time, in as many replicates as hold them: memory against time, and no result
-# depends on it; a rule of thumb
-_EVENTS_AT_ONCE = 4_000_000
 # detections and bits of frames, of which a replicate takes little memory: that of fewer is not counted; a rule of thumb
 _FEW_EVENTS = 100_000
 # of the work of a recording: its simulation; the rest are its statistics. Measured: 40 of 200 to 320 ns a detection in
@@ -412,7 +409,7 @@ def simulated(
         numbers: (replicates,) numbers that seed each recording.
     """
     expected, _ = sensor.expected(np.full((1, sensor.layout.pixels), float(photons.max())), capture.conditions)
-    step = max(1, int(_EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
+    step = max(1, int(memory.EVENTS_AT_ONCE / (float(expected.sum()) + sensor.layout.pixels)))
     for start in range(0, len(numbers), step):
         some = slice(start, start + step)
         streams = Streams(seed, f"capture/{capture.id}", "model", numbers[some])

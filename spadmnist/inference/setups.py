@@ -19,7 +19,7 @@ from scipy import stats
 from .. import twin
 from .candidates import templates
 from .evaluation import Evaluation, square
-from .levels import COST_OF_A_PARAMETER, FALSE_ALARM
+from .levels import COST_OF_A_PARAMETER, FALSE_ALARM, HALF_95
 from .light_levels import closed_form, totals_space
 from .models import InTheDark
 from .replicates import TOTALS, CannotSimulate, Replicates
@@ -145,7 +145,7 @@ def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[Set
     seen: set[tuple[str | None, str]] = set()
     for number, one in enumerate(likely):
         for factor, log, error in zip(one.factors, one.logs, one.errors, strict=True):
-            value, low, high = (plain(math.exp(min(log + k * error, _MOST))) for k in (0.0, -1.96, 1.96))
+            value, low, high = (plain(math.exp(min(log + k * error, _MOST))) for k in (0.0, -HALF_95, HALF_95))
             for id in factor.captures:
                 names = _names(replicates, evaluation, factor, id, float(log), float(error))
                 for name in names:
@@ -193,7 +193,7 @@ def _of_exposure(
             low, high = (middle, high) if detections(math.exp(middle)) < wanted else (low, middle)
         return math.exp((low + high) / 2)
 
-    value, low, high = (plain(factor_at(log + k * error)) for k in (0.0, -1.96, 1.96))
+    value, low, high = (plain(factor_at(log + k * error)) for k in (0.0, -HALF_95, HALF_95))
     return {"value": value, "low": low, "high": high}
 
 
@@ -301,7 +301,7 @@ def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
             break
     signature, z = at(coordinate.value(u))
     given[coordinate.key] = coordinate.value(u)
-    half = 1.96 * math.sqrt(covariance)
+    half = HALF_95 * math.sqrt(covariance)
     residuals = {**evaluation.residuals, TOTALS: z}
     return Trial(
         one.candidate,
