@@ -375,17 +375,8 @@ def light_of(
     own_error = 1 / math.sqrt(informed)
     pull = own / math.hypot(common, own_error)
     name = "light"
-    nuisances = [
-        Nuisance(
-            None,
-            name,
-            math.exp(best),
-            math.exp(best - HALF_95 * spread),
-            math.exp(best + HALF_95 * spread),
-            pull,
-            common,
-        )
-    ]
+    low, high = (math.exp(best + k * spread) for k in (-HALF_95, HALF_95))
+    nuisances = [Nuisance(None, name, math.exp(best), low, high, pull, common)]
     checks = [
         Check(
             name,
@@ -403,17 +394,9 @@ def light_of(
         mean = power * (projection - power * log / e**2) / others
         z = (log - mean) / math.sqrt(e**2 + power**2 / others)
         if capture.light.own_uncertainty > 0:
-            nuisances.append(
-                Nuisance(
-                    capture.id,
-                    name,
-                    math.exp(log),
-                    math.exp(log - HALF_95 * e),
-                    math.exp(log + HALF_95 * e),
-                    z,
-                    capture.light.own_uncertainty,
-                )
-            )
+            low, high = (math.exp(log + k * e) for k in (-HALF_95, HALF_95))
+            stated = capture.light.own_uncertainty
+            nuisances.append(Nuisance(capture.id, name, math.exp(log), low, high, z, stated))
         change = math.expm1((log - mean) * elasticity)
         size = f"{100 * change:+.2f} % detections relative to the other captures"
         checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))

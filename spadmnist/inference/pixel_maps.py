@@ -14,6 +14,7 @@ from ..sensor import Sensor
 from . import blind_times, mixed_model
 from .candidates import Candidate
 from .coordinates import Key
+from .levels import HALF_95
 from .mixed_model import PatternEvidence
 from .results import Value
 
