@@ -49,7 +49,8 @@ def after_diagnosis(
         entry = found.setup[0]
         return (
             f"measure the {entry['quantity']} of {entry['capture'] or 'all captures'} again, correct measurement.yaml, "
-            f"and type spadmnist compare {sensor} {measurement}."
+            f"and type spadmnist diagnose {sensor} {measurement} {same}: faint effects, which fail no check, are "
+            "looked for where the totals agree."
         )
     if found.advice and found.verdict == "confused":
         return f"take the capture {found.advice[-1]['capture']!r}, add it to the measurement, and diagnose again."
