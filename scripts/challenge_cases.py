@@ -312,7 +312,7 @@ def crosstalk_set(lab: Lab, x: float) -> Hidden:
     """More crosstalk than the data sheet says; diagonal neighbours and the delay as it says."""
     stated, real = STATED_CROSSTALK, STATED_CROSSTALK + x
     sheet = {"probability": stated, "diagonal_ratio": 0.16}
-    if lab.family == "tr":
+    if lab.family != "qis":  # frames have no delays
         sheet["delay"] = f"{CROSSTALK_DELAY * 1e9:g} ns"
     lab.effects["crosstalk"] = sheet
     near = {(dx, dy): 1.0 if dx * dy == 0 else 0.16 for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy}
@@ -320,9 +320,10 @@ def crosstalk_set(lab: Lab, x: float) -> Hidden:
     # the law of the delay is the stated one, too: the number alone is wrong
     lab.world.crosstalk_delay, lab.world.crosstalk_order = CROSSTALK_DELAY, 1
     ratios = np.array(list(near.values()))
-    if lab.family == "tr":
+    if lab.family != "qis":
         hazard = np.exp(-LAGS / CROSSTALK_DELAY) / CROSSTALK_DELAY
-        z = math.sqrt(sum(followers(lab, x * r * hazard, stated * r * hazard) ** 2 for r in ratios))
+        behind = followers if lab.family == "tr" else oracle.first_followers
+        z = math.sqrt(sum(behind(lab, x * r * hazard, stated * r * hazard) ** 2 for r in ratios))
     else:
         z = oracle.within_frames(lab, x * ratios)
     truth = changed("set", "crosstalk", "probability")
@@ -371,9 +372,10 @@ def crosstalk(lab: Lab, x: float) -> Hidden:
     lab.world.crosstalk = table
     lab.world.crosstalk_delay = float(np.exp(lab.rng.uniform(math.log(0.2e-9), math.log(3e-9))))
     delay = lab.world.crosstalk_delay
-    if lab.family == "tr":
+    if lab.family != "qis":
         hazard = np.exp(-LAGS / delay) / delay
-        z = math.sqrt(sum(followers(lab, chance * hazard) ** 2 for chance in table.values()))
+        behind = followers if lab.family == "tr" else oracle.first_followers
+        z = math.sqrt(sum(behind(lab, chance * hazard) ** 2 for chance in table.values()))
         argument = "pairs of pixels: excess within the delay"
     else:
         z = oracle.within_frames(lab, np.array(list(table.values())))

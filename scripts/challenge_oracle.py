@@ -70,6 +70,21 @@ def within_frames(lab: Lab, chances: np.ndarray) -> float:
     return math.sqrt(total)
 
 
+def first_followers(lab: Lab, extra: Any, base: Any = 0.0) -> float:
+    """Z of an excess hazard `extra` (1/s, at LAGS) of a neighbour behind the first stamp of a pixel in a frame.
+
+    Both stamps are the first of their pixels: the one at t, with the chance exp(-lambda t) that the neighbour has none
+    so far, and the neighbour's next one.
+    """
+    total = 0.0
+    for c in lab.stated:
+        rate = lab.rate(c)
+        first = lab.pixels * c.frames * -math.expm1(-2 * rate * c.frame_time) / 2
+        seen = gain(rate + base, extra) * np.exp(-rate * LAGS) * (c.frame_time > LAGS)
+        total += 2 * first * float(np.trapezoid(seen, LAGS))
+    return math.sqrt(total)
+
+
 def light_errors(lab: Lab) -> float:
     """1 / (error of one pixel's relative light, from all lit captures together)."""
     return math.sqrt(sum(lab.weight(c) * lab.share(c) ** 2 for c in lab.lit))

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import laws
@@ -247,6 +248,28 @@ def test_crosstalk_of_another_strength_has_the_delay_that_the_data_sheet_states(
     cut = -np.expm1(-6e-9 / hidden.CROSSTALK_DELAY)
     laws.distribution_is(found, lambda x: -np.expm1(-x / hidden.CROSSTALK_DELAY) / cut)
     assert generator.World.crosstalk_order == 2
+    for family in ("tr", "str"):  # both have time stamps
+        lab = hidden.Lab(family, 5)
+        hidden.crosstalk_set(lab, 0.02)
+        assert lab.effects["crosstalk"]["delay"] == f"{hidden.CROSSTALK_DELAY * 1e9:g} ns"
+
+
+def test_the_oracle_significance_of_crosstalk_in_first_stamps_is_its_likelihood_ratio() -> None:
+    """Two pixels, a third of whose frames have both stamps; frames alone tell a tenth of it."""
+    rate, frame, chance, delay, frames = 1e5, 1e-5, 0.02, 1e-9, 3_000_000
+    one = SimpleNamespace(frames=frames, frame_time=frame)
+    lab: Any = SimpleNamespace(stated=[one], pixels=1, rate=lambda c: rate)
+    z = hidden.oracle.first_followers(lab, chance * np.exp(-hidden.oracle.LAGS / delay) / delay)
+    rng = np.random.default_rng(2)
+    first, other = rng.exponential(1 / rate, (2, frames))
+    child = np.where(rng.random(frames) < chance, first + rng.exponential(delay, frames), np.inf)
+    gap = np.where(other < first, np.inf, np.minimum(other, child) - first)[first < frame]
+    gap = gap[np.isfinite(gap)]  # those behind which the neighbour fires, or would after the frame
+    extra = chance * np.exp(-gap / delay) / delay
+    ratio = np.log1p(extra / rate) + chance * np.expm1(-gap / delay)
+    error = 2 * float(np.std(ratio)) * math.sqrt(len(ratio))
+    assert abs(2 * float(ratio.sum()) - z**2) < 5 * error + 0.02 * z**2
+    assert z > 10 * hidden.oracle.within_frames(lab, np.array([chance]))
 
 
 def test_the_oracle_significance_of_a_sine_is_what_a_sine_shows() -> None:

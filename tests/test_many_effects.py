@@ -12,6 +12,7 @@ from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import is_edge
+from spadmnist.inference.earlier_trials import has_changed
 from spadmnist.inference.elimination import _drop_unless_missed, drop_needless
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
@@ -185,10 +186,10 @@ def test_signatures_of_the_first_look_are_used_again(lab) -> None:
     assert again[0].candidate.name == anew[0].candidate.name == "add crosstalk"
     # of another size: the same trial is simulated anew
     known = next(t for t in first if t.candidate.name == "add crosstalk")
-    assert not path.scan._has_changed(path.evaluation, known)
-    assert path.scan._has_changed(path.evaluation, replace(known, size=known.size * 1.3))
+    assert not has_changed(path.scan, path.evaluation, known)
+    assert has_changed(path.scan, path.evaluation, replace(known, size=known.size * 1.3))
     path.scan.accepted = [known.candidate]
-    assert path.scan._has_changed(path.evaluation, known)
+    assert has_changed(path.scan, path.evaluation, known)
 
 
 def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:

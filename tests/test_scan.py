@@ -17,6 +17,7 @@ from spadmnist import plugins
 from spadmnist.effects import Effect
 from spadmnist.inference.candidates import first_strengths
 from spadmnist.inference.coordinates import Coordinate
+from spadmnist.inference.earlier_trials import still_valid
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio, square
 from spadmnist.inference.evidence import best_of, evidence_of, worth_fitting
 from spadmnist.inference.gauss_newton import Fit
@@ -492,7 +493,7 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
         Trial(candidate, {CROSSTALK: x}, nothing, gain, t) for x, gain, t in ((0.1, 50.0, 0.03), (0.004, 45.0, 0.8))
     )
     seen: list[Trial] = []
-    monkeypatch.setattr(Scan, "_simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
     asked: list[float] = []
     monkeypatch.setattr(
         "spadmnist.inference.scan.map_trials_of", lambda scan, evaluation, values, least: asked.append(least) or []
@@ -534,7 +535,7 @@ def test_a_faint_template_of_another_shape_is_looked_at_beside_a_strong_one(lab,
         for p, t, gain, times in ((0.0085, 3e-7, 74.0, 1.7), (7e-4, 8e-11, 50.0, 7.2), (7e-4, 2e-8, 49.0, 1.5))
     )
     seen: list[Trial] = []
-    monkeypatch.setattr(Scan, "_simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
     monkeypatch.setattr("spadmnist.inference.scan.map_trials_of", lambda scan, evaluation, values, least: [])
     look.again(evaluation, {}, [strong, faint, near])
     assert [one.values[delay] for one in seen] == [3e-7, 8e-11]
@@ -642,14 +643,14 @@ def test_a_template_of_another_strength_does_not_hide_one_that_promises(lab) -> 
     weak, strong = (
         Trial(candidate, v, m, 0.0, 1.0) for (_, v), m in zip(tries, (like, Signature({}, {}, {})), strict=True)
     )
-    assert [t.values for t in look._still(evaluation, tries, [strong], True)] == [strong.values]
+    assert [t.values for t in still_valid(look, evaluation, tries, [strong], True)] == [strong.values]
     cells = len(evaluation.residuals[cell])
     evaluation.residuals[cell] = np.full(cells, 4.0)
     usual = np.maximum(evaluation.nulls[cell].expected(replicates.seen["flat"].total)[0], 1.0)
     weak.signature = Signature({cell: 4.0 * np.sqrt(usual)}, {}, {})
     weak.fall, _ = look.line_search(evaluation, weak.signature, weak.signed)
     assert weak.fall > 25
-    assert look._still(evaluation, tries, [weak, strong], True) == []
+    assert still_valid(look, evaluation, tries, [weak, strong], True) == []
 
 
 def test_a_time_is_tried_short_and_long(lab) -> None:

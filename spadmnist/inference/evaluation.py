@@ -230,14 +230,27 @@ def _evaluate(
             if not null.law.exact:
                 evaluation.residuals[cell] = judged.residuals
                 evaluation.replicate_residuals[cell] = replicate_residuals(null, made, made.values[name])
+    _compare_totals(replicates, evaluation, n)
+    return evaluation
+
+
+def _compare_totals(replicates: Replicates, evaluation: Evaluation, number: int) -> None:
+    """Write the residuals of the totals, and those of so many replicates."""
     evaluation.residuals[TOTALS] = totals_residuals(
         replicates, evaluation, {id: math.log(max(s.total, 0.5)) for id, s in replicates.seen.items()}
     )
-    draws = np.random.Generator(np.random.Philox(key=replicates.seed + 1)).standard_normal(n)
+    draws = np.random.Generator(np.random.Philox(key=replicates.seed + 1)).standard_normal(number)
     evaluation.replicate_residuals[TOTALS] = np.stack(
-        [own_totals(replicates, evaluation, k, float(draws[k])) for k in range(n)]
+        [own_totals(replicates, evaluation, k, float(draws[k])) for k in range(number)]
     )
-    return evaluation
+
+
+def with_totals_anew(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
+    """The evaluation with its totals compared anew, where `Replicates.unstated` has changed."""
+    residuals, own = dict(evaluation.residuals), dict(evaluation.replicate_residuals)
+    again = replace(evaluation, residuals=residuals, replicate_residuals=own, space=None)
+    _compare_totals(replicates, again, len(own[TOTALS]))
+    return again
 
 
 _Centre = tuple[float, float | None, Callable[[float], float], float]  # see `central_level`

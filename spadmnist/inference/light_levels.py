@@ -415,6 +415,7 @@ def _stated(replicates: Replicates, evaluation: Evaluation) -> list[str]:
         id
         for id in replicates.seen
         if evaluation.rates[id].stated is not None
+        and (replicates.seen[id].half_of or (replicates.seen[id].capture,))[0].id not in replicates.unstated
         and _informative(replicates, evaluation.rates[id], replicates.seen[id].total)
     ]
 

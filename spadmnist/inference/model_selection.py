@@ -25,7 +25,7 @@ from .comparison import Comparison, comparison_of, comparison_with, nothing_to_c
 from .conclusion import Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
-from .evaluation import misfit_null_95
+from .evaluation import block_checks, failing, misfit_null_95, with_totals_anew
 from .findings import mimicked
 from .forward_step import (
     added_from,
@@ -136,7 +136,7 @@ def _diagnosed(
                 drop_needless(path)
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
-    if path.steps and not short:
+    if path.steps and not short and not notes.explained:  # the rates follow from the stated light
         with or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
     with or_as_before(path, "the fit in the pixels that were hit"):
@@ -174,6 +174,7 @@ def _diagnosed(
                 notes.tried = path.scan.scan(path.evaluation, everywhere=True, known=notes.tried)
             limits = upper_limits.upper_limits(path.scan, path.evaluation, notes.tried)
     replicates.budget.until = math.inf
+    replicates.unstated = frozenset()  # measurement.yaml is as it was
     in_sample: Comparison | None = None
     with or_as_before(path, "the last comparison"):
         replicates.say("the comparison of the model with its steps")
@@ -228,6 +229,8 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
+    if notes.explained and path.steps:
+        _is_as_stated(path, notes)
     if all(block.p > CLEARLY for block in path.failed) or scan.only_rates(path.evaluation):
         complete(path)  # what no check shows plainly, and what the set-up may explain, is decided by the whole fit
     failed, number = path.failed, len(path.steps) + 1
@@ -256,8 +259,8 @@ def _another(path: ModelPath, notes: Notes) -> bool:
                 return False
         path.evaluation = before  # under this evaluation no check fails: nothing is left
         return False
-    if scan.only_rates(path.evaluation) and _by_setup(path, notes):
-        return False
+    if not notes.explained and scan.only_rates(path.evaluation) and _by_setup(path, notes):
+        return True  # a score test of what the other statistics show
     clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
     first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
@@ -348,4 +351,24 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
             notes.advice.append(experiment_design.on_brightest(replicates, evaluation, likely[0], found[0]))
     notes.setup = found + notes.setup
     notes.explained = True
+    replicates.unstated = frozenset(entry["capture"] for entry in found)
+    path.evaluation = with_totals_anew(replicates, evaluation)
+    return True
+
+
+def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
+    """Whether the steps explain the totals, so that the set-up need not; its entries are then removed.
+
+    Light that fluctuates slowly gives a capture another total, and so may another light level.
+    """
+    replicates, free = path.replicates, path.replicates.unstated
+    replicates.unstated = frozenset()
+    stated = with_totals_anew(replicates, path.evaluation)
+    if any(block.cell[0] == "" for block in failing(block_checks(replicates, stated, stated.residuals))):
+        replicates.unstated = free
+        return False
+    path.evaluation = stated
+    # it has found them all; those of captures that stopped early are not among them
+    notes.setup = [entry for entry in notes.setup if entry["capture"] not in free]
+    notes.explained, notes.bent, notes.rival, notes.advice = False, False, None, []
     return True

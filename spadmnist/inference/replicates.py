@@ -200,6 +200,8 @@ class Replicates:
         self.measurement, self.exposures, self.reduced = measurement, dict(exposures or {}), reduced
         self.seen: dict[str, ReducedCapture] = {}
         self.simulations = 0
+        # captures whose stated level is wrong, as the set-up explains the totals: their totals are not compared
+        self.unstated: frozenset[str] = frozenset()
         self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:

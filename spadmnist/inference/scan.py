@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..errors import UNABLE, SpadError, why
 from ..sensor import Sensor
 from .candidates import Candidate, has_random_pixels, templates, with_values
 from .coordinates import Key, is_edge
+from .earlier_trials import completed, still_valid
 from .evaluation import Evaluation, block_checks, failing, square
 from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
@@ -49,8 +50,6 @@ _HOPELESS = 0.05
 _NEARLY = 0.8  # of the largest fall of a candidate: of templates with as much, the one nearest to its best strength
 # of a logarithm: an edge whose best strength is farther off is simulated where it was seen, too; one of Z 114 was lost
 _FAR_OFF = 0.4
-# factor on the size of a signature: by more, another model has another scatter, and the signature is simulated anew
-_CHANGED = 1.15
 _LEAST_SIZE = 6.0  # standard deviations: a fainter signature is none, and is tried stronger
 _SATURATED = 300.0  # standard deviations: a signature beyond it says little of a smaller one; an edge is tried weaker
 _STEPS = 3  # how often a weaker or a stronger edge is tried, at most
@@ -202,7 +201,7 @@ class Scan:
                 chips = candidate.kind == "add" and has_random_pixels(with_values(evaluation.sensors.one, tried))
                 sensors = evaluation.sensors.changed(tried, chips=chips)
                 still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
-        for one in self._simulated(evaluation, still, few, only):
+        for one in self.simulated(evaluation, still, few, only):
             one.seen = set(only or evaluation.made)
             one.size = size_of(self.replicates, evaluation, one.signature)
             one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
@@ -237,8 +236,8 @@ class Scan:
         at = [float(tried[coordinate.key]) for coordinate in frequencies_of(candidate)]
         return next((line for line in self.lines(evaluation) if line.frequency in at), None)
 
-    def _simulated(
-        self, evaluation: Evaluation, tried: Sequence[Trial], few: int, only: Sequence[str] = ()
+    def simulated(
+        self, evaluation: Evaluation, tried: Sequence[Trial], few: int = _SCAN, only: Sequence[str] = ()
     ) -> list[Trial]:
         """The trials with their signatures; those that cannot be simulated are left out and recorded.
 
@@ -282,8 +281,8 @@ class Scan:
             out = self._by_totals(evaluation, tries)
         else:
             some = [] if everywhere else self.most_informative(evaluation)
-            still = self._still(evaluation, tries, [t for t in known if t.seen], everywhere)
-            old = self._completed(evaluation, still, some or evaluation.made)
+            still = still_valid(self, evaluation, tries, [t for t in known if t.seen], everywhere)
+            old = completed(self, evaluation, still, some or evaluation.made)
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = old + self._raised(evaluation, self._looked_at(evaluation, tries, some), some)
             out += self._lowered(evaluation, out, some)
@@ -367,62 +366,6 @@ class Scan:
             here = [t for t in found if wanted(t)]
         return out
 
-    def _still(
-        self,
-        evaluation: Evaluation,
-        tries: Sequence[tuple[Candidate, dict[Key, Any]]],
-        known: Sequence[Trial],
-        anew: bool,
-    ) -> list[Trial]:
-        """The known trials that are still candidates, at their best strength.
-
-        A trial that the data resemble is left out, to be simulated anew, if its signature has changed.
-
-        Args:
-            anew: every trial that the data resemble is left out, and of the others those whose signature has changed.
-        """
-        out, promising = [], set()
-        for one in known:
-            if one.candidate.phases or not any(is_same(one, *t) for t in tries):
-                continue
-            now = replace(one, sharp=False)
-            now.fall, now.times = self.line_search(evaluation, one.signature, one.signed)
-            out.append(now)
-            resembled, known_size = now.fall >= PROMISING / 4, now.size > 0
-            if (resembled and anew) or ((resembled or (anew and known_size)) and self._has_changed(evaluation, now)):
-                promising.add((now.candidate.name, shape_of(now)))
-        return [t for t in out if (t.candidate.name, shape_of(t)) not in promising]
-
-    def _has_changed(self, evaluation: Evaluation, known: Trial) -> bool:
-        """Whether the size of a known signature, in standard deviations, is another one under this model.
-
-        It shows that the cells have another scatter. It does not show another shift; the second look simulates that.
-        """
-        if any(known.candidate.effect == candidate.effect for candidate in self.accepted):
-            return True
-        now = size_of(self.replicates, evaluation, known.signature)
-        return not known.size / _CHANGED < now < known.size * _CHANGED
-
-    def _completed(self, evaluation: Evaluation, known: Sequence[Trial], wanted: Collection[str]) -> list[Trial]:
-        """The trials with their signatures completed in captures in which they were not simulated."""
-        out = [one for one in known if set(wanted) <= one.seen]
-        groups: dict[frozenset[str], list[Trial]] = {}
-        for one in known:
-            if set(wanted) <= one.seen:
-                continue
-            with contextlib.suppress(SpadError):  # what cannot be set in this model any more is tried anew
-                sensors = evaluation.sensors.changed(one.values, chips=one.chips)
-                groups.setdefault(frozenset(set(wanted) - one.seen), []).append(replace(one, sensors=sensors))
-        for missing, some in groups.items():
-            earlier = {id(one): one.signature for one in some}
-            for one in self._simulated(evaluation, some, _SCAN, sorted(missing)):
-                one.signature = earlier[id(one)].completed(one.signature, missing)
-                one.seen = one.seen | missing
-                one.size = size_of(self.replicates, evaluation, one.signature)
-                one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
-                out.append(one)
-        return out
-
     def only_rates(self, evaluation: Evaluation) -> bool:
         """Whether only totals fail; with a line in the spectra, it may be what moves those of short captures."""
         failed = failing(block_checks(self.replicates, evaluation, evaluation.residuals))
@@ -489,7 +432,7 @@ class Scan:
                     sizes[id(out[-1])] = size
         # random odd pixels are a map as well, even where the map by itself would not be significant
         least = LEAST_P_WITH_ODD_PIXELS if any(one.chips for one in best) else LEAST_P_OF_MAP
-        for one in self._simulated(evaluation, [*out, *map_trials_of(self, evaluation, values, least)], FEW):
+        for one in self.simulated(evaluation, [*out, *map_trials_of(self, evaluation, values, least)], FEW):
             if one.maps is None:
                 before, x, size = sizes[id(one)], abs(one.times), size_of(self.replicates, evaluation, one.signature)
                 if (

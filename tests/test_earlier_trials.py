@@ -1,0 +1,73 @@
+"""Trials of an earlier model: which signatures are used again under the next one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from tinylab import bench_of, taken
+
+import spadmnist as sp
+from spadmnist.inference.candidates import candidates
+from spadmnist.inference.earlier_trials import _differ, still_valid
+from spadmnist.inference.model_path import begin
+from spadmnist.inference.signature import Signature
+
+DELAY, PROBABILITY = ("crosstalk", "delay"), ("crosstalk", "probability")
+PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
+
+
+def test_another_number_of_the_same_effect_is_simulated_anew() -> None:
+    """More crosstalk at a delay of 0.1 ns is no more of what the data have, which is at 40 ns."""
+    effects = [
+        sp.effects.Detection(pdp=0.5),
+        sp.effects.Crosstalk(probability=0.05, delay=1e-10),
+        sp.effects.DeadTime(duration=50e-9),
+        sp.effects.DarkCounts(rate=100.0),
+        sp.effects.Tdc(resolution=1e-10),
+    ]
+    stated = sp.Sensor(sp.Layout(2, 2, 25e-12, 1.0), effects, rules="device")
+    truth = stated.with_values({"crosstalk.probability": 0.08, "crosstalk.delay": 40e-9})
+    flat = sp.Capture(
+        "flat", "tr", exposure=0.2, wavelength=500e-9, irradiance=2e5 * PHOTON / 25e-12, relative_uncertainty=0.1
+    )
+    path = begin(bench_of((stated, sp.simulate(truth, [flat], seed=1)), 16))
+    some = ("set crosstalk.probability", "set crosstalk.delay", "set dead_time.duration")
+    path.scan.candidates = lambda sensor: [c for c in candidates(sensor) if c.name in some]  # type: ignore[method-assign]
+    first = path.scan.scan(path.evaluation)
+    taken(path, "set crosstalk.delay", {DELAY: 40e-9})
+    path.scan.accepted = [c for c in candidates(stated.resolved()) if c.name == "set crosstalk.delay"]
+    again, anew = (path.scan.scan(path.evaluation, known=known) for known in (first, ()))
+
+    def fall(found: list) -> float:
+        return max(t.fall for t in found if t.candidate.name == "set crosstalk.probability")
+
+    assert fall(anew) > 100
+    assert fall(again) == pytest.approx(fall(anew), rel=0.2)
+    # what was simulated under this model, and what is of another effect, is used again, where the data resemble neither
+    for known, kept in ((first, {"set dead_time.duration"}), (again, {"set dead_time.duration", some[0]})):
+        faint = [replace(one, signature=Signature({}, {}, {})) for one in known if one.candidate.name != some[1]]
+        tries = [(one.candidate, one.values) for one in faint]
+        found = still_valid(path.scan, path.evaluation, tries, faint, False)
+        assert {one.candidate.name for one in found} == kept
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "differ"),
+    [
+        (1.0, 1.1, False),
+        (1.0, 1.2, True),
+        (0.0, 0.0, False),
+        (0.0, 1e-12, True),
+        (None, None, False),
+        (None, 1.0, True),
+        (True, False, True),
+        ([1.0, 2.0], [1.0, 2.1], False),
+        ([1.0, 2.0], [1.0, 3.0], True),
+        ([1.0, 2.0], 1.0, True),
+        ("a", "b", True),
+        ({"a": 1}, {"a": 1}, False),
+    ],
+)
+def test_values_differ_by_more_than_scatter(one: object, other: object, differ: bool) -> None:
+    assert _differ(one, other) is differ
