@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tinylab import bench_of, taken
+from tinylab import bench_of, taken, wrong_numbers
 
 import spadmnist as sp
 from spadmnist.inference.candidates import candidates
@@ -13,25 +13,14 @@ from spadmnist.inference.earlier_trials import _differ, still_valid
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.signature import Signature
 
-DELAY, PROBABILITY = ("crosstalk", "delay"), ("crosstalk", "probability")
-PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
+DELAY = "crosstalk", "delay"
 
 
 def test_another_number_of_the_same_effect_is_simulated_anew() -> None:
     """More crosstalk at a delay of 0.1 ns is no more of what the data have, which is at 40 ns."""
-    effects = [
-        sp.effects.Detection(pdp=0.5),
-        sp.effects.Crosstalk(probability=0.05, delay=1e-10),
-        sp.effects.DeadTime(duration=50e-9),
-        sp.effects.DarkCounts(rate=100.0),
-        sp.effects.Tdc(resolution=1e-10),
-    ]
-    stated = sp.Sensor(sp.Layout(2, 2, 25e-12, 1.0), effects, rules="device")
-    truth = stated.with_values({"crosstalk.probability": 0.08, "crosstalk.delay": 40e-9})
-    flat = sp.Capture(
-        "flat", "tr", exposure=0.2, wavelength=500e-9, irradiance=2e5 * PHOTON / 25e-12, relative_uncertainty=0.1
-    )
-    path = begin(bench_of((stated, sp.simulate(truth, [flat], seed=1)), 16))
+    listed = sp.effects.Crosstalk(probability=0.05, delay=1e-10)
+    stated, data = wrong_numbers(listed, {"crosstalk.probability": 0.08, "crosstalk.delay": 40e-9}, 0.2)
+    path = begin(bench_of((stated, data), 16))
     some = ("set crosstalk.probability", "set crosstalk.delay", "set dead_time.duration")
     path.scan.candidates = lambda sensor: [c for c in candidates(sensor) if c.name in some]  # type: ignore[method-assign]
     first = path.scan.scan(path.evaluation)

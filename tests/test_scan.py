@@ -11,8 +11,9 @@ import laws
 import numpy as np
 import pytest
 from scipy import stats
-from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken
+from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken, wrong_numbers
 
+import spadmnist as sp
 from spadmnist import plugins
 from spadmnist.effects import Effect
 from spadmnist.inference.candidates import first_strengths
@@ -50,6 +51,15 @@ CELL, OTHER = ("flat", "a"), ("flat", "b")
 
 
 # --- signs -------------------------------------------------------------------------------------------------------
+
+
+def test_a_small_number_that_is_listed_wrong_has_a_signature() -> None:
+    """Crosstalk of 0.2 % that is 0.6 %: a tenth more of it, which is tried first, is nothing among noise."""
+    listed = sp.effects.Crosstalk(probability=2e-3, delay=1e-9)
+    path = begin(bench_of(wrong_numbers(listed, {"crosstalk.probability": 6e-3}, 0.1), 16))
+    found = [t for t in path.scan.scan(path.evaluation) if t.candidate.name == "set crosstalk.probability"]
+    best = max(found, key=lambda t: t.fall)
+    assert best.fall > 25 and best.scaled()["crosstalk", "probability"] == pytest.approx(6e-3, rel=0.4)
 
 
 def test_what_both_signs_do_is_told_apart() -> None:

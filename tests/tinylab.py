@@ -6,8 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import spadmnist as sp
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
+from spadmnist.effects import Effect
 from spadmnist.inference.candidates import Candidate, candidates
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.model_path import ModelPath, accept
@@ -66,6 +68,24 @@ def labs(tmp_path: Path) -> Lab:
         return config.read_sensor(folder / "sensor.yaml"), measurements.open(out)
 
     return made
+
+
+PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
+
+
+def wrong_numbers(listed: Effect, values: dict[str, float], exposure: float) -> tuple[Sensor, Measurement]:
+    """(a sensor with an effect, one lit capture of it with other values): by "effect.parameter", SI; exposure: s."""
+    effects = [
+        sp.effects.Detection(pdp=0.5),
+        listed,
+        sp.effects.DeadTime(duration=50e-9),
+        sp.effects.DarkCounts(rate=100.0),
+        sp.effects.Tdc(resolution=1e-10),
+    ]
+    stated = Sensor(sp.Layout(2, 2, 25e-12, 1.0), effects, rules="device")
+    light = {"wavelength": 500e-9, "irradiance": 2e5 * PHOTON / 25e-12, "relative_uncertainty": 0.1}
+    flat = sp.Capture("flat", "tr", exposure=exposure, **light)
+    return stated, sp.simulate(stated.with_values(values), [flat], seed=1)
 
 
 def bench_of(made: tuple[Sensor, Measurement], replicates: int = 16) -> Replicates:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -324,18 +325,26 @@ class Scan:
         return best
 
     def _raised(self, evaluation: Evaluation, tried: list[Trial], some: Sequence[str]) -> list[Trial]:
-        """The trials, with stronger ones for those without a signature."""
-        faint = [
-            t
-            for t in tried
-            if not t.signature.nothing and size_of(self.replicates, evaluation, t.signature) < _LEAST_SIZE
-        ]
-        stronger_ones = [(t.candidate, up) for t in faint if (up := stronger(t))]
-        found = self._looked_at(evaluation, stronger_ones, some) if stronger_ones else []
+        """The trials, with stronger ones for those without a signature.
+
+        A listed value begins a tenth from where it is, not in the middle of its range: it may be raised twice.
+        """
+
+        def faint_of(trials: Sequence[Trial]) -> list[Trial]:
+            size = functools.partial(size_of, self.replicates, evaluation)
+            return [t for t in trials if not t.signature.nothing and size(t.signature) < _LEAST_SIZE]
+
+        faint = still = faint_of(tried)
+        found: list[Trial] = []
+        while still:
+            ups = [(t.candidate, up) for t in still if (up := stronger(t)) and not among(found, t.candidate, up)]
+            new = self._looked_at(evaluation, ups, some) if ups else []
+            still = [] if found else [t for t in faint_of(new) if t.candidate.kind == "set"]
+            faint, found = faint + still, found + new
         raised = {(one.candidate.name, shape_of(one)) for one in found}
         # a faint one that the data resemble stays
         again = [t for t in faint if t.fall < COST_OF_A_PARAMETER and (t.candidate.name, shape_of(t)) in raised]
-        return [t for t in tried if not any(t is one for one in again)] + found
+        return [t for t in tried + found if not any(t is one for one in again)]
 
     def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
         """Weaker trials for those whose large signature says little of a smaller one."""

@@ -170,15 +170,14 @@ def _half_way(one: Trial, up: bool) -> dict[Key, Any] | None:
 
 
 def stronger(one: Trial) -> dict[Key, Any] | None:
-    """The values of an added effect at several times its strength; None where it cannot be stronger."""
+    """The values of a trial at several times its strength; None where it cannot be stronger.
+
+    A listed edge is not moved that far: it has another signature there.
+    """
     out = dict(one.values)
     for coordinate in one.candidate.strengths:
-        if (
-            coordinate.key in out
-            and one.candidate.kind == "add"
-            and out[coordinate.key] != coordinate.off
-            and not coordinate.lacks
-        ):
+        movable = one.candidate.kind == "add" or not (coordinate.whole or coordinate.kind == "edge")
+        if coordinate.key in out and movable and out[coordinate.key] != coordinate.off and not coordinate.lacks:
             out[coordinate.key] = coordinate.scaled(float(out[coordinate.key]), _RAISED)
     return out if out != one.values else None
 

@@ -1,0 +1,76 @@
+"""Effects beside a fault of the set-up: totals that it explains do not hide what the other statistics show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tinylab import bench_of, labs
+
+import spadmnist as sp
+from spadmnist.inference.conclusion import Notes
+from spadmnist.inference.evaluation import with_totals_anew
+from spadmnist.inference.model_path import begin
+from spadmnist.inference.model_selection import _is_as_stated, diagnose
+from spadmnist.inference.replicates import TOTALS
+from spadmnist.measurement import Measurement, in_memory
+
+PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
+ENTRY = {"capture": "flat", "quantity": "light", "factor": {"value": 1.1, "low": 1.0, "high": 1.2}, "confused": True}
+
+
+def stated_at(data: Measurement, sensor: sp.Sensor, id: str, factor: float) -> Measurement:
+    """The same recordings, the light of one of which is stated wrong by this factor."""
+    made = []
+    for capture in data.captures:
+        recording = data.recording(capture.id, sensor)
+        if capture.id == id:
+            assert capture.light.level is not None
+            light = replace(recording.capture.light, level=capture.light.level * factor)
+            recording = replace(recording, capture=replace(recording.capture, light=light))
+        made.append(recording)
+    return in_memory("lab", sensor.layout, made)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5])
+def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float, tmp_path: Path) -> None:
+    sensor, data = labs(tmp_path)()
+    path = begin(bench_of((sensor, stated_at(data, sensor, "flat", factor))))
+    stated = path.evaluation
+    path.replicates.unstated = frozenset(["flat"])
+    path.evaluation = free = with_totals_anew(path.replicates, stated)
+    assert len(free.residuals[TOTALS]) == 1 < len(stated.residuals[TOTALS]) == 2
+    assert free.replicate_residuals[TOTALS].shape == (16, 1) and free.residuals.keys() == stated.residuals.keys()
+    short = {**ENTRY, "capture": "other"}  # of a capture that stopped early, whatever the totals say
+    notes = Notes([dict(ENTRY), short], explained=True)
+    as_stated = factor == 1
+    assert _is_as_stated(path, notes) is as_stated
+    assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [ENTRY, short])
+    assert path.replicates.unstated == (frozenset() if as_stated else {"flat"})
+    assert len(path.evaluation.residuals[TOTALS]) == (2 if as_stated else 1)
+
+
+@pytest.mark.slow
+def test_a_noisy_lamp_is_found_beside_a_wrong_light_level() -> None:
+    """No check fails but a total. A scan that ended there would miss the lamp."""
+    effects = [
+        sp.effects.Detection(pdp=0.5),
+        sp.effects.DeadTime(duration=50e-9),
+        sp.effects.DarkCounts(rate=100.0),
+        sp.effects.Tdc(resolution=1e-10),
+    ]
+    sensor, real = (
+        sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), [*effects, *more], rules="device")
+        for more in ([], [sp.effects.SourceNoise(contrast=0.015, coherence_time=1e-3)])
+    )
+    captures = [sp.Capture("dark", "tr", exposure=1.0, dark=True)]
+    for id, photons in (("low", 2e5), ("mid", 6e5), ("high", 1e6)):
+        light = {"wavelength": 500e-9, "irradiance": photons * PHOTON / 25e-12, "relative_uncertainty": 0.02}
+        captures.append(sp.Capture(id, "tr", exposure=0.03, **light))
+    found = diagnose(sensor, stated_at(sp.simulate(real, captures, seed=2), sensor, "low", 1.1), quick=True, jobs=2)
+    assert found.verdict == "explained" and [step.candidate.name for step in found.steps] == ["add source_noise"]
+    value = found.steps[0].values["coherence_time"]
+    assert value.low is not None and value.high is not None and value.low / 2 < 1e-3 < 2 * value.high
+    assert {entry["capture"] for entry in found.setup} == {"low"}
+    assert all(entry["factor"]["low"] < 1 / 1.1 < entry["factor"]["high"] for entry in found.setup)
