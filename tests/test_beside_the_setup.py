@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 from tinylab import bench_of, labs
 
 import spadmnist as sp
 from spadmnist.inference.conclusion import Notes
-from spadmnist.inference.evaluation import with_totals_anew
 from spadmnist.inference.model_path import begin
-from spadmnist.inference.model_selection import _is_as_stated, diagnose
+from spadmnist.inference.model_selection import _is_as_stated, _is_freed, _take_setup_again, diagnose
 from spadmnist.inference.replicates import TOTALS
+from spadmnist.inference.results import Step
+from spadmnist.inference.trial import Trial
 from spadmnist.measurement import Measurement, in_memory
 
 PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
@@ -37,18 +39,35 @@ def stated_at(data: Measurement, sensor: sp.Sensor, id: str, factor: float) -> M
 def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float, tmp_path: Path) -> None:
     sensor, data = labs(tmp_path)()
     path = begin(bench_of((sensor, stated_at(data, sensor, "flat", factor))))
-    stated = path.evaluation
-    path.replicates.unstated = frozenset(["flat"])
-    path.evaluation = free = with_totals_anew(path.replicates, stated)
+    stated, errors = path.evaluation, path.ladder[0].errors
+    short = {**ENTRY, "quantity": "exposure"}  # it stopped early, whatever the totals say
+    notes = Notes([entry := dict(ENTRY), short], explained=True, by_totals=[entry])
+    kept = path.kept()
+    assert _is_freed(path, notes) and path.replicates.unstated == {"flat"}
+    free = path.evaluation
     assert len(free.residuals[TOTALS]) == 1 < len(stated.residuals[TOTALS]) == 2
     assert free.replicate_residuals[TOTALS].shape == (16, 1) and free.residuals.keys() == stated.residuals.keys()
-    short = {**ENTRY, "capture": "other"}  # of a capture that stopped early, whatever the totals say
-    notes = Notes([dict(ENTRY), short], explained=True)
+    path.rung("the same")
+    assert path.ladder[1].errors == pytest.approx(errors)  # whether they are compared or not
+    assert not _is_as_stated(path, notes)  # without a step
+    path.steps = [cast(Step, object())]
     as_stated = factor == 1
     assert _is_as_stated(path, notes) is as_stated
-    assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [ENTRY, short])
+    assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
     assert path.replicates.unstated == (frozenset() if as_stated else {"flat"})
     assert len(path.evaluation.residuals[TOTALS]) == (2 if as_stated else 1)
+    path.back_to(kept)
+    assert path.replicates.unstated == frozenset() and path.evaluation is stated
+    _take_setup_again(path, notes)  # the step is gone
+    assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
+
+
+def test_levels_are_not_freed_where_steps_were_fitted_to_them_or_a_change_is_a_tie(tmp_path: Path) -> None:
+    path = begin(bench_of(labs(tmp_path)()))
+    notes = Notes([dict(ENTRY)], explained=True, by_totals=[dict(ENTRY)], rival=cast(Trial, object()))
+    assert not _is_freed(path, notes)
+    path.steps, notes.rival = [cast(Step, object())], None
+    assert not _is_freed(path, notes) and path.replicates.unstated == frozenset()
 
 
 @pytest.mark.slow

@@ -62,6 +62,16 @@ def test_a_small_number_that_is_listed_wrong_has_a_signature() -> None:
     assert best.fall > 25 and best.scaled()["crosstalk", "probability"] == pytest.approx(6e-3, rel=0.4)
 
 
+def test_what_cannot_be_tried_stronger_stays_as_it_was() -> None:
+    """Near the end of its range, and without a signature in so few data."""
+    listed = sp.effects.Crosstalk(probability=0.04, delay=1e-9)
+    path = begin(bench_of(wrong_numbers(listed, {}, 1e-3), 16))
+    found = [t for t in path.scan.scan(path.evaluation) if t.candidate.name == "set crosstalk.probability"]
+    (one,) = found
+    assert one.size < 6 and one.values["crosstalk", "probability"] == 0.05
+    assert not [entry for entry in path.scan.untried if entry["effect"] == "crosstalk"]
+
+
 def test_what_both_signs_do_is_told_apart() -> None:
     up = Signature({CELL: np.array([5.0, 1.0]), OTHER: np.array([2.0])}, {CELL: 0.1}, {"flat": 0.3})
     down = Signature({CELL: np.array([-3.0, 1.0])}, {CELL: 0.3}, {"flat": -0.1})

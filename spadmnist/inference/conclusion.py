@@ -28,6 +28,7 @@ class Notes:
     Attributes:
         setup: entries of the set-up.
         explained: the set-up explains the totals that fail.
+        by_totals: the entries that the totals gave.
         bent: a nonlinearity that no effect here has may explain them as well.
         advice: captures that would separate explanations.
         rival: a change of the sensor that is a tie with the set-up.
@@ -40,6 +41,7 @@ class Notes:
 
     setup: list[dict[str, Any]]
     explained: bool = False
+    by_totals: list[dict[str, Any]] = field(default_factory=list)
     bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Trial | None = None

@@ -16,7 +16,7 @@ from .candidates import Candidate
 from .coordinates import Key
 from .evaluation import Evaluation, mean_misfit
 from .gauss_newton import Fit
-from .light_levels import level_error, log_levels, totals_space
+from .light_levels import level_error, log_levels, stated_levels
 from .replicates import TOTALS, Cell, Replicates
 from .results import Step, plain, title
 from .signature import Signature, residuals_at
@@ -84,7 +84,7 @@ def physical_errors(
     Raises:
         EffectError: where a user's statistic fails, if `strict`.
     """
-    ids, elasticities, _, common = totals_space(replicates, evaluation)
+    ids, elasticities, common = stated_levels(replicates, evaluation)
     errors = {}
     if ids:
         logs = {i: math.log(max(s.total, 0.5)) for i, s in replicates.seen.items()}

@@ -45,7 +45,10 @@ def between(scan: Scan, evaluation: Evaluation, found: Candidate, other: Trial) 
     replicates = scan.replicates
     assert other.sensors is not None
     residuals = other.residuals or {}
-    now = math.sqrt(max(square(residuals) - square(evaluation.residuals), 0.0))
+    here = evaluation.residuals
+    both = [cell for cell, z in residuals.items() if cell in here and len(z) == len(here[cell])]
+    apart = square({cell: residuals[cell] for cell in both}) - square({cell: here[cell] for cell in both})
+    now = math.sqrt(max(apart, 0.0))
     replicates.say("the capture that would separate the two explanations")
     best: tuple[float, str] | None = None
     for words, capture, like in _menu(replicates, evaluation):

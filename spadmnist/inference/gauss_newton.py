@@ -146,7 +146,7 @@ def gauss_newton(
         found = evaluate([u, *(_points_aside(coordinates, u, steps, seen) if anew else [])])
         z = found[0]
         if isinstance(z, CannotSimulate):
-            raise z
+            raise CannotSimulate(str(z))
         cost = float(z @ z)
         if best is not None and not anew and best[0] - cost < 0.3 * promised:
             if promised < _WORTH_ANEW + noise:
@@ -348,7 +348,7 @@ def _jacobian(
         )
         for k, m in zip(some, made, strict=True):
             if isinstance(m, CannotSimulate):
-                raise m
+                raise CannotSimulate(str(m))
             ends[k] = stacked(residuals_at(replicates, evaluation, m), keys)
     jacobian = _differences(ends, points, cells)
     for i, slope in columns.items():

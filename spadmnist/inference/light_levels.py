@@ -415,7 +415,6 @@ def _stated(replicates: Replicates, evaluation: Evaluation) -> list[str]:
         id
         for id in replicates.seen
         if evaluation.rates[id].stated is not None
-        and (replicates.seen[id].half_of or (replicates.seen[id].capture,))[0].id not in replicates.unstated
         and _informative(replicates, evaluation.rates[id], replicates.seen[id].total)
     ]
 
@@ -437,19 +436,28 @@ def totals_space(
     """
     if evaluation.space is not None:
         return evaluation.space
-    ids = _stated(replicates, evaluation)
-    errors, elasticity, common = [], [], []
-    for id in ids:
-        light = replicates.seen[id].capture.light
-        _, _, slope = evaluation.rates[id].level_of(max(replicates.seen[id].total, 1.0))
-        errors.append(level_error(replicates, evaluation, id))
-        elasticity.append(max(slope, 1e-3))
-        common.append(0.0 if light.dark else light.relative_uncertainty)
-    c = np.array(common)
-    covariance = np.diag(np.array(errors) ** 2) + np.outer(c, c)
-    root = np.linalg.inv(np.linalg.cholesky(covariance)) if ids else np.zeros((0, 0))
-    evaluation.space = ids, np.array(elasticity), root, c
+    ids, elasticity, c = stated_levels(replicates, evaluation)
+    compared = [whole_of(replicates, id) not in replicates.unstated for id in ids]
+    ids, elasticity, c = [id for id, yes in zip(ids, compared, strict=True) if yes], elasticity[compared], c[compared]
+    errors = np.array([level_error(replicates, evaluation, id) for id in ids])
+    root = np.linalg.inv(np.linalg.cholesky(np.diag(errors**2) + np.outer(c, c))) if ids else np.zeros((0, 0))
+    evaluation.space = ids, elasticity, root, c
     return evaluation.space
+
+
+def whole_of(replicates: Replicates, id: str) -> str:
+    """The name of a capture, or of that of which it is a half."""
+    half_of = replicates.seen[id].half_of
+    return id if half_of is None else half_of[0].id
+
+
+def stated_levels(replicates: Replicates, evaluation: Evaluation) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """(captures whose level is stated and informed, elasticities (captures,), the light's part in the errors)."""
+    ids = _stated(replicates, evaluation)
+    slopes = [evaluation.rates[id].level_of(max(replicates.seen[id].total, 1.0))[2] for id in ids]
+    lights = [replicates.seen[id].capture.light for id in ids]
+    common = np.array([0.0 if light.dark else light.relative_uncertainty for light in lights])
+    return ids, np.array([max(slope, 1e-3) for slope in slopes]), common
 
 
 def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> float:

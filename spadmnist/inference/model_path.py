@@ -123,12 +123,14 @@ class ModelPath:
         own = (self.evaluation, dict(self.values), list(self.steps), list(self.ladder), self.fit)
         fitted = [(step, dict(step.values), step.map) for step in self.steps]  # a fit writes into the steps
         scan = list(self.scan.accepted), dict(self.scan.phases)
-        return (*own, *scan, fitted, dict(self.located), self.approximate, list(self.nearest))
+        more = dict(self.located), self.approximate, list(self.nearest), self.replicates.unstated
+        return (*own, *scan, fitted, *more)
 
     def back_to(self, kept: tuple[Any, ...]) -> None:
         """Restore the state that `kept` returned."""
         self.evaluation, self.values, self.steps, self.ladder, self.fit = kept[:5]
-        self.scan.accepted, self.scan.phases, fitted, self.located, self.approximate, self.nearest = kept[5:]
+        self.scan.accepted, self.scan.phases, fitted, self.located, self.approximate, self.nearest = kept[5:-1]
+        self.replicates.unstated = kept[-1]
         for step, values, map_ in fitted:
             step.values, step.map = values, map_
 

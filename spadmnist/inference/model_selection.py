@@ -25,7 +25,7 @@ from .comparison import Comparison, comparison_of, comparison_with, nothing_to_c
 from .conclusion import Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
-from .evaluation import block_checks, failing, misfit_null_95, with_totals_anew
+from .evaluation import Evaluation, block_checks, failing, misfit_null_95, with_totals_anew
 from .findings import mimicked
 from .forward_step import (
     added_from,
@@ -119,12 +119,14 @@ def _diagnosed(
     start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
     while len(path.steps) < max_steps and not _in_vain(path, notes) and _possible(path, notes):
-        if path.steps:
+        if path.steps or notes.setup:
             keep(so_far(path, start, notes))
     replicates.budget.until, stopped = FITS, len(path.steps) >= max_steps
     if path.steps:
         with or_as_before(path, "the fit of all numbers together"):
             complete(path)
+            if _is_as_stated(path, notes):
+                complete(path)
         if path.evaluation.borrowed:  # the budget has ended it: the steps are still judged by replicates of their own
             replicates.budget.until = math.inf
             with or_as_before(path, "the last comparison"):
@@ -136,6 +138,7 @@ def _diagnosed(
                 drop_needless(path)
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
+        _take_setup_again(path, notes)
     if path.steps and not short and not notes.explained:  # the rates follow from the stated light
         with or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
@@ -229,10 +232,10 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
 def _another(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
-    if notes.explained and path.steps:
-        _is_as_stated(path, notes)
     if all(block.p > CLEARLY for block in path.failed) or scan.only_rates(path.evaluation):
         complete(path)  # what no check shows plainly, and what the set-up may explain, is decided by the whole fit
+    if _is_as_stated(path, notes):
+        complete(path)
     failed, number = path.failed, len(path.steps) + 1
     waiting, notes.waiting = notes.waiting, []
     plainly = any(block.p <= CLEARLY for block in failed) and not scan.only_rates(path.evaluation)
@@ -260,7 +263,7 @@ def _another(path: ModelPath, notes: Notes) -> bool:
         path.evaluation = before  # under this evaluation no check fails: nothing is left
         return False
     if not notes.explained and scan.only_rates(path.evaluation) and _by_setup(path, notes):
-        return True  # a score test of what the other statistics show
+        return _is_freed(path, notes)
     clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
     first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
@@ -349,26 +352,51 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
         if bright is not None:
             notes.bent = True
             notes.advice.append(experiment_design.on_brightest(replicates, evaluation, likely[0], found[0]))
-    notes.setup = found + notes.setup
+    notes.setup, notes.by_totals = found + notes.setup, found
     notes.explained = True
-    replicates.unstated = frozenset(entry["capture"] for entry in found)
-    path.evaluation = with_totals_anew(replicates, evaluation)
+    return True
+
+
+def _is_freed(path: ModelPath, notes: Notes) -> bool:
+    """Whether the levels that the set-up explains are free now, for a score test of what other statistics show.
+
+    They stay where there are steps, whose fit has the totals in it, or where a change of the sensor is a tie.
+    """
+    if path.steps or notes.rival is not None:
+        return False
+    path.replicates.unstated = frozenset(entry["capture"] for entry in notes.by_totals)
+    path.evaluation = with_totals_anew(path.replicates, path.evaluation)
     return True
 
 
 def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
-    """Whether the steps explain the totals, so that the set-up need not; its entries are then removed.
+    """Whether the steps explain the totals of freed levels, so that the set-up need not; its entries are then removed.
 
     Light that fluctuates slowly gives a capture another total, and so may another light level.
     """
     replicates, free = path.replicates, path.replicates.unstated
-    replicates.unstated = frozenset()
-    stated = with_totals_anew(replicates, path.evaluation)
-    if any(block.cell[0] == "" for block in failing(block_checks(replicates, stated, stated.residuals))):
-        replicates.unstated = free
+    if not free or not path.steps:
         return False
-    path.evaluation = stated
-    # it has found them all; those of captures that stopped early are not among them
-    notes.setup = [entry for entry in notes.setup if entry["capture"] not in free]
-    notes.explained, notes.bent, notes.rival, notes.advice = False, False, None, []
-    return True
+    explained = False
+    replicates.unstated = frozenset()
+    try:
+        stated = with_totals_anew(replicates, path.evaluation)
+        explained = not _totals_fail(replicates, stated)
+    finally:
+        replicates.unstated = frozenset() if explained else free
+    if explained:
+        path.evaluation, path.approximate = stated, path.fit is not None  # the totals are no part of its fit
+        notes.setup = [entry for entry in notes.setup if all(entry is not one for one in notes.by_totals)]
+        notes.explained, notes.bent, notes.advice = False, False, []
+    return explained
+
+
+def _take_setup_again(path: ModelPath, notes: Notes) -> None:
+    """Put the entries of the set-up back where the step that explained the totals was dropped."""
+    if notes.by_totals and not notes.explained and _totals_fail(path.replicates, path.evaluation):
+        notes.setup, notes.explained = notes.by_totals + notes.setup, True
+
+
+def _totals_fail(replicates: Replicates, evaluation: Evaluation) -> bool:
+    failed = failing(block_checks(replicates, evaluation, evaluation.residuals))
+    return any(block.cell[0] == "" for block in failed)

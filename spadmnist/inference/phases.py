@@ -126,7 +126,7 @@ def simulate_phases(
     made: list[Signature] = []
     for one in found:
         if isinstance(one, CannotSimulate):
-            raise one
+            raise CannotSimulate(str(one))
         made.append(one)
     return PeriodicSignature.of(made, turns)
 

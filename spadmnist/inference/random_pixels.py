@@ -104,7 +104,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     _, there, fit = best
     (signature,) = signatures(replicates, evaluation, [there.sensors], only=some)
     if isinstance(signature, CannotSimulate):
-        raise signature
+        raise CannotSimulate(str(signature))
     residuals = residuals_at(replicates, evaluation, signature)
     one.evaluation, one.sensors, one.fit = there, there.sensors, replace(fit, square=square(there.residuals))
     one.values, one.times = dict(fit.values), 1.0

@@ -56,8 +56,11 @@ class CannotSimulate(SpadError):
 
     @classmethod
     def because(cls, error: BaseException) -> CannotSimulate:
-        """The error that says why a model cannot be simulated, of any error that was raised."""
-        return error if isinstance(error, cls) else cls(why(error))
+        """The error that says why a model cannot be simulated, of any error that was raised.
+
+        It has no traceback, which would hold all that was simulated with it.
+        """
+        return cls(str(error) if isinstance(error, cls) else why(error))
 
 
 @dataclass

@@ -334,17 +334,19 @@ class Scan:
             size = functools.partial(size_of, self.replicates, evaluation)
             return [t for t in trials if not t.signature.nothing and size(t.signature) < _LEAST_SIZE]
 
-        faint = still = faint_of(tried)
+        still, known = faint_of(tried), len(self.untried)
         found: list[Trial] = []
+        replaced: list[Trial] = []
         while still:
             ups = [(t.candidate, up) for t in still if (up := stronger(t)) and not among(found, t.candidate, up)]
             new = self._looked_at(evaluation, ups, some) if ups else []
+            raised = {(one.candidate.name, shape_of(one)) for one in new}
+            # a faint one that the data resemble stays
+            replaced += [t for t in still if t.fall < COST_OF_A_PARAMETER and (t.candidate.name, shape_of(t)) in raised]
             still = [] if found else [t for t in faint_of(new) if t.candidate.kind == "set"]
-            faint, found = faint + still, found + new
-        raised = {(one.candidate.name, shape_of(one)) for one in found}
-        # a faint one that the data resemble stays
-        again = [t for t in faint if t.fall < COST_OF_A_PARAMETER and (t.candidate.name, shape_of(t)) in raised]
-        return [t for t in tried + found if not any(t is one for one in again)]
+            found += new
+        del self.untried[known:]  # they were tried, if not as strong
+        return [t for t in [*tried, *found] if not any(t is one for one in replaced)]
 
     def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
         """Weaker trials for those whose large signature says little of a smaller one."""

@@ -254,7 +254,7 @@ def _signature(
         logs[id] = needed_light(replicates, evaluation, sensors.mean_sensor(id), id)
     for id, other in made.items():
         if isinstance(other, CannotSimulate):
-            raise other
+            raise CannotSimulate(str(other))
         base, some = evaluation.made[id], other.numbers.astype(int)
         assert some[-1] == len(some) - 1  # the first replicates are compared with the first of the model's own
         null_total = evaluation.rates[id]

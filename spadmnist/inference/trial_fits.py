@@ -98,7 +98,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     if not one.faint:  # the signature at the fitted values may differ from that of the trial
         (there,) = signatures(replicates, evaluation, [one.sensors])
         if isinstance(there, CannotSimulate):
-            raise there
+            raise CannotSimulate(str(there))
         one.there, residuals = there, residuals_at(replicates, evaluation, there)
         found = replace(found, residuals=residuals, square=square(residuals))
     one.fit, one.values, one.residuals, one.times = found, dict(found.values), found.residuals, 1.0
