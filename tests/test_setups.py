@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from spadmnist import cli, config, sensor_file
+from spadmnist import cli, config, sensor_file, twin
 from spadmnist import measurement as measurements
 from spadmnist.cli import comparing
+from spadmnist.effects import BackgroundLight
 from spadmnist.errors import InputError
 from spadmnist.inference.comparison import _between_wavelengths, compare
+from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.model_selection import diagnose
+from spadmnist.inference.models import InTheDark
 from spadmnist.inference.results import NONLINEARITY, table
 from spadmnist.measurement import Measurement
 
@@ -159,6 +162,28 @@ def lab(folder: Path, extra: str = "", plan: str = LAB, seed: int = 0) -> Measur
     (folder / "truth.yaml").write_text(TR + extra)
     plan_ = measurements.open(folder / "plan.yaml", planned=True)
     return measurements.open(twin.simulate(config.read_sensor(folder / "truth.yaml"), plan_, folder / "lab", seed))
+
+
+def test_background_light_beside_one_wrong_level_is_a_tie_with_two_wrong_levels(tmp_path):
+    """Neither a change of the sensor nor one level explains the totals: two numbers do, and these are two pairs."""
+    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    real = sensor.changed(effects=[*sensor.effects, BackgroundLight(rate=300.0)]).resolved()
+    levels = {"dark": None, "low": 11.0, "mid": 115.7, "middle": 300.0, "high": 600.0}
+    plan = measured(tmp_path / "plan", {id: ("500 nm", level, "1 us", 1.0) for id, level in levels.items()})
+    means = {}
+    for capture in plan.captures:
+        photons = twin.photons_at(capture, sensor.layout) or 1.0  # the dark level is a factor
+        model = InTheDark.of(real) if capture.light.dark else real
+        mean = closed_form(model, capture)(photons * (1.08 if capture.id == "high" else 1.0)) / 256
+        means[capture.id] = ("500 nm", levels[capture.id], "1 us", mean)
+    data = measured(tmp_path / "data", means)
+    found = diagnose(sensor, data, quick=True, jobs=1)
+    assert found.verdict == "confused"
+    assert [step.candidate.name for step in found.steps] == ["add background_light"]
+    value = found.steps[0].values["rate"]
+    assert value.value == pytest.approx(300, rel=0.5)
+    assert {e["capture"] for e in found.setup} == {"low", "high"} and all(e["confused"] for e in found.setup)
 
 
 @pytest.mark.slow

@@ -335,6 +335,9 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     cost = likely[0].cost if likely else float(evaluation.residuals[TOTALS] @ evaluation.residuals[TOTALS])
     others = setups.rivals(path.scan, evaluation, cost)
     own = others[0].cost(evaluation) if others else math.inf
+    if likely and not others:
+        others = setups.rivals_beside(path.scan, evaluation, likely[0])
+        own = cost if others else math.inf  # as many numbers, as good a fit: a tie
     if not likely or own < cost - setups.TIE:
         return False  # the sensor explains it better
     near = [e for e in likely if e.cost < cost + setups.TIE and len(e.factors) == len(likely[0].factors)]

@@ -18,7 +18,7 @@ from scipy import stats
 
 from .. import twin
 from .candidates import templates
-from .evaluation import Evaluation, square
+from .evaluation import Evaluation, square, with_totals_anew
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM, HALF_95
 from .light_levels import closed_form, totals_space
 from .models import InTheDark
@@ -260,6 +260,21 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
         for t, signature in zip(out, signatures(replicates, evaluation, models), strict=True)
         if _fits(scan, evaluation, t, signature)
     ]
+
+
+def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[Trial]:
+    """The rivals of a set-up explanation of several factors, with one of these factors beside them, by cost."""
+    replicates = scan.replicates
+    out: list[Trial] = []
+    for factor in one.factors if len(one.factors) == 2 else ():
+        before, replicates.unstated = replicates.unstated, replicates.unstated | set(factor.captures)
+        try:
+            free = with_totals_anew(replicates, evaluation)
+            if free.residuals[TOTALS].size > 1:
+                out += rivals(scan, free, one.cost - COST_OF_A_PARAMETER)
+        finally:
+            replicates.unstated = before
+    return sorted(out, key=lambda t: t.cost(evaluation))
 
 
 def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature | CannotSimulate) -> bool:
