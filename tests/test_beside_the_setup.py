@@ -14,7 +14,7 @@ from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import _is_as_stated, _is_freed, _take_setup_again, diagnose
 from spadmnist.inference.replicates import TOTALS
-from spadmnist.inference.results import Step
+from spadmnist.inference.results import Step, sentence
 from spadmnist.inference.trial import Trial
 from spadmnist.measurement import Measurement, in_memory
 
@@ -92,4 +92,5 @@ def test_a_noisy_lamp_is_found_beside_a_wrong_light_level() -> None:
     value = found.steps[0].values["coherence_time"]
     assert value.low is not None and value.high is not None and value.low / 2 < 1e-3 < 2 * value.high
     assert {entry["capture"] for entry in found.setup} == {"low"}
+    assert sentence(found).endswith("of the model, and the set-up of low those of the totals.")
     assert all(entry["factor"]["low"] < 1 / 1.1 < entry["factor"]["high"] for entry in found.setup)

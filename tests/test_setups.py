@@ -19,7 +19,7 @@ from spadmnist.inference.comparison import _between_wavelengths, compare
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.models import InTheDark
-from spadmnist.inference.results import NONLINEARITY, table
+from spadmnist.inference.results import NONLINEARITY, sentence, table
 from spadmnist.measurement import Measurement
 
 SENSOR = """sensor:
@@ -184,6 +184,8 @@ def test_background_light_beside_one_wrong_level_is_a_tie_with_two_wrong_levels(
     value = found.steps[0].values["rate"]
     assert value.value == pytest.approx(300, rel=0.5)
     assert {e["capture"] for e in found.setup} == {"low", "high"} and all(e["confused"] for e in found.setup)
+    said = "the set-up of low and high, or background_light with that of high: each explains the totals"
+    assert sentence(found).startswith(said)
 
 
 @pytest.mark.slow

@@ -187,6 +187,7 @@ def _diagnosed(
         )
     found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
+    found.beside = notes.beside
     return found
 
 
@@ -336,8 +337,8 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     others = setups.rivals(path.scan, evaluation, cost)
     own = others[0].cost(evaluation) if others else math.inf
     if likely and not others:
-        others = setups.rivals_beside(path.scan, evaluation, likely[0])
-        own = cost if others else math.inf  # as many numbers, as good a fit: a tie
+        for rival, factor in setups.rivals_beside(path.scan, evaluation, likely[0])[:1]:
+            others, own, notes.beside = [rival], cost, factor.captures  # as many numbers, as good a fit: a tie
     if not likely or own < cost - setups.TIE:
         return False  # the sensor explains it better
     near = [e for e in likely if e.cost < cost + setups.TIE and len(e.factors) == len(likely[0].factors)]

@@ -262,19 +262,19 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
     ]
 
 
-def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[Trial]:
-    """The rivals of a set-up explanation of several factors, with one of these factors beside them, by cost."""
+def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[tuple[Trial, Factor]]:
+    """(rival of a set-up explanation of two factors, the factor that stays beside it), by cost."""
     replicates = scan.replicates
-    out: list[Trial] = []
+    out: list[tuple[Trial, Factor]] = []
     for factor in one.factors if len(one.factors) == 2 else ():
         before, replicates.unstated = replicates.unstated, replicates.unstated | set(factor.captures)
         try:
             free = with_totals_anew(replicates, evaluation)
             if free.residuals[TOTALS].size > 1:
-                out += rivals(scan, free, one.cost - COST_OF_A_PARAMETER)
+                out += [(rival, factor) for rival in rivals(scan, free, one.cost - COST_OF_A_PARAMETER)]
         finally:
             replicates.unstated = before
-    return sorted(out, key=lambda t: t.cost(evaluation))
+    return sorted(out, key=lambda pair: pair[0].cost(evaluation))
 
 
 def _fits(scan: Scan, evaluation: Evaluation, one: Trial, signature: Signature | CannotSimulate) -> bool:
