@@ -62,12 +62,12 @@ def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float,
     assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
 
 
-def test_levels_are_not_freed_where_steps_were_fitted_to_them_or_a_change_is_a_tie(tmp_path: Path) -> None:
+def test_levels_are_not_freed_where_a_change_of_the_sensor_is_a_tie(tmp_path: Path) -> None:
     path = begin(bench_of(labs(tmp_path)()))
     notes = Notes([dict(ENTRY)], explained=True, by_totals=[dict(ENTRY)], rival=cast(Trial, object()))
-    assert not _is_freed(path, notes)
-    path.steps, notes.rival = [cast(Step, object())], None
     assert not _is_freed(path, notes) and path.replicates.unstated == frozenset()
+    notes.rival = None
+    assert _is_freed(path, notes) and path.replicates.unstated == {"flat"}
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from spadmnist.inference import exact_likelihood, memory, point_process
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.exact_likelihood import NoLikelihood, maximise
 from spadmnist.inference.point_process import Stamps
-from spadmnist.inference.replicates import Execution, Replicates
+from spadmnist.inference.replicates import CannotSimulate, Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Loky, Serial, executor
@@ -149,7 +149,7 @@ def test_a_model_whose_replicates_are_too_large_cannot_be_simulated(
 
     numbers = np.arange(2, dtype=np.uint64)
     (made,) = replicates.simulate([(Model.same(replicates.start), "flat", np.full(2, 1e6), numbers)])
-    assert made == "too large"
+    assert isinstance(made, CannotSimulate) and str(made) == "too large"
 
 
 def _refuse(*_: Any) -> None:

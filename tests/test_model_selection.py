@@ -24,7 +24,7 @@ from spadmnist.inference.joint_fit import _bounded
 from spadmnist.inference.model_path import ModelPath, begin
 from spadmnist.inference.model_selection import _another, _or_confused
 from spadmnist.inference.pixel_maps import PixelMap
-from spadmnist.inference.replicates import TOTALS
+from spadmnist.inference.replicates import TOTALS, CannotSimulate
 from spadmnist.inference.results import Step, mimic
 from spadmnist.inference.score_test import ScoreTest, explains_its_signature
 from spadmnist.inference.signature import Signature, fall_of, residuals_at, signatures
@@ -286,7 +286,7 @@ def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
         )
         held = _bounded(path, fit)
         assert coordinates[0].value(float(held.point[0])) == pytest.approx(point)
-    monkeypatch.setattr("spadmnist.inference.joint_fit.signatures", lambda *_, **__: ["beyond what can be simulated"])
+    monkeypatch.setattr("spadmnist.inference.joint_fit.signatures", lambda *_, **__: [CannotSimulate("beyond")])
     assert coordinates[0].value(float(_bounded(path, fit).point[0])) == pytest.approx(0.01)
 
 

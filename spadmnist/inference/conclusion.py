@@ -29,6 +29,8 @@ class Notes:
         setup: entries of the set-up.
         explained: the set-up explains the totals that fail.
         by_totals: the entries that the totals gave.
+        faulty: in words, the captures of which the set-up explains the totals.
+        taken_back: (`bent`, `advice`) of a set-up that steps explain.
         bent: a nonlinearity that no effect here has may explain them as well.
         advice: captures that would separate explanations.
         rival: a change of the sensor that is a tie with the set-up.
@@ -43,6 +45,8 @@ class Notes:
     setup: list[dict[str, Any]]
     explained: bool = False
     by_totals: list[dict[str, Any]] = field(default_factory=list)
+    faulty: str = ""
+    taken_back: tuple[bool, list[dict[str, Any]]] | None = None
     bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Trial | None = None

@@ -143,8 +143,7 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
     """The capture that separates a set-up from a change of the sensor with the same totals, by closed forms."""
     replicates = scan.replicates
     now = math.sqrt(abs(setup.cost - other.cost(evaluation)))
-    whole = {id for factor in setup.factors for id in factor.captures}
-    log = float(setup.logs[0])
+    logs = {id: float(x) for factor, x in zip(setup.factors, setup.logs, strict=True) for id in factor.captures}
     best: tuple[float, str] | None = None
     model = next(iter(replicates.seen.values())).capture
     sensor = evaluation.sensors.one
@@ -157,7 +156,7 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
         for times in (0.1, 10.0):
             brighter = replace(seen.capture, light=replace(light, level=light.level * times))
             words = f"{_seen_in(brighter)} {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
-            tries.append((words, brighter, log if id in whole else 0.0))
+            tries.append((words, brighter, logs.get(id, 0.0)))
     assert other.sensors is not None
     for words, capture, expected in tries:
         level = 1.0 if capture.light.dark else twin.photons_at(capture, replicates.start.layout) or 1.0

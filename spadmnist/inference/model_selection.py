@@ -39,7 +39,7 @@ from .forward_step import (
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import completed
 from .journal import Journal
-from .levels import CLEARLY
+from .levels import CLEARLY, COST_OF_A_PARAMETER
 from .model_path import ModelPath, begin
 from .replicates import REPLICATES, TOTALS, Execution, Replicates
 from .results import Diagnosis
@@ -119,7 +119,7 @@ def _diagnosed(
     start, notes = path.evaluation, Notes(too_short(short))
     replicates.budget.until = STEPS
     while len(path.steps) < max_steps and not _in_vain(path, notes) and _possible(path, notes):
-        if path.steps or notes.setup:
+        if path.steps or notes.explained:
             keep(so_far(path, start, notes))
     replicates.budget.until, stopped = FITS, len(path.steps) >= max_steps
     if path.steps:
@@ -187,7 +187,7 @@ def _diagnosed(
         )
     found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
-    found.beside = notes.beside
+    found.beside, found.faulty = notes.beside, notes.faulty if notes.explained else ""
     return found
 
 
@@ -263,7 +263,8 @@ def _another(path: ModelPath, notes: Notes) -> bool:
                 return False
         path.evaluation = before  # under this evaluation no check fails: nothing is left
         return False
-    if not notes.explained and scan.only_rates(path.evaluation) and _by_setup(path, notes):
+    asked = notes.explained or notes.taken_back is not None
+    if not asked and scan.only_rates(path.evaluation) and _by_setup(path, notes):
         return _is_freed(path, notes)
     clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
     first = ", ".join(list(clearest)[:4])
@@ -336,20 +337,26 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     cost = likely[0].cost if likely else float(evaluation.residuals[TOTALS] @ evaluation.residuals[TOTALS])
     others = setups.rivals(path.scan, evaluation, cost)
     own = others[0].cost(evaluation) if others else math.inf
+    contested = likely[:1]
+    beside: tuple[str, ...] = ()
     if likely and not others:
-        for rival, factor in setups.rivals_beside(path.scan, evaluation, likely[0])[:1]:
-            others, own, notes.beside = [rival], cost, factor.captures  # as many numbers, as good a fit: a tie
+        with contextlib.suppress(OutOfBudget):  # the set-up explains the totals
+            for rival, factor in setups.rivals_beside(path.scan, evaluation, likely[0])[:1]:
+                others, beside = [rival], factor.captures
+                own = rival.cost(evaluation) + COST_OF_A_PARAMETER * len(beside)
+                contested = [likely[0].without(factor)]
     if not likely or own < cost - setups.TIE:
         return False  # the sensor explains it better
     near = [e for e in likely if e.cost < cost + setups.TIE and len(e.factors) == len(likely[0].factors)]
     found = setups.entries(replicates, evaluation, near)
     if not found:
         return False
+    notes.faulty = setups.captures_of(likely[:1] if beside else near)
     if own < cost + setups.TIE:
-        found = [{**entry, "confused": True} for entry in found]
-        notes.rival = others[0]
+        found = [{**entry, "confused": entry["confused"] or entry["capture"] not in beside} for entry in found]
+        notes.rival, notes.beside = others[0], beside
         with path.scan.if_possible(others[0].candidate, "advice", wholly=False):
-            notes.advice += experiment_design.between_totals(path.scan, evaluation, likely[0], others[0])
+            notes.advice += experiment_design.between_totals(path.scan, evaluation, contested[0], others[0])
     else:
         notes.advice += experiment_design.on_setup(replicates, evaluation, found)
         bright = setups.brightest(replicates, likely[0])
@@ -364,12 +371,15 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
 def _is_freed(path: ModelPath, notes: Notes) -> bool:
     """Whether the levels that the set-up explains are free now, for a score test of what other statistics show.
 
-    They stay where there are steps, whose fit has the totals in it, or where a change of the sensor is a tie.
+    They stay where a change of the sensor is a tie. Steps are fitted anew, without these totals.
     """
-    if path.steps or notes.rival is not None:
+    if notes.rival is not None:
         return False
     path.replicates.unstated = frozenset(entry["capture"] for entry in notes.by_totals)
     path.evaluation = with_totals_anew(path.replicates, path.evaluation)
+    if path.fit is not None:
+        path.approximate = True
+        complete(path)
     return True
 
 
@@ -389,7 +399,9 @@ def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
     finally:
         replicates.unstated = frozenset() if explained else free
     if explained:
-        path.evaluation, path.approximate = stated, path.fit is not None  # the totals are no part of its fit
+        path.evaluation = stated
+        path.approximate = path.approximate or path.fit is not None  # the totals are no part of its fit
+        notes.taken_back = notes.bent, notes.advice
         notes.setup = [entry for entry in notes.setup if all(entry is not one for one in notes.by_totals)]
         notes.explained, notes.bent, notes.advice = False, False, []
     return explained
@@ -397,8 +409,14 @@ def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
 
 def _take_setup_again(path: ModelPath, notes: Notes) -> None:
     """Put the entries of the set-up back where the step that explained the totals was dropped."""
-    if notes.by_totals and not notes.explained and _totals_fail(path.replicates, path.evaluation):
+    if notes.taken_back is None or notes.explained:
+        return
+    if path.replicates.unstated:  # the budget has ended what followed
+        path.replicates.unstated = frozenset()
+        path.evaluation = with_totals_anew(path.replicates, path.evaluation)
+    if _totals_fail(path.replicates, path.evaluation):
         notes.setup, notes.explained = notes.by_totals + notes.setup, True
+        notes.bent, notes.advice = notes.taken_back
 
 
 def _totals_fail(replicates: Replicates, evaluation: Evaluation) -> bool:

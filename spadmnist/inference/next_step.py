@@ -45,6 +45,11 @@ def after_diagnosis(
         return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
     if new is None and found.steps and found.verdict in ("explained", "partly_explained", "confused"):
         return f"spadmnist diagnose {sensor} {measurement} {same} writes the new model, for compare to check."
+    if found.verdict == "explained" and found.faulty:
+        return (
+            f"measure the light of {found.faulty} again, correct measurement.yaml, and type spadmnist compare {new} "
+            f"{measurement}."
+        )
     if found.verdict == "setup" and found.setup:
         entry = found.setup[0]
         return (

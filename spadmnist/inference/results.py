@@ -203,6 +203,7 @@ class Diagnosis:
     stopped: bool = False  # the largest number of steps ended the search
     or_setup: bool = False  # the last step explains the totals as well as `setup` does, and is in no sensor file
     beside: tuple[str, ...] = ()  # captures whose entries of `setup` stay with that step
+    faulty: str = ""  # in words, the captures of which the set-up explains the totals
 
     def as_data(self) -> dict[str, Any]:
         """The result as JSON data: `formats`, spadmnist-diagnosis/1 or spadmnist-fit/1."""
@@ -424,8 +425,7 @@ def _verdict_on(found: Diagnosis) -> str:
     if found.verdict == "setup":
         return "the set-up explains the deviations; nothing here asks for a change of the sensor."
     if found.verdict == "explained":
-        wrong = list(dict.fromkeys(str(entry["capture"] or "all captures") for entry in found.setup))
-        beside = f", and the set-up of {' and '.join(wrong)} those of the totals" if wrong else ""
+        beside = f", and the set-up of {found.faulty} those of the totals" if found.faulty else ""
         return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model{beside}."
     if found.verdict == "confused" and found.setup and not found.steps:
         where = found.setup[0]["capture"] or "all captures"
@@ -433,9 +433,10 @@ def _verdict_on(found: Diagnosis) -> str:
     if found.verdict == "confused" and found.or_setup:
         *earlier, last = [title(s.candidate) for s in found.steps]
         either = f"the {found.setup[0]['quantity']} of {found.setup[0]['capture'] or 'all captures'}, or {last}"
+        if " and " in found.faulty:
+            either = f"the set-up of {found.faulty}, or {last}"
         if found.beside:
-            wrong = list(dict.fromkeys(str(entry["capture"]) for entry in found.setup))
-            either = f"the set-up of {' and '.join(wrong)}, or {last} with that of {' and '.join(found.beside)}"
+            either += f" with that of {' and '.join(found.beside)}"
         besides = f"; besides, {' and '.join(earlier)} was found" if earlier else ""
         return f"{either}: each explains the totals, and the sensor file has neither{besides}."
     if found.verdict == "confused":

@@ -345,7 +345,8 @@ class Scan:
             replaced += [t for t in still if t.fall < COST_OF_A_PARAMETER and (t.candidate.name, shape_of(t)) in raised]
             still = [] if found else [t for t in faint_of(new) if t.candidate.kind == "set"]
             found += new
-        del self.untried[known:]  # they were tried, if not as strong
+        # a listed value was tried, if not as far off
+        self.untried[known:] = [entry for entry in self.untried[known:] if entry["change"] == "add"]
         return [t for t in [*tried, *found] if not any(t is one for one in replaced)]
 
     def _lowered(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:

@@ -76,6 +76,11 @@ class SetupExplanation:
         """The sum of squares of the residuals, plus the cost of the factors, in chi square."""
         return float(self.left @ self.left) + COST_OF_A_PARAMETER * len(self.factors)
 
+    def without(self, factor: Factor) -> SetupExplanation:
+        """The same residuals with the other factors alone."""
+        kept = [k for k, one in enumerate(self.factors) if one != factor]
+        return SetupExplanation(tuple(self.factors[k] for k in kept), self.logs[kept], self.errors[kept], self.left)
+
     @property
     def explains(self) -> bool:
         """Whether the totals pass with it: their p-value, and each residual within 4 sigma."""
@@ -113,6 +118,12 @@ def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupEx
         logs = covariance @ design.T @ z
         found.append(SetupExplanation(factors, logs, np.sqrt(np.diag(covariance)), z - design @ logs))
     return sorted((e for e in found if e.explains), key=lambda e: e.cost)
+
+
+def captures_of(likely: Sequence[SetupExplanation]) -> str:
+    """The captures of explanations that are a tie, in words: those of one are all needed."""
+    every = [" and ".join(dict.fromkeys(id for factor in one.factors for id in factor.captures)) for one in likely]
+    return " or ".join(dict.fromkeys(every))
 
 
 def _overlap(pair: Sequence[Factor]) -> bool:
@@ -251,7 +262,8 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
             continue
         remains, fit = best
         if remains + COST_OF_A_PARAMETER < cost + TIE and stats.chi2.sf(remains, max(1, freedom - 1)) > FALSE_ALARM:
-            fit.fall = square(evaluation.residuals) - remains
+            z = evaluation.residuals[TOTALS]
+            fit.fall = float(z @ z) - remains
             out.append(fit)
     out = sorted(out, key=lambda t: t.cost(evaluation))[:_VERIFIED]
     models = [t.sensors for t in out if t.sensors is not None]
@@ -263,7 +275,7 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
 
 
 def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[tuple[Trial, Factor]]:
-    """(rival of a set-up explanation of two factors, the factor that stays beside it), by cost."""
+    """(rival of one strength of a set-up explanation of two factors, the factor that stays beside it), by cost."""
     replicates = scan.replicates
     out: list[tuple[Trial, Factor]] = []
     for factor in one.factors if len(one.factors) == 2 else ():
@@ -271,7 +283,9 @@ def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> 
         try:
             free = with_totals_anew(replicates, evaluation)
             if free.residuals[TOTALS].size > 1:
-                out += [(rival, factor) for rival in rivals(scan, free, one.cost - COST_OF_A_PARAMETER)]
+                # each level that is freed is a number
+                cost = one.cost - COST_OF_A_PARAMETER * len(factor.captures)
+                out += [(r, factor) for r in rivals(scan, free, cost) if len(r.candidate.strengths) == 1]
         finally:
             replicates.unstated = before
     return sorted(out, key=lambda pair: pair[0].cost(evaluation))

@@ -521,7 +521,8 @@ misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 {% endfor %}
 </tbody></table></div>
 {% if found.setup | selectattr("confused") | list %}
-<p class="small">This measurement cannot separate those that begin with "or": any of them is enough.</p>
+<p class="small">This measurement cannot separate those that begin with "or": \
+{{ "of those of one capture, any one" if " and " in found.faulty else "any of them" }} is enough.</p>
 {% endif %}
 {% endif %}
 {% if found.nuisances %}
