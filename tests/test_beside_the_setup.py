@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from tinylab import bench_of, labs
 
@@ -13,8 +15,10 @@ import spadmnist as sp
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import _is_as_stated, _is_freed, _take_setup_again, diagnose
+from spadmnist.inference.next_step import after_diagnosis
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, sentence
+from spadmnist.inference.setups import Factor, SetupExplanation, captures_of
 from spadmnist.inference.trial import Trial
 from spadmnist.measurement import Measurement, in_memory
 
@@ -68,6 +72,29 @@ def test_levels_are_not_freed_where_a_change_of_the_sensor_is_a_tie(tmp_path: Pa
     assert not _is_freed(path, notes) and path.replicates.unstated == frozenset()
     notes.rival = None
     assert _is_freed(path, notes) and path.replicates.unstated == {"flat"}
+
+
+def test_explanations_of_the_totals_in_words_and_in_parts() -> None:
+    low, high, all_ = (Factor("light", ids, len(ids) > 1) for ids in (("low",), ("high",), ("low", "high")))
+    both = SetupExplanation((low, high), np.array([0.1, 0.2]), np.array([0.01, 0.02]), np.array([1.0, 2.0]))
+    one = SetupExplanation((all_,), np.array([0.1]), np.array([0.01]), np.array([3.0, 1.0]))
+    other = SetupExplanation((low,), np.array([0.1]), np.array([0.01]), np.array([3.0, 1.0]))
+    assert captures_of([both]) == captures_of([both, one]) == "low and high"  # all of one are needed
+    assert captures_of([both, other]) == "low and high or low"
+    left = both.without(low)
+    assert left.factors == (high,) and left.logs.tolist() == [0.2] and left.errors.tolist() == [0.02]
+    assert left.cost == pytest.approx(both.cost - 9) == 14
+
+
+def test_the_next_step_beside_a_fault_of_the_set_up_corrects_the_measurement() -> None:
+    step = SimpleNamespace(candidate=SimpleNamespace(kind="add", effect="flicker", parameter=None))
+    found: Any = SimpleNamespace(
+        finished=True, asked="diagnose", verdict="explained", steps=[step], faulty="low", advice=[]
+    )
+    said = after_diagnosis(found)
+    assert said.startswith("measure the light of low again, correct measurement.yaml, and type spadmnist compare")
+    found.faulty, found.stopped = "", False
+    assert "measurement.yaml" not in after_diagnosis(found)
 
 
 @pytest.mark.slow
