@@ -153,6 +153,8 @@ def _diagnosed(
         path.evaluation = completed(replicates, path.evaluation)  # where the budget has ended the fit of all numbers
         if path.steps:
             path.last_rung()
+    with or_as_before(path, "the set-up by the last model"):
+        _renew_setup(path, notes)
     verdict = verdict_of(path, left_over(path, notes), notes)
     if not path.steps:
         path.evaluation, path.fit, path.values = start, None, {}
@@ -417,6 +419,23 @@ def _take_setup_again(path: ModelPath, notes: Notes) -> None:
     if _totals_fail(path.replicates, path.evaluation):
         notes.setup, notes.explained = notes.by_totals + notes.setup, True
         notes.bent, notes.advice = notes.taken_back
+
+
+def _renew_setup(path: ModelPath, notes: Notes) -> None:
+    """Write the entries of the set-up by the model with its steps, under which the totals may scatter more."""
+    replicates, free = path.replicates, path.replicates.unstated
+    if not path.steps or not free:
+        return
+    replicates.unstated = frozenset()
+    try:
+        stated = with_totals_anew(replicates, path.evaluation)
+        likely = setups.explanations(replicates, stated)
+        near = [e for e in likely if e.cost < likely[0].cost + setups.TIE and len(e.factors) == len(likely[0].factors)]
+        if found := setups.entries(replicates, stated, near):
+            others = [entry for entry in notes.setup if all(entry is not one for one in notes.by_totals)]
+            notes.setup, notes.by_totals, notes.faulty = found + others, found, setups.captures_of(near)
+    finally:
+        replicates.unstated = free
 
 
 def _totals_fail(replicates: Replicates, evaluation: Evaluation) -> bool:
