@@ -34,7 +34,7 @@ class Notes:
         bent: a nonlinearity that no effect here has may explain them as well.
         advice: captures that would separate explanations.
         rival: a change of the sensor that is a tie with the set-up.
-        beside: captures whose fault of the set-up stays beside the rival; none where it explains the totals alone.
+        shared: captures whose wrong level the rival needs as well; none where it explains the totals alone.
         placebo: the row of the placebo.
         tried: the last trials of the candidates.
         looked: the evaluation under which they were tried in all captures.
@@ -50,7 +50,7 @@ class Notes:
     bent: bool = False
     advice: list[dict[str, Any]] = field(default_factory=list)
     rival: Trial | None = None
-    beside: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
     placebo: Rung | None = None
     tried: list[Trial] = field(default_factory=list)
     looked: Evaluation | None = None

@@ -189,7 +189,7 @@ def _diagnosed(
         )
     found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
-    found.beside, found.faulty = notes.beside, notes.faulty if notes.explained else ""
+    found.shared, found.faulty = notes.shared, notes.faulty if notes.explained else ""
     return found
 
 
@@ -340,12 +340,14 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     others = setups.rivals(path.scan, evaluation, cost)
     own = others[0].cost(evaluation) if others else math.inf
     contested = likely[:1]
-    beside: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
     if likely and not others:
         with contextlib.suppress(OutOfBudget):  # the set-up explains the totals
-            for rival, factor in setups.rivals_beside(path.scan, evaluation, likely[0])[:1]:
-                others, beside = [rival], factor.captures
-                own = rival.cost(evaluation) + COST_OF_A_PARAMETER * len(beside)
+            for rival, factor in setups.rivals_with_a_factor(path.scan, evaluation, likely[0])[:1]:
+                others, shared = [rival], factor.captures
+                own = max(
+                    rival.cost(evaluation) + COST_OF_A_PARAMETER * len(shared), cost - setups.TIE
+                )  # a tie at best
                 contested = [likely[0].without(factor)]
     if not likely or own < cost - setups.TIE:
         return False  # the sensor explains it better
@@ -353,10 +355,10 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     found = setups.entries(replicates, evaluation, near)
     if not found:
         return False
-    notes.faulty = setups.captures_of(likely[:1] if beside else near)
+    notes.faulty = setups.captures_of(likely[:1] if shared else near)
     if own < cost + setups.TIE:
-        found = [{**entry, "confused": entry["confused"] or entry["capture"] not in beside} for entry in found]
-        notes.rival, notes.beside = others[0], beside
+        found = [{**entry, "confused": entry["confused"] or entry["capture"] not in shared} for entry in found]
+        notes.rival, notes.shared = others[0], shared
         with path.scan.if_possible(others[0].candidate, "advice", wholly=False):
             notes.advice += experiment_design.between_totals(path.scan, evaluation, contested[0], others[0])
     else:

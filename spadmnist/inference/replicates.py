@@ -49,9 +49,9 @@ _SCALES = 8
 
 
 class CannotSimulate(SpadError):
-    """A model that cannot be simulated. Among the results of several models it stands in the place of that of its own.
+    """A model cannot be simulated. The message is the reason.
 
-    The message is the reason.
+    In a list of results it takes the place of the result of its model.
     """
 
     @classmethod
@@ -157,7 +157,7 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
 
 @dataclass(frozen=True)
 class Execution:
-    """By whom models are simulated, within which budget, and who is told.
+    """Workers, budget and callbacks of the simulations.
 
     Attributes:
         say: called with what is being done.

@@ -202,7 +202,7 @@ class Diagnosis:
     compared: str = ""  # what alone was compared with the model, in words; "" for all statistics
     stopped: bool = False  # the largest number of steps ended the search
     or_setup: bool = False  # the last step explains the totals as well as `setup` does, and is in no sensor file
-    beside: tuple[str, ...] = ()  # captures whose entries of `setup` stay with that step
+    shared: tuple[str, ...] = ()  # captures whose wrong level that step needs as well
     faulty: str = ""  # in words, the captures of which the set-up explains the totals
 
     def as_data(self) -> dict[str, Any]:
@@ -425,8 +425,8 @@ def _verdict_on(found: Diagnosis) -> str:
     if found.verdict == "setup":
         return "the set-up explains the deviations; nothing here asks for a change of the sensor."
     if found.verdict == "explained":
-        beside = f", and the set-up of {found.faulty} those of the totals" if found.faulty else ""
-        return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model{beside}."
+        totals = f", and the set-up of {found.faulty} those of the totals" if found.faulty else ""
+        return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model{totals}."
     if found.verdict == "confused" and found.setup and not found.steps:
         where = found.setup[0]["capture"] or "all captures"
         return f"the set-up of {where}, or {NONLINEARITY}: it is the brightest capture."
@@ -435,8 +435,8 @@ def _verdict_on(found: Diagnosis) -> str:
         either = f"the {found.setup[0]['quantity']} of {found.setup[0]['capture'] or 'all captures'}, or {last}"
         if " and " in found.faulty:
             either = f"the set-up of {found.faulty}, or {last}"
-        if found.beside:
-            either += f" with that of {' and '.join(found.beside)}"
+        if found.shared:
+            either += f" with that of {' and '.join(found.shared)}"
         besides = f"; besides, {' and '.join(earlier)} was found" if earlier else ""
         return f"{either}: each explains the totals, and the sensor file has neither{besides}."
     if found.verdict == "confused":

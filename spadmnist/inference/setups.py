@@ -274,8 +274,12 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
     ]
 
 
-def rivals_beside(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[tuple[Trial, Factor]]:
-    """(rival of one strength of a set-up explanation of two factors, the factor that stays beside it), by cost."""
+def rivals_with_a_factor(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[tuple[Trial, Factor]]:
+    """Changes of the sensor that replace one of the two factors of a set-up explanation.
+
+    Returns:
+        (trial of a change with one strength, the factor that is still needed), by cost.
+    """
     replicates = scan.replicates
     out: list[tuple[Trial, Factor]] = []
     for factor in one.factors if len(one.factors) == 2 else ():
