@@ -184,7 +184,7 @@ def test_background_light_beside_one_wrong_level_is_a_tie_with_two_wrong_levels(
     value = found.steps[0].values["rate"]
     assert value.value == pytest.approx(300, rel=0.5)
     assert {e["capture"] for e in found.setup} == {"low", "high"} and all(e["confused"] for e in found.setup)
-    said = "the set-up of low and high, or background_light with that of high: each explains the totals"
+    said = "the set-up of low and high, or background_light with the set-up of high: each explains the totals"
     assert sentence(found).startswith(said)
 
 

@@ -436,7 +436,7 @@ def _verdict_on(found: Diagnosis) -> str:
         if " and " in found.faulty:
             either = f"the set-up of {found.faulty}, or {last}"
         if found.shared:
-            either += f" with that of {' and '.join(found.shared)}"
+            either += f" with the set-up of {' and '.join(found.shared)}"
         besides = f"; besides, {' and '.join(earlier)} was found" if earlier else ""
         return f"{either}: each explains the totals, and the sensor file has neither{besides}."
     if found.verdict == "confused":
