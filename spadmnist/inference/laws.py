@@ -29,6 +29,8 @@ _FEW = 20.0
 _EVENTS = 25.0
 _LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion, for empty cells
 _LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged, for empty cells
+# of Student's t: a smaller tail is computed as its logarithm. It is a little above the least number of a double
+_FAR_TAIL = 1e-290
 _LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
 
 _Both = tuple[np.ndarray | float, np.ndarray | float]  # of this model and of the other
@@ -50,7 +52,7 @@ class Law:
         return -math.inf
 
     def shifted(self, expected: np.ndarray, shift: np.ndarray, n: int) -> np.ndarray:
-        """The expectation of cells that are shifted, (cells,)."""
+        """The expectation of cells that are shifted, in the shape of the shift: (cells,) or (shifts, cells)."""
         return np.asarray(expected + shift)
 
     def regression(self, values: np.ndarray, x: np.ndarray, coefficients: np.ndarray) -> None:
@@ -363,5 +365,12 @@ def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:
 
 def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
     """The normal score of a Student's t."""
-    log_tail = stats.t.logsf(np.abs(t), freedom)
-    return np.asarray(np.sign(t) * _score_of_tail(log_tail))
+    t = np.asarray(t, np.float64)
+    # the tail of `scipy.stats.t.sf`, at a tenth of its cost for some cells
+    tail = special.stdtr(freedom, -np.abs(t))
+    score = -special.ndtri(np.maximum(tail, _LEAST))
+    far = tail < _FAR_TAIL
+    if far.any():  # the first term of the incomplete beta function, beyond the range of a double as well
+        a, x = freedom / 2, freedom / (freedom + t[far] ** 2)
+        score[far] = _score_of_tail(a * np.log(x) - math.log(2 * a) - special.betaln(a, 0.5))
+    return np.asarray(np.sign(t) * score)

@@ -78,10 +78,7 @@ class CaptureNull:
     def level_of(self, total: float) -> tuple[float, float, float]:
         """(level that gives this total, standard error of its log, elasticity of the total there)."""
         low, high = self.level * 1e-6, self._highest
-        for _ in range(200):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if self.total_at(middle) < total else (low, middle)
-        found = math.sqrt(low * high)
+        found = bisection(self.total_at, total, low, high)
         elasticity = self.elasticity_at(found)
         return found, self._scatter / max(elasticity, 1e-3), elasticity
 
@@ -309,12 +306,17 @@ def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.n
 
 def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
     """The level at which this total is expected; the stated one where there is none."""
-    low, high = 1e-6, rising_until(expected, 1e-6, 1e12)
-    for _ in range(100):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if expected(middle) < total else (low, middle)
-    found = math.sqrt(low * high)
+    found = bisection(expected, total, 1e-6, rising_until(expected, 1e-6, 1e12))
     return found if 1e-5 < found < 1e11 else stated or 1.0
+
+
+def bisection(expected: Callable[[float], float], total: float, low: float, high: float) -> float:
+    """The level between `low` and `high` at which this total is expected, to the last digit of a double."""
+    middle = math.sqrt(low * high)
+    while low < middle < high:
+        low, high = (middle, high) if expected(middle) < total else (low, middle)
+        middle = math.sqrt(low * high)
+    return middle
 
 
 def rising_until(expected: Callable[[float], float], low: float, high: float) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
@@ -68,19 +67,31 @@ class Model:
             chips: every replicate is of a chip of its own, because the random properties of the pixels are not known.
         """
 
-        def own(capture: str) -> dict[Key, Any]:
-            return {**values, **{key: x for (id, key), x in (phases or {}).items() if id == capture}}
+        known: list[tuple[Sensor, dict[Key, float], Sensor]] = []  # (sensor here, phases, the changed sensor)
+
+        def changed(sensor: Sensor, own: dict[Key, float]) -> Sensor:
+            """The changed sensor; of what is alike there is one, which keeps what it has computed."""
+            found = next((made for of, with_phases, made in known if of is sensor and with_phases == own), None)
+            if found is None:
+                found = with_values(sensor, {**values, **own})
+                known.append((sensor, own, found))
+            return found
+
+        def own(capture: str) -> dict[Key, float]:
+            return {key: x for (id, key), x in (phases or {}).items() if id == capture}
 
         def of(capture: str, number: int) -> Sensor:
             sensor = self.of(capture, number)
-            return with_values(on_chip(sensor, number + 1) if chips else sensor, own(capture))
+            if alike:
+                return changed(sensor, own(capture))
+            return with_values(on_chip(sensor, number + 1) if chips else sensor, {**values, **own(capture)})
 
         def usual(capture: str) -> Sensor:
-            return with_values(self.mean_sensor(capture), own(capture))
+            return with_values(self.mean_sensor(capture), {**values, **own(capture)})
 
-        typical = functools.lru_cache(maxsize=64)(usual)
-        known = typical if self.typical or chips else None
-        return Model(of, with_values(self.one, values), self.alike and not chips, known)
+        alike = self.alike and not chips
+        typical = functools.lru_cache(maxsize=64)(usual) if self.typical or chips else None
+        return Model(of, changed(self.one, {}), alike, typical)
 
 
 def phase_parameters(sensor: Sensor) -> list[Key]:

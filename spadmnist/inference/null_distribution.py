@@ -212,12 +212,12 @@ def scatter_of(null: Null, made: CaptureReplicates) -> np.ndarray:
 def residuals_of(
     null: Null, values: np.ndarray, unshifted: tuple[np.ndarray, float], shift: np.ndarray, noise: float
 ) -> np.ndarray:
-    """The residuals of a summary if the expectation of its cells were shifted, (cells,).
+    """The residuals of a summary if the expectation of its cells were shifted, in the shape of the shift.
 
     Args:
         values: (cells,) of the measured summary.
         unshifted: (expectation (cells,), its relative variance), see `Null.expected`.
-        shift: (cells,) of the expectation.
+        shift: (cells,) of the expectation, or (shifts, cells).
         noise: relative variance of the shift.
     """
     expected = null.law.shifted(unshifted[0], shift, null.recordings)

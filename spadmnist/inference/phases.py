@@ -230,9 +230,8 @@ def _best(
         waves = {id: np.stack([_waves(t, float(p)) for p in phases]) for id, phases in around.items()}
         gain = {id: np.zeros(len(phases)) for id, phases in around.items()}
         for cell, x in own.items():
-            for k, shift in enumerate(waves[cell[0]] @ x):
-                z = residuals_shifted(replicates, evaluation, cell, shift)
-                gain[cell[0]][k] += before[cell] - float(z @ z)
+            z = residuals_shifted(replicates, evaluation, cell, waves[cell[0]] @ x)
+            gain[cell[0]] += before[cell] - np.einsum("pc,pc->p", z, z)
         chosen = {id: int(g.argmax()) for id, g in gain.items()}
         logs = {id: waves[id] @ swing.logs.get(id, np.zeros(5)) for id in around}
 

@@ -49,7 +49,7 @@ class ReducedCapture:
         Args:
             reduced: with its statistics; without them only the counts are there.
         """
-        summaries = {}
+        recording, summaries = recording.widened(), {}
         for statistic in statistics_for(recording.capture) if reduced else ():
             summary = reduce_with(statistic, recording)
             if summary is not None:

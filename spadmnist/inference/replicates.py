@@ -125,7 +125,7 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
             half = recording.every_other(task.second)
             assert half is not None  # the measurement's own half is there
             recording = half
-        recording = recording.beside(task.dead)
+        recording = recording.beside(task.dead).widened()
         totals.append(int(recording.totals.sum()))
         for statistic in known:
             summary = reduce_with(statistic, recording)
@@ -318,20 +318,23 @@ class Replicates:
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | CannotSimulate] = [CannotSimulate()] * len(wanted)
         some_of = names or [()] * len(wanted)
-        entries = [self._name(one, pieces, hasty, some) for one, some in zip(wanted, some_of, strict=True)]
+        entries: list[str | None] = [None] * len(wanted)
         most, work = 0.0, [0.0] * len(wanted)  # bytes of a replicate; s of two idle cores
-        for k, (sensors, id, photons, numbers) in enumerate(wanted):
+        for k, (model, id, photons, numbers) in enumerate(wanted):
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
             try:
+                sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
+                if self.journal is not None:
+                    more = self.seed, self.dead, pieces, hasty, *sorted(some_of[k])
+                    entries[k] = self.journal.name(sensors, self.seen[id], photons, numbers, *more)
                 if len(numbers):
-                    first = sensors.of(id, int(numbers[0]))
-                    most = max(most, self._bytes(first, id, photons))
-                    work[k] = len(numbers) * self.work_of(first, id) * _share_of_work(capture, some_of[k])
+                    most = max(most, self._bytes(sensors[0], id, photons))
+                    work[k] = len(numbers) * self.work_of(sensors[0], id) * _share_of_work(capture, some_of[k])
+                together = [Packed.of(sensors[0], self.workers.apart)] if model.alike else []
                 for part in parts:
-                    each = [0] if sensors.alike else [int(numbers[i]) for i in part]
-                    models = [Packed.of(sensors.of(id, number), self.workers.apart) for number in each]
+                    models = together or [Packed.of(sensors[i], self.workers.apart) for i in part]
                     rest = self.seed, self.dead, hasty, some_of[k], second
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
@@ -361,20 +364,6 @@ class Replicates:
 
         self._limited(most).run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
         return out
-
-    def _name(
-        self, wanted: tuple[Model, str, np.ndarray, np.ndarray], pieces: int, hasty: bool, some: Collection[str]
-    ) -> str | None:
-        """The name in the journal of what is wanted; None without a journal, or where the model cannot be made."""
-        model, id, photons, numbers = wanted
-        if self.journal is None:
-            return None
-        try:
-            sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
-        except UNABLE:
-            return None
-        more = self.seed, self.dead, pieces, hasty, *sorted(some)
-        return self.journal.name(sensors, self.seen[id], photons, numbers, *more)
 
 
 def _share_of_work(capture: Capture, names: Collection[str]) -> float:

@@ -340,7 +340,11 @@ def size_of(replicates: Replicates, evaluation: Evaluation, signature: Signature
 
 
 def residuals_shifted(replicates: Replicates, evaluation: Evaluation, cell: Cell, shift: np.ndarray) -> np.ndarray:
-    """The residuals of the data in one block if its expectation were shifted by `shift` (cells,)."""
+    """The residuals of the data in one block if its expectation were shifted, in the shape of the shift.
+
+    Args:
+        shift: (cells,), or (shifts, cells) for several.
+    """
     seen = replicates.seen[cell[0]]
     unshifted = evaluation.expected(cell, seen.total)
     return residuals_of(evaluation.nulls[cell], seen.summaries[cell[1]].values, unshifted, shift, 0.0)

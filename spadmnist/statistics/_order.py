@@ -38,7 +38,7 @@ def time_order(recording: Recording) -> TimeOrder:
         assert recording.events is not None
         bits = max(1, (recording.pixels - 1).bit_length())
         ticks, _ = whole_ticks(recording)
-        return TimeOrder(_ordered(ticks, recording.events.offsets, _slabs(recording, bits), bits), bits)
+        return TimeOrder(_in_order(ticks, recording.events.offsets, _slabs(recording, bits), bits), bits)
 
     return recording.kept("time order", make)
 
@@ -62,7 +62,7 @@ def in_time_order(recording: Recording, reach: int = 0, least: int = 0) -> Itera
     bits = max(1, (recording.pixels - 1).bit_length())
     plan = _slabs(recording, bits)
     if not _rise(ticks, offsets):
-        yield _ordered(ticks, offsets, plan, bits), bits, 0
+        yield _in_order(ticks, offsets, plan, bits), bits, 0
         return
     position, slab, many = offsets[:-1].copy(), 0, max(1, plan.number * _PIECE // len(ticks))
     before = np.empty(0, np.int64)
@@ -112,10 +112,9 @@ def _rise(stamps, offsets):
     return True
 
 
-@jit
-def _ordered(stamps, offsets, plan, bits):
+def _in_order(stamps: np.ndarray, offsets: np.ndarray, plan: _Plan, bits: int) -> np.ndarray:
     """All rows' stamps with their rows in the lower bits, in order: a slab of time after the other."""
-    out = np.empty(offsets[offsets.size - 1], np.int64)
+    out = np.empty(offsets[-1], np.int64)
     used, ordered = _sort_slabs(stamps, offsets, offsets[:-1].copy(), (0, plan.number), plan, bits, out, 0)
     if not ordered:  # a row is not
         out[:used].sort()

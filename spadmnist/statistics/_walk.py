@@ -239,10 +239,11 @@ def _through(recording: Recording) -> Walk:
         offsets, end = recording.events.offsets, exposure_in(recording, tick)
         spot, stride, first, step, kind, second = around(recording.layout, near_by)
         ranks, passed = np.array(RANKS), _Passed.none(spot, stride, offsets)
+        ranges = _Ranges.of_lags(lags, min(latest(tick), int(lags[-1])))
         for words, bits, new in in_time_order(recording, int(lags[-1]), int(ranks[-1])):
             _through_exposure(
                 words, new, bits, stamps, offsets, end, edges, start, ranks, crowd_edges(recording)[0],
-                gaps(tick), kinds, lags, min(latest(tick), int(lags[-1])), spot, stride, first, step, kind, second,
+                gaps(tick), kinds, lags, ranges, spot, stride, first, step, kind, second,
                 passed, spacings, crowds, clusters, found, later,
             )  # fmt: skip
         _finish(kinds, passed.runs, clusters)
@@ -302,16 +303,39 @@ class _Passed(NamedTuple):
         return _Passed(row_of, recent, latest_at, place, np.ones(len(_GAPS), np.int64))
 
 
+class _Ranges(NamedTuple):
+    """Ranges of lags, each in one bin, and either up to `latest` or beyond it.
+
+    limits: (_RANGES,) ticks that each one does not reach, those behind the last one the longest lag; number: of them;
+    of: (longest lag,) uint8, the range of each lag, or none where that would be long; latest: ticks.
+    """
+
+    limits: np.ndarray
+    number: int
+    of: np.ndarray
+    latest: int
+
+    @staticmethod
+    def of_lags(lags: np.ndarray, latest: int) -> _Ranges:
+        """Those of some bins. lags: (bins,) ticks."""
+        longest = int(lags[-1])
+        some = np.unique(np.append(lags, [1, latest]))
+        limits = np.full(_RANGES, longest)
+        limits[: some.size] = some
+        of = np.searchsorted(some[:-1], np.arange(longest if longest <= _LONG else 0), side="right").astype(np.uint8)
+        return _Ranges(limits, some.size, of, latest)
+
+
 @jit
 def _through_exposure(
-    words, new, bits, stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, latest,
+    words, new, bits, stamps, offsets, end, edges, start, ranks, crowded, gaps, kinds, lags, ranges,
     spot, stride, first, step, kind, second, passed, spacings, crowds, clusters, found, later,
 ):  # fmt: skip
     """Walk through some detections in the order of time, from the first new one on, some after the others.
 
     words, bits: see `TimeOrder`; stamps, offsets: all of them, by rows; edges, start: of spacings, see `guide`; ranks,
-    crowded: of crowds, with their edges; gaps, kinds: of clusters; lags: (bins,) ticks; spot, ..., second: see
-    `around`; passed: those before, to which these are added.
+    crowded: of crowds, with their edges; gaps, kinds: of clusters; lags: (bins,) ticks; ranges: of lags, see `_Ranges`;
+    spot, ..., second: see `around`; passed: those before, to which these are added.
     Adds to spacings, crowds, clusters, found (classes, bins) pairs of near pixels, and of all in the last one, later
     (classes,).
     """
@@ -323,7 +347,6 @@ def _through_exposure(
     entry_of = np.full(2 * reach + 2, step.size)  # of the way from one spot to another; nobody's are the last
     for e in range(step.size if back else 0):
         entry_of[step[e] + reach] = e
-    range_of = _range_of(lags, latest) if back else np.empty(0, np.uint8)
     most = ranks[ranks.size - 1]
     times = np.empty(2 * _BLOCK, np.int64)
     some = np.empty(_BLOCK, np.int64)
@@ -340,12 +363,10 @@ def _through_exposure(
             times[i - oldest] = words[i] >> bits
         held, count = begin - oldest, stop - oldest
         if back:
-            _near_pairs_back(
-                words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
-            )
+            _near_pairs_back(words, bits, begin, stop, spot, lags, ranges, entry_of, kind, second, some, found, later)
         else:
             _near_pairs(
-                words[begin:stop], bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
+                words[begin:stop], bits, stamps, offsets, lags, ranges, spot, stride, first, step, kind, second,
                 passed.row_of, passed.recent, passed.latest_at, passed.place, found, later,
             )  # fmt: skip
             before = np.int64(0)
@@ -381,49 +402,28 @@ def _after(words, bits, end, time):
 
 
 @jit
-def _ranges(lags, latest):
-    """(ranges of lags: up to each of these, then so far that nothing is; how many they are)."""
-    ranges = np.unique(np.append(lags, np.array([1, latest])))
-    limits = np.full(_RANGES, lags[lags.size - 1])
-    limits[: ranges.size] = ranges
-    return limits, ranges.size
-
-
-@jit
-def _range_of(lags, latest):
-    """(longest lag,) uint8, the range of each lag; see `_ranges`."""
-    limits, ranges = _ranges(lags, latest)
-    out = np.zeros(lags[lags.size - 1], np.uint8)
-    for k in range(ranges - 1):
-        out[limits[k] :] += np.uint8(1)
-    return out
-
-
-@jit
-def _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later):
+def _add_ranges(counters, ranges, lags, kind, second, found, later):
     """Add what was counted by entry and range of lags to the classes of near pixels."""
     for e in range(kind.size):
         b = 0
-        for k in range(ranges):
-            while lags[b] < limits[k]:
+        for k in range(ranges.number):
+            while lags[b] < ranges.limits[k]:
                 b += 1
             found[kind[e], b] += counters[e, k]
-            if second[e] and 1 < limits[k] <= latest:
+            if second[e] and 1 < ranges.limits[k] <= ranges.latest:
                 later[kind[e]] += counters[e, k]
 
 
 @jit
-def _near_pairs_back(
-    words, bits, begin, stop, spot, lags, latest, range_of, entry_of, kind, second, some, found, later
-):  # fmt: skip
+def _near_pairs_back(words, bits, begin, stop, spot, lags, ranges, entry_of, kind, second, some, found, later):
     """As `_near_pairs`, where few detections are near in time: all of these are gone through, and counted.
 
-    words: all of them, of which those from `begin` to `stop` are looked back from; range_of: the function of that name;
-    entry_of: see `_through_exposure`; some: a buffer for as many.
+    words: all of them, of which those from `begin` to `stop` are looked back from; entry_of: see `_through_exposure`;
+    some: a buffer for as many.
     """
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
-    limits, ranges = _ranges(lags, latest)
+    range_of = ranges.of
     counters = np.zeros((kind.size + 1, _RANGES + 1), np.int64)
     reach = np.int64(entry_of.size // 2 - 1)
     most = np.uint64(entry_of.size - 1)
@@ -448,25 +448,25 @@ def _near_pairs_back(
             # far ones, which are most, all go to the place behind the last
             way = min(np.uint64(reach - spot[words[i] & mask] + spot[words[j] & mask]), most)
             counters[np.uint64(entry_of[way]), np.uint64(range_of[np.uint64(lag)])] += 1
-    _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
+    _add_ranges(counters, ranges, lags, kind, second, found, later)
     every = found[found.shape[0] - 1]
     for e in range(kind.size + 1):
         b = 0
-        for k in range(ranges):
-            while lags[b] < limits[k]:
+        for k in range(ranges.number):
+            while lags[b] < ranges.limits[k]:
                 b += 1
             every[b] += counters[e, k]
 
 
 @jit
 def _near_pairs(
-    words, bits, stamps, offsets, lags, latest, spot, stride, first, step, kind, second,
+    words, bits, stamps, offsets, lags, ranges, spot, stride, first, step, kind, second,
     row_of, recent, latest_at, passed, found, later,
 ):  # fmt: skip
     """Count the pairs that each stamp makes with earlier ones around it; moves `recent`, ..., `passed` on."""
     mask = (np.int64(1) << bits) - 1
     longest = lags[lags.size - 1]
-    limits, ranges = _ranges(lags, latest)
+    limits, latest = ranges.limits, ranges.latest
     counters = np.zeros((step.size, _RANGES + 1), np.int64)
     hits = np.empty(step.size + 1, np.int64)
     begin, end, base = np.int64(0), np.int64(step.size), np.int64(0)
@@ -512,7 +512,7 @@ def _near_pairs(
         recent[0, here] = now
         latest_at[0] = now
         passed[here] += 1
-    _add_ranges(counters, limits, ranges, lags, latest, kind, second, found, later)
+    _add_ranges(counters, ranges, lags, kind, second, found, later)
 
 
 @jit

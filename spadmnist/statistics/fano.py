@@ -376,7 +376,8 @@ class ArrayFano(Statistic):
                 if len(sums):
                     total += _fill(words[new:], bits, factor, sums)
                 else:
-                    pairs, (total,) = event_pairs(words >> bits, np.array([0, len(words)]), factor, levels)
+                    ticks = (words >> bits).view(np.uint64)  # as those of each pixel are
+                    pairs, (total,) = event_pairs(ticks, np.array([0, len(words)]), factor, levels)
             if len(sums):
                 pairs = pairs_in_windows(sums, levels)
             slots, total, scatter = np.inf, int(total), 0.0
