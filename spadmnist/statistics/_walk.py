@@ -32,7 +32,7 @@ _PER_DECADE = 10
 _AT_ONCE = 16384  # stamps of frames that are sorted together: they fit into the cache
 _BLOCK = 4096  # detections that are gone through together: their times fit into the nearest cache
 _DEEP = 4  # stamps of a pixel that are held; what is earlier is looked up
-_FEW_BACK = 25.0  # detections of the array within the longest lag, up to which all of them are gone through
+_FEW_BACK = 6.0  # detections of the array within the longest lag, up to which all of them are gone through: as fast
 _LONG = 1 << 20  # ticks in the longest lag, up to which the range of each one stands in a table
 _RANGES = 8  # of lags, at most: a number that the compiler knows
 _SHIFTS = 64  # steps between stamps up to which those of the whole array are compared in turn
@@ -282,14 +282,13 @@ def around(layout: Layout, near_by: Near) -> tuple[np.ndarray, int, np.ndarray, 
 class _Passed(NamedTuple):
     """What is known of the detections that were passed.
 
-    row_of: (spots,) the row at each spot; recent: (deep, spots) the last stamps; latest_at: (deep + 1,) the latest of
-    all those that ever stood at each depth, of which the last is held no longer; place: (spots,) of the last one;
-    runs: (gaps,) how long the cluster is to which the last one belongs.
+    row_of: (spots,) the row at each spot; recent: (deep, spots) the last stamps; newest: (1,) of all; place: (spots,)
+    of the last one; runs: (gaps,) how long the cluster is to which the last one belongs.
     """
 
     row_of: np.ndarray
     recent: np.ndarray
-    latest_at: np.ndarray
+    newest: np.ndarray
     place: np.ndarray
     runs: np.ndarray
 
@@ -299,8 +298,8 @@ class _Passed(NamedTuple):
         spots = int(spot.max(initial=-1)) + 1 + REACH * (stride + 1)
         row_of, place = np.full(spots, -1), np.zeros(spots, np.int64)
         row_of[spot], place[spot] = np.arange(len(spot)), offsets[:-1] - 1
-        recent, latest_at = np.full((_DEEP, spots), _NEVER), np.full(_DEEP + 1, _NEVER)
-        return _Passed(row_of, recent, latest_at, place, np.ones(len(_GAPS), np.int64))
+        recent, newest = np.full((_DEEP, spots), _NEVER), np.full(1, _NEVER)
+        return _Passed(row_of, recent, newest, place, np.ones(len(_GAPS), np.int64))
 
 
 class _Ranges(NamedTuple):
@@ -367,7 +366,7 @@ def _through_exposure(
         else:
             _near_pairs(
                 words[begin:stop], bits, stamps, offsets, lags, ranges, spot, stride, first, step, kind, second,
-                passed.row_of, passed.recent, passed.latest_at, passed.place, found, later,
+                passed.row_of, passed.recent, passed.newest, passed.place, found, later,
             )  # fmt: skip
             before = np.int64(0)
             for k in range(lags.size):
@@ -461,7 +460,7 @@ def _near_pairs_back(words, bits, begin, stop, spot, lags, ranges, entry_of, kin
 @jit
 def _near_pairs(
     words, bits, stamps, offsets, lags, ranges, spot, stride, first, step, kind, second,
-    row_of, recent, latest_at, passed, found, later,
+    row_of, recent, newest, passed, found, later,
 ):  # fmt: skip
     """Count the pairs that each stamp makes with earlier ones around it; moves `recent`, ..., `passed` on."""
     mask = (np.int64(1) << bits) - 1
@@ -473,44 +472,45 @@ def _near_pairs(
     for i in range(words.size):
         now = words[i] >> bits
         here = spot[words[i] & mask]
-        if now - latest_at[0] < longest:
+        if now - newest[0] < longest:
             if stride > 0:
                 base = here
             else:
                 begin, end = first[here], first[here + 1]
+            # first all entries are gone through, then those that are found: no processor could guess which ones
+            some = np.uint64(0)
+            for e in range(begin, end):
+                hits[some] = e
+                some += np.uint64(now - recent[0, np.uint64(base + step[e])] < longest)
             depth = 0
-            while depth < _DEEP and now - latest_at[depth] < longest:
-                # first all entries are gone through, then those that are found: no processor could guess which ones
+            while some > 0 and depth < _DEEP:
+                # where the last stamp of a depth is near enough, the one before it may be
+                near = some
                 some = np.uint64(0)
-                for e in range(begin, end):
-                    lag = now - recent[depth, np.uint64(base + step[e])]
-                    hits[some] = e
-                    some += np.uint64(lag < longest)
-                for h in range(some):
-                    lag = now - recent[depth, np.uint64(base + step[hits[h]])]
+                for h in range(near):
+                    e = hits[h]
+                    place = np.uint64(base + step[e])
+                    lag = now - recent[depth, place]
                     k = np.uint64(0)
                     for limit in range(_RANGES):
                         k += np.uint64(lag >= limits[limit])
-                    counters[np.uint64(hits[h]), k] += 1
+                    counters[np.uint64(e), k] += 1
+                    hits[some] = e
+                    some += np.uint64(depth == _DEEP - 1 or now - recent[depth + 1, place] < longest)
                 depth += 1
-            if now - latest_at[_DEEP] < longest:
-                for e in range(begin, end):
-                    row = row_of[base + step[e]]
-                    if row < 0:
-                        continue
-                    start, stop = offsets[row], passed[base + step[e]] - _DEEP + 1
-                    if stop > start and now - np.int64(stamps[stop - 1]) < longest:
-                        _many_before(stamps, start, stop - 1, now, lags, found[kind[e]])
-                        if second[e]:
-                            until = _since(stamps, start, stop, now - 1)
-                            later[kind[e]] += until - _since(stamps, start, until, now - latest)
-        for depth in range(_DEEP, 0, -1):
-            earlier = recent[depth - 1, here]
-            latest_at[depth] = max(latest_at[depth], earlier)
-            if depth < _DEEP:
-                recent[depth, here] = earlier
+            for h in range(some):
+                e = hits[h]
+                row = row_of[base + step[e]]
+                start, stop = offsets[row], passed[base + step[e]] - _DEEP + 1
+                if stop > start and now - np.int64(stamps[stop - 1]) < longest:
+                    _many_before(stamps, start, stop - 1, now, lags, found[kind[e]])
+                    if second[e]:
+                        until = _since(stamps, start, stop, now - 1)
+                        later[kind[e]] += until - _since(stamps, start, until, now - latest)
+        for depth in range(_DEEP - 1, 0, -1):
+            recent[depth, here] = recent[depth - 1, here]
         recent[0, here] = now
-        latest_at[0] = now
+        newest[0] = now
         passed[here] += 1
     _add_ranges(counters, ranges, lags, kind, second, found, later)
 
