@@ -828,7 +828,7 @@ class Sensor:
         carried = self._carried
         if self.rules == "paper" and frames and carried == 0:
             return events
-        if not (frames or self._soft or self._extends or len(parents)):
+        if not (frames or self.soft or self._extends or len(parents)):
             if not self.dead_times.any():
                 return events
             if events.cause is None:
@@ -843,7 +843,7 @@ class Sensor:
         return events.keep(fired)
 
     @cached_property
-    def _soft(self) -> list[Effect]:
+    def soft(self) -> list[Effect]:
         """The effects that let a pixel wake up slowly."""
         return [e for e in self.at("dead_time") if hasattr(e, "sensitivity")]
 
@@ -862,10 +862,10 @@ class Sensor:
         A pixel whose sensitivity has come up to S fires with probability S: each event draws a number, and fires if
         the sensitivity has reached it. Only what follows another event closely can find a pixel half awake.
         """
-        if not self._soft:
+        if not self.soft:
             return _NONE
         needed = np.zeros(len(events))
-        for effect in self._soft:
+        for effect in self.soft:
             longest = float(self._recovered(effect, np.array([1 - 2.0**-53]))[0])
             close = kernels.followers(events.times, events.offsets, self.dead_times + longest)
             rng = streams.draws(f"{effect.name}/sensitivity", len(events))

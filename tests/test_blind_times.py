@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from pathlib import Path
@@ -12,12 +13,13 @@ import pytest
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.effects import Conditions, Effect, parameter
+from spadmnist.errors import SpadError
 from spadmnist.events import Events, Layout
 from spadmnist.inference.blind_times import ShortestIntervals, Width, likelihoods, width_of
 from spadmnist.inference.candidates import candidates, with_values
 from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.map_fits import fit_maps
+from spadmnist.inference.map_fits import fit_blind_times, fit_maps
 from spadmnist.inference.pixel_maps import by_counts
 from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.score_test import p_of_map
@@ -206,6 +208,28 @@ def test_the_chance_of_a_map_of_dead_times(benches: dict[float, tuple[Replicates
         # where the model blurs the edge by other laws there is none
         slow = {("slow_recovery", "time_constant"): 5e-9}
         assert p_of_map(replicates, evaluation, candidate, slow, light_levels_of(replicates, evaluation)) == 1.0
+
+
+def test_a_parameter_of_the_name_of_a_hook_blurs_no_edge(benches: dict[float, tuple[Replicates, np.ndarray]]) -> None:
+    class Filtered(Effect, stage="arrival"):
+        """A filter with a parameter that is called as the hook of a slow recovery is."""
+
+        sensitivity = parameter(1.0, "", "share that passes", bounds=(0, 1), off=1.0, search=(0.1, 1.0))
+
+        def factor(self, t: np.ndarray, conditions: Conditions) -> np.ndarray:
+            return np.full(np.shape(t), self.sensitivity)
+
+        def maximum(self, conditions: Conditions) -> float:
+            return float(self.sensitivity)
+
+    stated, _ = benches[0.03]
+    replicates = copy.copy(stated)
+    effects = [*stated.start.effects, Filtered()]
+    replicates.start = Sensor(stated.start.layout, effects, stated.start.rules, 0, "filtered").resolved()
+    candidate = next(c for c in candidates(stated.start) if c.carrier == DURATION)
+    assert fit_blind_times(replicates, {}, candidate).estimate.size == SIDE**2
+    with pytest.raises(SpadError, match="blur them by other laws"):
+        fit_blind_times(replicates, {("slow_recovery", "time_constant"): 5e-9}, candidate)
 
 
 def test_which_times_are_the_dead_time(benches: dict[float, tuple[Replicates, np.ndarray]]) -> None:

@@ -222,6 +222,14 @@ def test_a_search_without_a_look_says_that_nothing_was_tried() -> None:
     assert said == "not finished: no check fails; the budget ended before all was done: step 1."
 
 
+def test_a_search_that_ended_before_any_step_does_not_speak_of_steps() -> None:
+    said = results.sentence(answer({}, "setup", finished=False))
+    assert said.startswith("not finished; so far: the set-up explains the deviations")
+    found = answer({}, "explained", finished=False)
+    found.steps = [step("per_pixel", "dark_counts", "rate")]
+    assert results.sentence(found).startswith("not finished; the verdict is that of the steps so far: ")
+
+
 def test_the_set_up_or_the_sensor_are_both_named() -> None:
     found = answer({}, "confused", or_setup=True)
     factor = {"value": 0.95, "low": 0.94, "high": 0.96}

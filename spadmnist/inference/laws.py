@@ -357,10 +357,13 @@ def _powers_of(scores: np.ndarray) -> np.ndarray:
 def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:
     """The normal score whose upper tail has this logarithm."""
     tail = np.exp(np.maximum(log_tail, -700.0))
-    score = -special.ndtri(np.clip(tail, _LEAST, 1 - 1e-16))
+    score = np.array(-special.ndtri(np.clip(tail, _LEAST, 1 - 1e-16)))
     # beyond the range of a double, by the asymptotic tail of the normal law
     far = log_tail < -690
-    return np.asarray(np.where(far, np.sqrt(np.maximum(-2 * log_tail - math.log(2 * math.pi), 0.0)), score))
+    if far.any():
+        square = -2 * log_tail[far] - math.log(2 * math.pi)
+        score[far] = np.sqrt(square - np.log(square))
+    return score
 
 
 def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
@@ -368,7 +371,7 @@ def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
     t = np.asarray(t, np.float64)
     # the tail of `scipy.stats.t.sf`, at a tenth of its cost for some cells
     tail = special.stdtr(freedom, -np.abs(t))
-    score = -special.ndtri(np.maximum(tail, _LEAST))
+    score = np.array(-special.ndtri(np.maximum(tail, _LEAST)))
     far = tail < _FAR_TAIL
     if far.any():  # the first term of the incomplete beta function, beyond the range of a double as well
         a, x = freedom / 2, freedom / (freedom + t[far] ** 2)

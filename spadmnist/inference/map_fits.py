@@ -502,7 +502,7 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     base = base_of(start, candidate)
     captures = [s.shortest for id, s in replicates.seen.items() if s.shortest is not None and (not use or id in use)]
     blur = blur_of(start)
-    if blur is None or any(hasattr(e, "sensitivity") for e in start.effects):
+    if blur is None or start.soft:
         raise SpadError("dead times by pixel are not estimated where stamps or the recovery blur them by other laws")
     found = blind_times.likelihoods(captures, blur, base) if captures and base > 0 else None
     if found is None:

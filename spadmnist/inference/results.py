@@ -414,9 +414,8 @@ def _verdict_on(found: Diagnosis) -> str:
         ended = ", ".join(str(e["where"]) for e in found.untried if e["effect"] is None)
         return f"not finished: no check fails; the budget ended before all was done: {ended}."
     if not found.finished:
-        return "not finished; the verdict is that of the steps so far: " + _verdict_on(
-            dataclasses.replace(found, finished=True)
-        )
+        so_far = "the verdict is that of the steps so far" if found.steps else "so far"
+        return f"not finished; {so_far}: {_verdict_on(dataclasses.replace(found, finished=True))}"
     fitted = " and ".join(title(s.candidate) for s in found.steps)
     if found.verdict == "adequate" and found.steps:
         return f"{fitted}: fitted. No check failed before, and none fails now."
