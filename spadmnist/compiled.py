@@ -81,7 +81,7 @@ def folder() -> Path | None:
             return found
     if told is None:
         logging.getLogger(__name__).warning(
-            "Compiled code cannot be kept, and every run compiles anew, for up to a minute: neither $NUMBA_CACHE_DIR nor "
+            "Compiled code cannot be kept, and every run compiles anew, up to a minute: neither $NUMBA_CACHE_DIR nor "
             "the user's cache folder nor a temporary one takes a folder that is yours alone; name one that does."
         )
     return None
