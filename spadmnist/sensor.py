@@ -8,7 +8,7 @@ beyond the paper's line, `kernels.paper_line` does the same, image by image, in 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -67,6 +67,10 @@ class Sensor:
     def __post_init__(self) -> None:
         for effect in self.effects:
             _check_effect(effect)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Its fields, without what was computed of them: a worker gets no maps that it does not ask for."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def resolved(self) -> Sensor:
         """The same sensor with every map read and every distribution drawn. Raises InputError for a bad map."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 
@@ -13,10 +14,13 @@ from tinylab import bench_of
 
 import spadmnist.statistics as statistics
 from spadmnist.events import Events
-from spadmnist.inference.laws import Law
+from spadmnist.inference.laws import Exponential, Law
 from spadmnist.inference.light_levels import bisection
-from spadmnist.inference.models import Model
-from spadmnist.inference.reduction import ReducedCapture
+from spadmnist.inference.models import Model, Packed
+from spadmnist.inference.reduction import ReducedCapture, summaries_of
+from spadmnist.inference.replicates import no_size
+from spadmnist.recording import Recording
+from spadmnist.statistics import Statistic, Summary
 
 RATE, PHASE = ("dark_counts", "rate"), ("flicker", "phase")
 FLICKER = "    flicker: {amplitude: 0.1, frequency: 100 Hz, phase: 0.7 rad}\n"
@@ -92,6 +96,31 @@ def test_widened_stamps_are_the_same_ones(lab) -> None:
     assert free.widened() is free
 
 
+def test_a_users_own_statistic_has_the_stamps_as_they_are(lab) -> None:
+    class Ticks(Statistic):
+        """A statistic of a user's own, which shows the type of the ticks that it is given."""
+
+        modalities = ("tr",)
+
+        def reduce(self, recording: Recording) -> Summary | None:
+            assert recording.events is not None and recording.events.ticks is not None
+            return Summary(np.array([float(recording.events.ticks.dtype.itemsize)]), "normal", lambda cell: "", no_size)
+
+    recording = bench_of(lab(), 2).recording("flat")
+    assert summaries_of([Ticks()], recording)["ticks"].values == [4.0]
+
+
+def test_a_sensor_is_sent_without_what_was_computed_of_it(lab) -> None:
+    start, data = lab(side=8)
+    sensor = bench_of((start, data), 2).start
+    before = Packed.of(sensor).packed
+    conditions = data.captures[0].conditions
+    sensor.expected(np.full((1, 64), 1e5), conditions)
+    assert sensor.nominal_dead_time == 50e-9 and "dead_times" in vars(sensor)
+    assert Packed.of(sensor).packed == before
+    assert np.array_equal(copy.copy(sensor).dead_times, sensor.dead_times)
+
+
 # --- tails -----------------------------------------------------------------------------------------------------------
 
 
@@ -130,3 +159,10 @@ def test_a_level_is_found_to_the_last_digit_and_not_beyond_the_ends() -> None:
     assert bisection(lambda level: level, 1e-9, 1.0, 1e6) == pytest.approx(1.0, rel=1e-15)
     # of a level beyond which nothing changes, the lowest
     assert bisection(lambda level: min(level, 30.0), 30.0, 1e-6, 1e12) == pytest.approx(30.0, rel=1e-14)
+
+
+def test_residuals_of_what_no_double_can_square_are_numbers() -> None:
+    z = scores(np.array([1e160, -1e200, np.inf, 0.0]), 64)
+    assert np.isfinite(z).all() and z[0] > 200 and z[1] < -200 and z[3] == 0.0
+    power = Exponential().standardized(np.array([1e12]), np.array([0.0]), np.ones(1), 0.0, 64)
+    assert np.isfinite(power).all() and power > 30

@@ -28,9 +28,11 @@ _FEW = 20.0
 # expected independent events from which on a count is nearly normal: the cells below decide the tails of a score
 _EVENTS = 25.0
 _LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion, for empty cells
-_LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged, for empty cells
-# of Student's t: a smaller tail is computed as its logarithm. It is a little above the least number of a double
+# of Student's t: a smaller tail is computed as its logarithm. It is above `_LEAST`, by which tails are cut off
 _FAR_TAIL = 1e-290
+# the largest t, and minus the largest logarithm of a tail, whose squares are numbers
+_LARGEST_T, _LARGEST_LOG = 1e150, 1e300
+_LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged, for empty cells
 _LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
 
 _Both = tuple[np.ndarray | float, np.ndarray | float]  # of this model and of the other
@@ -361,7 +363,7 @@ def _score_of_tail(log_tail: np.ndarray) -> np.ndarray:
     # beyond the range of a double, by the asymptotic tail of the normal law
     far = log_tail < -690
     if far.any():
-        square = -2 * log_tail[far] - math.log(2 * math.pi)
+        square = -2 * np.maximum(log_tail[far], -_LARGEST_LOG) - math.log(2 * math.pi)
         score[far] = np.sqrt(square - np.log(square))
     return score
 
@@ -373,7 +375,8 @@ def _normal_of_t(t: np.ndarray, freedom: int) -> np.ndarray:
     tail = special.stdtr(freedom, -np.abs(t))
     score = np.array(-special.ndtri(np.maximum(tail, _LEAST)))
     far = tail < _FAR_TAIL
-    if far.any():  # the first term of the incomplete beta function, beyond the range of a double as well
-        a, x = freedom / 2, freedom / (freedom + t[far] ** 2)
-        score[far] = _score_of_tail(a * np.log(x) - math.log(2 * a) - special.betaln(a, 0.5))
+    if far.any():  # the first term of the incomplete beta function, with its limit for many degrees of freedom
+        a, x = freedom / 2, freedom / (freedom + np.minimum(np.abs(t[far]), _LARGEST_T) ** 2)
+        log_tail = a * np.log(x) - 0.5 * np.log1p(-x) - math.log(2 * a) - special.betaln(a, 0.5)
+        score[far] = _score_of_tail(log_tail)
     return np.asarray(np.sign(t) * score)

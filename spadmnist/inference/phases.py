@@ -31,6 +31,7 @@ _TURNS = 8
 _MANY = 16
 # in chi square: the least fall in a capture for which the other phase is taken; 3 standard deviations of one number
 _SIDES = 9.0
+_AT_ONCE = 100_000  # cells of several phases that are compared together, 100 bytes each: no result depends on it
 _CLOSER = np.linspace(-0.5, 0.5, 9)  # of the step between two phases: the finer grid about the best one
 
 
@@ -230,8 +231,10 @@ def _best(
         waves = {id: np.stack([_waves(t, float(p)) for p in phases]) for id, phases in around.items()}
         gain = {id: np.zeros(len(phases)) for id, phases in around.items()}
         for cell, x in own.items():
-            z = residuals_shifted(replicates, evaluation, cell, waves[cell[0]] @ x)
-            gain[cell[0]] += before[cell] - np.einsum("pc,pc->p", z, z)
+            some = max(1, _AT_ONCE // x.shape[1])
+            for k in range(0, len(waves[cell[0]]), some):
+                z = residuals_shifted(replicates, evaluation, cell, waves[cell[0]][k : k + some] @ x)
+                gain[cell[0]][k : k + some] += before[cell] - np.einsum("pc,pc->p", z, z)
         chosen = {id: int(g.argmax()) for id, g in gain.items()}
         logs = {id: waves[id] @ swing.logs.get(id, np.zeros(5)) for id in around}
 

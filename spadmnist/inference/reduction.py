@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,11 +49,7 @@ class ReducedCapture:
         Args:
             reduced: with its statistics; without them only the counts are there.
         """
-        recording, summaries = recording.widened(), {}
-        for statistic in statistics_for(recording.capture) if reduced else ():
-            summary = reduce_with(statistic, recording)
-            if summary is not None:
-                summaries[statistic.name] = summary.apart()
+        summaries = summaries_of(statistics_for(recording.capture) if reduced else (), recording)
         counts = np.asarray(recording.totals, float)
         last = None
         if recording.events is not None and len(recording.events):
@@ -76,6 +72,20 @@ def own_statistics() -> list[type[Statistic]]:
     """The statistics of a notebook or of modules of the user's, which stand neither here nor in a plug-in file."""
     known = (Statistic.registry.find(name) for name in Statistic.registry)
     return [cls for cls in known if plugins.is_own(cls)]
+
+
+def summaries_of(statistics: Iterable[Statistic], recording: Recording) -> dict[str, Summary]:
+    """The summaries of a recording by the statistics that apply to it.
+
+    The ticks of its stamps are widened for the statistics here, whose kernels are then compiled for one type; a user's
+    own statistic has the recording as it is.
+    """
+    wide, out = recording.widened(), {}
+    for statistic in statistics:
+        summary = reduce_with(statistic, wide if plugins.is_built_in(type(statistic)) else recording)
+        if summary is not None:
+            out[statistic.name] = summary.apart()
+    return out
 
 
 def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:

@@ -25,7 +25,7 @@ from . import memory
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, maps_added
 from .models import InTheDark, Model, Packed
-from .reduction import ReducedCapture, halves_of, reduce_with, statistics_for
+from .reduction import ReducedCapture, halves_of, statistics_for, summaries_of
 
 if TYPE_CHECKING:
     from .journal import Journal
@@ -125,12 +125,10 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
             half = recording.every_other(task.second)
             assert half is not None  # the measurement's own half is there
             recording = half
-        recording = recording.beside(task.dead).widened()
+        recording = recording.beside(task.dead)
         totals.append(int(recording.totals.sum()))
-        for statistic in known:
-            summary = reduce_with(statistic, recording)
-            if summary is not None:
-                found.setdefault(statistic.name, []).append(summary.apart())
+        for name, summary in summaries_of(known, recording).items():
+            found.setdefault(name, []).append(summary)
 
     try:
         for k, model in enumerate(task.models):
@@ -332,9 +330,10 @@ class Replicates:
                 if len(numbers):
                     most = max(most, self._bytes(sensors[0], id, photons))
                     work[k] = len(numbers) * self.work_of(sensors[0], id) * _share_of_work(capture, some_of[k])
-                together = [Packed.of(sensors[0], self.workers.apart)] if model.alike else []
+                packed = [Packed.of(sensor, self.workers.apart) for sensor in sensors]
+                del sensors  # there may be many, with a map each
                 for part in parts:
-                    models = together or [Packed.of(sensors[i], self.workers.apart) for i in part]
+                    models = packed if model.alike else [packed[i] for i in part]
                     rest = self.seed, self.dead, hasty, some_of[k], second
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:

@@ -196,7 +196,7 @@ class Diagnosis:
     covariance: tuple[list[str], np.ndarray] = field(default_factory=lambda: ([], np.zeros((0, 0))), repr=False)
     asked: str = "diagnosis"  # or "fit"
     in_sample: Comparison | None = field(default=None, repr=False)  # of the model with all steps, to all captures
-    finished: bool = True  # False: a budget ended it, and the verdict is that of the steps so far
+    finished: bool = True  # False: a budget ended it, and the verdict is that of what was done
     shape: tuple[int, int] | None = None  # rows, columns of the measured pixels
     unwritten: str = ""  # why there is no next sensor file where one was wanted
     compared: str = ""  # what alone was compared with the model, in words; "" for all statistics

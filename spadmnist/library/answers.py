@@ -328,7 +328,7 @@ class Diagnosis(_Found):
 
     @property
     def finished(self) -> bool:
-        """False where the budget of work ended the search: the verdict is then that of the steps so far."""
+        """False where the budget of work ended the search: the verdict is then that of what was done."""
         return self.found.finished
 
     @property

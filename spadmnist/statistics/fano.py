@@ -376,7 +376,7 @@ class ArrayFano(Statistic):
                 if len(sums):
                     total += _fill(words[new:], bits, factor, sums)
                 else:
-                    ticks = (words >> bits).view(np.uint64)  # as those of each pixel are
+                    ticks = (words >> bits).view(np.uint64)  # as those of each pixel are where they are widened
                     pairs, (total,) = event_pairs(ticks, np.array([0, len(words)]), factor, levels)
             if len(sums):
                 pairs = pairs_in_windows(sums, levels)
