@@ -267,7 +267,7 @@ class Exponential(Scaled):
         The power at a simple fraction of the clock may be exactly 0 for few detections, so that a very small one is
         rounded up.
         """
-        ratio = values / np.maximum(expected, _LEAST)
+        ratio = values / np.maximum(np.maximum(expected, values * _LEAST), _LEAST)
         return _score_of_tail(-n * np.log1p(np.maximum(ratio, _LEAST_RATIO) / n))
 
     def of_their_own(
