@@ -24,7 +24,8 @@ T = TypeVar("T")
 
 MODALITIES = ("tr", "str", "qis", "counts")
 _FEW_TICKS = 64  # between the first stamp and the last: a rate changes within one
-WIDENED = 1 << 22  # detections, at most, whose ticks are widened: they take 34 MB then
+# detections, at most, whose ticks are widened: they take 34 MB then, far less than what simulates as many
+_WIDENED = 1 << 22
 _EVENTS_AT_ONCE = 1 << 20  # detections whose arithmetic needs further memory
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
 _BLOCKS = (16, 8, 4)  # of time, of which every other one makes half a capture: as many as lose no more than this
@@ -247,7 +248,7 @@ class Recording:
         Of very many detections they stay as they are.
         """
         events = self.events
-        if events is None or events.ticks is None or len(events) > WIDENED:
+        if events is None or events.ticks is None or len(events) > _WIDENED:
             return self
         ticks = events.ticks.astype(np.uint64, copy=False)
         return self if ticks is events.ticks else replace(self, events=events.stamped(ticks, float(events.tick or 0)))

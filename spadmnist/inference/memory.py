@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..readout import no_detection
-from ..recording import WIDENED, Capture
+from ..recording import Capture
 from ..sensor import BYTES_PER_EVENT, Sensor
 
 # bytes that all processes take together with one worker or two; chosen so that a computer of 4 GB has room for it
@@ -40,10 +40,8 @@ def replicate_bytes(sensor: Sensor, capture: Capture, events: float, recorded: f
         own, file = (_size(c.exposure, one) * recorded for one in (sensor.tick, tick))
         moved = 0.0 if math.isclose(sensor.tick, tick, rel_tol=1e-9) else file
         cut = recorded + file / 2 if half else 0.0
-        reduced = recorded / 2 if half else recorded
-        wide = 8 * reduced if _size(c.exposure, tick) < 8 and reduced <= WIDENED else 0.0
         # one after the other: simulated, put on the ticks of the file, reduced
-        return max(own + BYTES_PER_EVENT * at_once, own + moved, file + wide + 8 * min(recorded, _ORDERED) + cut)
+        return max(own + BYTES_PER_EVENT * at_once, own + moved, file + 8 * min(recorded, _ORDERED) + cut)
     bits = c.frames * pixels / 8
     large = events > 2 * _STRETCH and not sensor.tying(readouts)
     stretch = min(events, _STRETCH) if large else events  # what is simulated of the frames at once
