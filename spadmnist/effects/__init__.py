@@ -26,12 +26,13 @@ A timing effect sees TR streams, and the frames' first stamps (STR) with one fra
 the class, a `spadmnist.streams.Draws` for the counter-based kernels. An image that is too large to be simulated at once
 is simulated part by part, where all effects that draw count their draws and no `influence()` is more than 0.
 
-Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns);
-it is called once, after maps are read and distributions drawn. And `expected_rate(rate, conditions)`, the closed form
-of its mean; an arrival effect gets the part of the rate that it acts on, and by default the mean of `factor` or `open`
-is taken. And `influence()`, how far its events reach. With `by_pixel = True` on the class, closed forms of a part of a
-chip are computed for that part alone: set it where `apply` of rates and `expected_rate` give each pixel a value that
-depends on that pixel alone.
+Every effect may have `made(chip)`: what is fixed when the chip is made (neighbours, which pixels are hit, patterns); it
+is called once, after maps are read and distributions drawn. What a hook returns depends on the parameters, on what
+`made` fixed and on its arguments alone: one object serves all captures. And `expected_rate(rate, conditions)`, the
+closed form of its mean; an arrival effect gets the part of the rate that it acts on, and by default the mean of
+`factor` or `open` is taken. And `influence()`, how far its events reach. With `by_pixel = True` on the class, closed
+forms of a part of a chip are computed for that part alone: set it where `apply` of rates and `expected_rate` give each
+pixel a value that depends on that pixel alone.
 """
 
 from __future__ import annotations
