@@ -230,6 +230,15 @@ def test_a_search_that_ended_before_any_step_does_not_speak_of_steps() -> None:
     assert results.sentence(found).startswith("not finished; the verdict is that of the steps so far: ")
 
 
+def test_the_brightest_capture_may_be_a_nonlinearity_beside_steps_as_well() -> None:
+    found = answer({}, "explained", faulty="bright")
+    found.steps = [step("per_pixel", "dark_counts", "rate")]
+    assert results.sentence(found).endswith("the model, and the set-up of bright those of the totals.")
+    found.bent = True
+    said = f"the model, and the set-up of bright, or {results.NONLINEARITY}, those of the totals."
+    assert results.sentence(found).endswith(said)
+
+
 def test_the_set_up_or_the_sensor_are_both_named() -> None:
     found = answer({}, "confused", or_setup=True)
     factor = {"value": 0.95, "low": 0.94, "high": 0.96}

@@ -189,7 +189,8 @@ def _diagnosed(
         )
     found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
-    found.shared, found.faulty = notes.shared, notes.faulty if notes.explained else ""
+    found.shared, found.bent = notes.shared, notes.bent
+    found.faulty = notes.faulty if notes.explained else ""
     return found
 
 

@@ -204,6 +204,7 @@ class Diagnosis:
     or_setup: bool = False  # the last step explains the totals as well as `setup` does, and is in no sensor file
     shared: tuple[str, ...] = ()  # captures whose wrong level that step needs as well
     faulty: str = ""  # in words, the captures of which the set-up explains the totals
+    bent: bool = False  # a nonlinearity that no effect here has may explain them as well
 
     def as_data(self) -> dict[str, Any]:
         """The result as JSON data: `formats`, spadmnist-diagnosis/1 or spadmnist-fit/1."""
@@ -424,7 +425,8 @@ def _verdict_on(found: Diagnosis) -> str:
     if found.verdict == "setup":
         return "the set-up explains the deviations; nothing here asks for a change of the sensor."
     if found.verdict == "explained":
-        totals = f", and the set-up of {found.faulty} those of the totals" if found.faulty else ""
+        either = f"{found.faulty}, or {NONLINEARITY}," if found.bent else found.faulty
+        totals = f", and the set-up of {either} those of the totals" if found.faulty else ""
         return f"{fitted} explain{'s' if len(found.steps) == 1 else ''} the deviations of the model{totals}."
     if found.verdict == "confused" and found.setup and not found.steps:
         where = found.setup[0]["capture"] or "all captures"
