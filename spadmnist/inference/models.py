@@ -15,6 +15,10 @@ from .candidates import on_chip, with_values
 from .coordinates import Key, Values
 from .reduction import own_statistics
 
+# pixels, at most, of a sensor that is kept for all captures and replicates: half a megabyte for each map of dead times.
+# There may be a hundred models at the same time; a rule of thumb
+_SMALL = 1 << 16
+
 
 @dataclass(frozen=True)
 class Model:
@@ -70,11 +74,12 @@ class Model:
         known: list[tuple[Sensor, dict[Key, float], Sensor]] = []  # (sensor here, phases, the changed sensor)
 
         def changed(sensor: Sensor, own: dict[Key, float]) -> Sensor:
-            """The changed sensor; of what is alike there is one, which keeps what it has computed."""
+            """The changed sensor; of a small one that is alike there is one, which keeps what it has computed."""
             found = next((made for of, with_phases, made in known if of is sensor and with_phases == own), None)
             if found is None:
                 found = with_values(sensor, {**values, **own})
-                known.append((sensor, own, found))
+                if found.layout.pixels <= _SMALL:
+                    known.append((sensor, own, found))
             return found
 
         def own(capture: str) -> dict[Key, float]:
