@@ -30,7 +30,8 @@ _EVENTS = 25.0
 _LEAST_COUNT = 0.5  # counts: the least scatter of a cell to which a template is set in proportion, for empty cells
 # of Student's t: a smaller tail is computed as its logarithm. It is above `_LEAST`, by which tails are cut off
 _FAR_TAIL = 1e-290
-# the largest t, and minus the largest logarithm of a tail, whose squares are numbers
+# the largest t, and minus the largest logarithm of a tail, that are used: the square of the first and twice the second
+# are within the range of a double
 _LARGEST_T, _LARGEST_LOG = 1e150, 1e300
 _LEAST_SCATTER = 0.3  # counts: the least scatter of a cell in which a shift is judged, for empty cells
 _LEAST_FREE = 1e-30  # the same for cells that are no counts: never divides by 0
