@@ -20,7 +20,7 @@ from spadmnist.inference.coordinates import Key
 from spadmnist.inference.elimination import drop_needless, drop_unexplaining, no_step_explains
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import evidence_of
-from spadmnist.inference.experiment_design import _apart, between
+from spadmnist.inference.experiment_design import between, expected_significance
 from spadmnist.inference.map_trials import random_map_trials
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose
@@ -259,7 +259,7 @@ def test_a_light_that_is_not_stated_is_the_one_that_fits(lab) -> None:
     flat = replicates.seen["flat"].capture
     free = replace(flat, light=replace(flat.light, level=None))
     other = evaluation.sensors.changed({CROSSTALK: 0.3})
-    stated, found = (_apart(replicates, evaluation, other, one, "flat") for one in (flat, free))
+    stated, found = (expected_significance(replicates, evaluation, other, one, "flat") for one in (flat, free))
     assert found == pytest.approx(stated, rel=0.3) and found > 1
 
 

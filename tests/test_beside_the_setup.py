@@ -16,7 +16,7 @@ import spadmnist as sp
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.levels import HALF_95
 from spadmnist.inference.model_path import begin
-from spadmnist.inference.model_selection import _is_as_stated, _is_freed, _take_setup_again, diagnose
+from spadmnist.inference.model_selection import diagnose, is_as_stated, is_freed, take_setup_again
 from spadmnist.inference.next_step import after_diagnosis
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, sentence
@@ -49,31 +49,31 @@ def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float,
     short = {**ENTRY, "quantity": "exposure"}  # it stopped early, whatever the totals say
     notes = Notes([entry := dict(ENTRY), short], explained=True, by_totals=[entry])
     kept = path.kept()
-    assert _is_freed(path, notes) and path.replicates.unstated == {"flat"}
+    assert is_freed(path, notes) and path.replicates.unstated == {"flat"}
     free = path.evaluation
     assert len(free.residuals[TOTALS]) == 1 < len(stated.residuals[TOTALS]) == 2
     assert free.replicate_residuals[TOTALS].shape == (16, 1) and free.residuals.keys() == stated.residuals.keys()
     path.rung("the same")
     assert path.ladder[1].errors == pytest.approx(errors)  # whether they are compared or not
-    assert not _is_as_stated(path, notes)  # without a step
+    assert not is_as_stated(path, notes)  # without a step
     path.steps = [cast(Step, object())]
     as_stated = factor == 1
-    assert _is_as_stated(path, notes) is as_stated
+    assert is_as_stated(path, notes) is as_stated
     assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
     assert path.replicates.unstated == (frozenset() if as_stated else {"flat"})
     assert len(path.evaluation.residuals[TOTALS]) == (2 if as_stated else 1)
     path.back_to(kept)
     assert path.replicates.unstated == frozenset() and path.evaluation is stated
-    _take_setup_again(path, notes)  # the step is gone
+    take_setup_again(path, notes)  # the step is gone
     assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
 
 
 def test_levels_are_not_freed_where_a_change_of_the_sensor_is_a_tie(tmp_path: Path) -> None:
     path = begin(bench_of(labs(tmp_path)()))
     notes = Notes([dict(ENTRY)], explained=True, by_totals=[dict(ENTRY)], rival=cast(Trial, object()))
-    assert not _is_freed(path, notes) and path.replicates.unstated == frozenset()
+    assert not is_freed(path, notes) and path.replicates.unstated == frozenset()
     notes.rival = None
-    assert _is_freed(path, notes) and path.replicates.unstated == {"flat"}
+    assert is_freed(path, notes) and path.replicates.unstated == {"flat"}
 
 
 def test_explanations_of_the_totals_in_words_and_in_parts() -> None:

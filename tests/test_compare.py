@@ -19,7 +19,7 @@ from spadmnist.errors import InputError
 from spadmnist.events import Events, Layout
 from spadmnist.inference.comparison import Comparison, canonical, compare, table
 from spadmnist.inference.evaluation import Evaluation, evaluate, misfits
-from spadmnist.inference.light_levels import CaptureNull, _score
+from spadmnist.inference.light_levels import CaptureNull, score_of_total
 from spadmnist.inference.null_distribution import learn
 from spadmnist.inference.reduction import ReducedCapture
 from spadmnist.inference.replicate_cache import recall
@@ -234,7 +234,8 @@ def test_a_lamp_that_was_off_is_no_light_level() -> None:
     }
     state = Evaluation({}, None, {}, {}, {"flat": made}, {}, {}, {}, {})  # type: ignore[arg-type]
     own, data = (
-        _score(replicates, state, "flat", 18.0, expected) for expected in (19.0, made.total_at(made.stated or 1.0))
+        score_of_total(replicates, state, "flat", 18.0, expected)
+        for expected in (19.0, made.total_at(made.stated or 1.0))
     )
     assert own is not None and abs(own) < 1 and data == made.score(18.0)
     # Poisson's own where the dark is most of it: 25 expected, 17 found

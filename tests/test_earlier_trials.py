@@ -9,7 +9,7 @@ from tinylab import bench_of, taken, wrong_numbers
 
 import spadmnist as sp
 from spadmnist.inference.candidates import candidates
-from spadmnist.inference.earlier_trials import _differ, still_valid
+from spadmnist.inference.earlier_trials import still_valid, values_differ
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.signature import Signature
 
@@ -59,4 +59,4 @@ def test_another_number_of_the_same_effect_is_simulated_anew() -> None:
     ],
 )
 def test_values_differ_by_more_than_scatter(one: object, other: object, differ: bool) -> None:
-    assert _differ(one, other) is differ
+    assert values_differ(one, other) is differ

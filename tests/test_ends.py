@@ -241,7 +241,7 @@ def test_half_an_export_is_cleared_by_the_next_one_and_a_living_writer_keeps_its
 @pytest.mark.parametrize("at", [3, 0.3, 0.6, 0.9, 0.999])
 def test_damaged_replicates_are_not_taken(at: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One bit anywhere; also where the archive itself has no digest of it."""
-    monkeypatch.setattr("spadmnist.inference.replicate_cache._folder", lambda: tmp_path)
+    monkeypatch.setattr("spadmnist.inference.replicate_cache.nulls_folder", lambda: tmp_path)
     values = {"map": np.arange(40.0).reshape(8, 5), "spread": np.full((8, 2), 0.5)}
     laws = {"map": ("poisson", None), "spread": ("normal", np.ones(2))}
     one = CaptureReplicates(np.arange(8, dtype=np.uint64), np.arange(8.0), values, laws)

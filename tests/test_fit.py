@@ -32,7 +32,7 @@ from spadmnist.inference.gauss_newton import (
 from spadmnist.inference.held_out import captures_needed, leave_one_capture_out, optimism
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.models import Model
-from spadmnist.inference.named_fit import _named, fit_named
+from spadmnist.inference.named_fit import fit_named, named_candidate
 from spadmnist.inference.pixel_maps import PixelMap, map_values, summary
 from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.inference.results import sentence
@@ -437,14 +437,14 @@ def test_what_cannot_be_fitted_is_told_with_what_can(made):
     with pytest.raises(
         InputError, match=r"dead_time\.durations cannot be fitted here; .*Did you mean dead_time\.duration\?"
     ):
-        _named(*known, "set", "dead_time", "durations")
+        named_candidate(*known, "set", "dead_time", "durations")
     with pytest.raises(InputError, match=r"crosstalks cannot be fitted here; .*Did you mean crosstalk\?"):
-        _named(*known, "add", "crosstalks", None)
+        named_candidate(*known, "add", "crosstalks", None)
     with pytest.raises(InputError, match=r"detection\.pdp cannot be fitted here: .* the same as another light level"):
-        _named(*known, "set", "detection", "pdp")
+        named_candidate(*known, "set", "detection", "pdp")
     with pytest.raises(
         InputError, match=r"--add dead_time: the sensor lists it already; .*--free dead_time\.PARAMETER"
     ):
-        _named(*known, "add", "dead_time", None)
+        named_candidate(*known, "add", "dead_time", None)
     with pytest.raises(InputError, match=r"--free crosstalk\.probability: .* --add crosstalk adds it"):
-        _named(*known, "set", "crosstalk", "probability")
+        named_candidate(*known, "set", "crosstalk", "probability")

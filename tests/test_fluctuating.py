@@ -15,11 +15,11 @@ from spadmnist.inference.elimination import drop_needless
 from spadmnist.inference.evaluation import evaluate, log_likelihood_ratio
 from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.gauss_newton import gauss_newton_step
-from spadmnist.inference.joint_fit import _bounded, _gauss_newton
+from spadmnist.inference.joint_fit import bounded, repeated_steps
 from spadmnist.inference.laws import Law
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.replicates import TOTALS
-from spadmnist.inference.signature import Signature, _mean_shift, signatures
+from spadmnist.inference.signature import Signature, mean_deviation, signatures
 from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
 
@@ -63,7 +63,7 @@ def test_totals_that_go_the_same_way_in_two_recordings_are_chance(lab) -> None:
 )
 def test_what_a_few_totals_share(apart: list[float], believed: bool) -> None:
     """Their scatter in the model's own recordings: 1 %."""
-    shared = _mean_shift(np.array(apart), 0.01)
+    shared = mean_deviation(np.array(apart), 0.01)
     assert shared == (pytest.approx(np.mean(apart)) if believed else 0.0)
 
 
@@ -153,9 +153,9 @@ def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, 
             patch.setattr("spadmnist.inference.joint_fit.signatures", lambda *a: held.append(a[3]) or simulated(*a))  # noqa: B023
             coordinates = tuple(change_of(path.replicates, "add crosstalk").coordinates[:1])
             path.values[CROSSTALK] = 0.01
-            found, _, _ = _gauss_newton(path, path.evaluation, {}, coordinates, {})
+            found, _, _ = repeated_steps(path, path.evaluation, {}, coordinates, {})
             assert found is not None
             held.clear()
-            _bounded(path, found)
+            bounded(path, found)
         wanted = min(replicates, 32) if lamp else 8
         assert many[-1] == held[0] == wanted

@@ -320,6 +320,22 @@ def test_types_reach_those_who_import_the_package() -> None:
     assert (PACKAGE / "py.typed").is_file()
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
+def test_the_inference_is_tested_by_its_public_names(path: Path) -> None:
+    """A private name may be renamed, split or removed; a test that speaks of one forbids it. Constants may be set."""
+    tree, modules = ast.parse(path.read_text()), set[str]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("spadmnist.inference"):
+            private = [alias.name for alias in node.names if alias.name.startswith("_")]
+            assert not private, f"{path.name}:{node.lineno}: {', '.join(private)}"
+            modules |= {alias.asname or alias.name for alias in node.names if node.module == "spadmnist.inference"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            assert not re.match("_[a-z]", node.attr), f"{path.name}:{node.lineno}: {node.value.id}.{node.attr}"
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            assert not re.fullmatch(r"spadmnist\.inference[\w.]*\._[a-z]\w*", node.value), f"{path.name}:{node.lineno}"
+
+
 @pytest.mark.parametrize("file", sorted(f for f in MODULES if f.startswith("inference/")))
 def test_the_search_asks_for_no_unit_and_no_stage(file: str) -> None:
     """What is special is declared: the kind of a parameter, what an effect acts on, what a likelihood describes."""

@@ -21,7 +21,7 @@ from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_fits import fit_codes
 from spadmnist.inference.pixel_maps import code_periods
 from spadmnist.inference.replicates import Execution, Replicates
-from spadmnist.inference.setups import _of_exposure
+from spadmnist.inference.setups import exposure_factor
 from spadmnist.inference.signature import Signature
 from spadmnist.inference.trial import Trial
 from spadmnist.measurement import in_memory
@@ -90,7 +90,7 @@ def test_the_limit_of_an_effect_is_that_of_its_weakest_shape() -> None:
         return times, 20.0, Trial(candidate, {probability.key: strength}, Signature({}, {}, {}), 0.0, 1.0)
 
     fast, slow = shape(0.0045, 1.645 / 20), shape(0.054, 1.645 / 24)
-    assert max(fast, slow, key=upper_limits._strength_at_limit) is slow
+    assert max(fast, slow, key=upper_limits.strength_at_limit) is slow
 
 
 def means(relative: float, own: float) -> tuple[sp.Sensor, Any]:
@@ -168,6 +168,6 @@ def test_an_exposure_is_no_light_level(modality: str) -> None:
     level, error, _ = evaluation.rates["flat"].level_of(replicates.seen["flat"].total)
     log = math.log(level / float(evaluation.rates["flat"].stated or 1.0))
     assert math.exp(log) > 1.18  # of the light it would be more
-    found = _of_exposure(replicates, evaluation, "flat", log, error)
+    found = exposure_factor(replicates, evaluation, "flat", log, error)
     assert found["value"] == pytest.approx(1.1, abs=0.01)
     assert found["low"] is not None and found["high"] is not None and found["low"] < 1.1 < found["high"]

@@ -22,7 +22,7 @@ from spadmnist.inference.exact_likelihood import (
     maximise,
     not_in_likelihood,
 )
-from spadmnist.inference.point_process import _FOLLOWS, _LAST, _followed, _of_rates, hazards_of
+from spadmnist.inference.point_process import FOLLOWS, LAST, followed_gaps, hazards_of, likelihood_of_rates
 from spadmnist.inference.profile_likelihood import crossing, maximum
 from spadmnist.light import photons_from_irradiance
 from spadmnist.recording import Capture, Light, Recording
@@ -299,15 +299,15 @@ def test_the_chances_of_what_follows_add_up(history: list[float]) -> None:
     def density(end: float, *later: float) -> float:
         times = np.array([*history, *later])
         # every gap is followed: those between, then the one to the end; none comes before the first
-        gaps, kinds = np.diff([*times, end]), np.array([*[_FOLLOWS] * (len(times) - 1), 0], np.uint8)
+        gaps, kinds = np.diff([*times, end]), np.array([*[FOLLOWS] * (len(times) - 1), 0], np.uint8)
         kinds = np.roll(kinds, 1)
-        kinds[-1] |= _LAST
+        kinds[-1] |= LAST
         offsets, counts = np.array([0, len(gaps)]), np.array([len(times)])
         hazard, used = np.zeros(len(gaps)), np.zeros(1, np.int64)
         pixel = dead, chance, lifetime, rate
-        base, awake = _followed((gaps, kinds, offsets), (counts, end), pixel, (500e-12, 0.0), (hazard, used))
+        base, awake = followed_gaps((gaps, kinds, offsets), (counts, end), pixel, (500e-12, 0.0), (hazard, used))
         rest = hazard, offsets, used, counts, awake
-        return math.exp(float(base[0] + _of_rates(*rest, rate)[0][0]))
+        return math.exp(float(base[0] + likelihood_of_rates(*rest, rate)[0][0]))
 
     last, end = history[-1], history[-1] + 3e-6
     grid = last + np.concatenate([np.linspace(49e-9, 51e-9, 801), np.geomspace(51.01e-9, 3e-6, 3001)])

@@ -13,15 +13,15 @@ from spadmnist.inference.candidates import candidates
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import is_edge
 from spadmnist.inference.earlier_trials import has_changed
-from spadmnist.inference.elimination import _drop_unless_missed, drop_needless
+from spadmnist.inference.elimination import drop_needless, drop_unless_missed
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
-from spadmnist.inference.forward_step import _best_of_scan_added, added_from
+from spadmnist.inference.forward_step import added_from, best_of_scan_added
 from spadmnist.inference.joint_fit import complete_fit
 from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
-from spadmnist.inference.model_selection import _another
+from spadmnist.inference.model_selection import another_step
 from spadmnist.inference.replicates import TOTALS, CannotSimulate
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures
@@ -123,19 +123,19 @@ def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeyp
     def fitted(path, worth, faint):
         return [replace(t, evidence=t.fall) for t in worth]
 
-    monkeypatch.setattr(module + "_fitted", fitted)
+    monkeypatch.setattr(module + "fitted_trials", fitted)
     monkeypatch.setattr(module + "_taken", taken_or_not)
     monkeypatch.setattr(module + "p_of_best", lambda *_: (9.0, 1e-20))
     monkeypatch.setattr(module + "patterns_first", lambda scan, evaluation, second: second)
     monkeypatch.setattr(path.scan, "again", lambda *_: trials)
-    assert _best_of_scan_added(path, Notes([], False), path.failed, 0.01) is helps
+    assert best_of_scan_added(path, Notes([], False), path.failed, 0.01) is helps
     assert asked == ["set dead_time.duration", "add crosstalk"]
     assert [step.name for step in path.steps] == [asked[1] if helps else asked[0]]
     # a group of which the squares promise far more is fitted before one of little evidence is taken
     path.steps.clear()
     asked.clear()
     trials[1].fall = 2000.0
-    _best_of_scan_added(path, Notes([], False), path.failed, 0.01)
+    best_of_scan_added(path, Notes([], False), path.failed, 0.01)
     assert asked[0] == "add crosstalk"
 
 
@@ -153,14 +153,14 @@ def test_a_trace_that_nothing_explains_forbids_no_step_of_another_one(lab, monke
         asked.append([t.candidate.name for t in worth])
         return [replace(t, evidence=t.fall if t.candidate.effect == "crosstalk" else -2.0) for t in worth]
 
-    monkeypatch.setattr(module + "_fitted", fitted)
+    monkeypatch.setattr(module + "fitted_trials", fitted)
     monkeypatch.setattr(module + "_taken", lambda path, notes, failed, second, best, significance: True)
     monkeypatch.setattr(module + "p_of_best", lambda *_: (9.0, 1e-20))
     monkeypatch.setattr(module + "patterns_first", lambda scan, evaluation, second: second)
     monkeypatch.setattr(path.scan, "again", lambda evaluation, values, tried, faint=False: tried[:1])
     notes = Notes([], False)
     notes.tried = trials
-    assert _best_of_scan_added(path, notes, path.failed, 0.01) is True
+    assert best_of_scan_added(path, notes, path.failed, 0.01) is True
     # what competes with that candidate is no other trace
     assert asked == ([["set dead_time.duration"], ["add crosstalk"]] if apart else [["set dead_time.duration"]])
     assert apart or len(path.evaluation.replicate_residuals[TOTALS]) > 16  # then more replicates are made
@@ -236,7 +236,7 @@ def test_a_map_that_is_clearly_needed_stays_without_another_fit(lab) -> None:
     accept(path, one, 10.0)
     taken(path, "add afterpulsing", {PROBABILITY: 0.05, LIFETIME: 6e-8})
     done, before = replicates.simulations, path.evaluation
-    _drop_unless_missed(path, path.steps[0])
+    drop_unless_missed(path, path.steps[0])
     assert names(path) == ["per_pixel dark_counts.rate", "add afterpulsing"] and path.evaluation is before
     assert replicates.simulations - done == 16 * len(replicates.seen)  # one evaluation, no Jacobian
 
@@ -264,7 +264,7 @@ def test_what_does_not_compete_is_added_without_another_scan(lab, monkeypatch) -
     notes, scans = Notes([], False), []
     scan = Scan.scan
     monkeypatch.setattr(Scan, "scan", lambda self, *a, **k: (scans.append(len(path.steps)), scan(self, *a, **k))[1])
-    while len(path.steps) < 3 and _another(path, notes):
+    while len(path.steps) < 3 and another_step(path, notes):
         pass
     assert sorted(names(path)) == ["add afterpulsing", "add crosstalk", "add flicker"]
     assert len(scans) < 3
@@ -292,7 +292,7 @@ def test_a_group_that_waited_is_fitted_with_what_competes_with_it_now(lab, monke
     edge = given(path, "set dead_time.duration", {DURATION: 60e-9}, fitted=False)
     slow = given(path, "add slow_recovery", {d.key: 1.5e-8 for d in recovery.coordinates}, fitted=False)
     monkeypatch.setattr(
-        "spadmnist.inference.forward_step._fitted", lambda path, group, faint: asked.append(group) or []
+        "spadmnist.inference.forward_step.fitted_trials", lambda path, group, faint: asked.append(group) or []
     )
     notes = Notes([], False)
     notes.second = [edge, slow]

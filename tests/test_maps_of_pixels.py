@@ -21,7 +21,7 @@ from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.named_fit import fit_named
-from spadmnist.inference.pixel_maps import _DOUBT, PixelMap
+from spadmnist.inference.pixel_maps import DOUBT, PixelMap
 from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
@@ -138,13 +138,13 @@ def test_the_closed_form_of_frames_with_gaps_and_a_gate(fraction: float, tmp_pat
 def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     """Draws of a map are as wide as the pixels may be: of 256 that say little each, that is uncertain.
 
-    A ratio beyond 0.7 to 1.4 is a chance of less than 1e-6 for 400 draws. `_DOUBT` is what widths of 2,000 maps of
+    A ratio beyond 0.7 to 1.4 is a chance of less than 1e-6 for 400 draws. `DOUBT` is what widths of 2,000 maps of
     normal values scatter by; 9 % are five standard errors of that.
     """
     rng, n, sigma, noise = np.random.default_rng(3), 256, 0.012, 0.015
     x = np.random.default_rng(4).standard_normal((2000, n))
     width = 1.4826 * np.median(np.abs(x - np.median(x, axis=1, keepdims=True)), axis=1)
-    assert pytest.approx(np.std(width**2) * math.sqrt(n), rel=0.09) == _DOUBT
+    assert pytest.approx(np.std(width**2) * math.sqrt(n), rel=0.09) == DOUBT
     raw = rng.normal(0, math.hypot(sigma, noise), n)
     share = sigma**2 / (sigma**2 + noise**2)
     error = np.full(n, math.sqrt(share) * noise)
@@ -157,7 +157,7 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     known, doubted = widths(False), widths(True)
     assert np.mean(known) == pytest.approx(sigma**2, rel=0.25)
     # by how much the estimate of a variance scatters, times how the width of a draw follows it
-    alone = _DOUBT / math.sqrt(n) * (sigma**2 + noise**2)
+    alone = DOUBT / math.sqrt(n) * (sigma**2 + noise**2)
     bigger, usual = (s**2 / (s**2 + noise**2) for s in (math.sqrt(sigma**2 + alone), sigma))
     follows = float(np.var(raw)) * (bigger**2 - usual**2) + noise**2 * (bigger - usual)
     assert 0.7 < math.sqrt(np.var(doubted) - np.var(known)) / follows < 1.4

@@ -11,9 +11,9 @@ from scipy import stats
 from spadmnist.inference.mixed_model import (
     NO_PATTERN,
     PatternEvidence,
-    _log_likelihood,
     evidence_of_patterns,
     evidence_of_scene,
+    log_likelihood_of_values,
 )
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.pixel_maps import evidence_of_patterns as in_a_map
@@ -67,10 +67,10 @@ def test_the_likelihood_is_that_of_the_normal_law() -> None:
     inverse = np.linalg.inv(covariance)
     coefficients = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ y)
     expected = stats.multivariate_normal(design @ coefficients, covariance).logpdf(y) + 6 * math.log(2 * math.pi)
-    assert _log_likelihood(y, variance, design, groups, of_group) == pytest.approx(expected, rel=1e-9)
+    assert log_likelihood_of_values(y, variance, design, groups, of_group) == pytest.approx(expected, rel=1e-9)
     alone = stats.norm(0, np.sqrt(variance)).logpdf(y - y @ (1 / variance) / (1 / variance).sum()).sum()
     alone += 6 * math.log(2 * math.pi)
-    assert _log_likelihood(y, variance, np.ones((12, 1)), None, 0.0) == pytest.approx(alone, rel=1e-9)
+    assert log_likelihood_of_values(y, variance, np.ones((12, 1)), None, 0.0) == pytest.approx(alone, rel=1e-9)
 
 
 def test_what_is_no_pattern_has_no_evidence() -> None:

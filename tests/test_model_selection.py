@@ -14,15 +14,15 @@ from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import point_of
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
-from spadmnist.inference.evidence import _share_of_counts, best_of, evidence_of, judge_maps_by_odd_pixels
+from spadmnist.inference.evidence import best_of, evidence_of, judge_maps_by_odd_pixels, share_of_counts
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
 from spadmnist.inference.findings import mimicked
 from spadmnist.inference.forward_step import best_added
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.intervals import sharpen
-from spadmnist.inference.joint_fit import _bounded
+from spadmnist.inference.joint_fit import bounded
 from spadmnist.inference.model_path import ModelPath, begin
-from spadmnist.inference.model_selection import _another, _or_confused
+from spadmnist.inference.model_selection import another_step, or_confused
 from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.replicates import TOTALS, CannotSimulate
 from spadmnist.inference.results import Step, mimic
@@ -84,10 +84,12 @@ def test_totals_are_no_matter_of_the_set_up_where_a_line_may_move_them(lab, monk
     monkeypatch.setattr(look, "lines", lambda evaluation: [Line(100.0, 1.0, -20.0)])
     assert not look.only_rates(evaluation)
     path = ModelPath(replicates, look, evaluation, {}, [], [])
-    monkeypatch.setattr("spadmnist.inference.model_selection._by_setup", lambda *_: pytest.fail("the set-up was asked"))
+    monkeypatch.setattr(
+        "spadmnist.inference.model_selection.explained_by_setup", lambda *_: pytest.fail("the set-up was asked")
+    )
     monkeypatch.setattr(look, "scan", lambda *_, **__: [])
     monkeypatch.setattr("spadmnist.inference.model_selection.best_added", lambda *_: False)
-    assert not _another(path, Notes([], False))
+    assert not another_step(path, Notes([], False))
 
 
 def test_an_edge_that_drowns_all_else_is_tried_weaker(lab):
@@ -120,12 +122,12 @@ def test_an_edge_of_which_the_data_want_more_is_tried_further_off(lab, monkeypat
     one = Trial(candidate, {jitter: high / 16}, Signature({}, {}, {}), 100.0, 1.7)
     # what it is thought to gain at several times its strength is no bound for what it gains there
     found = [(90.0, 1.7), (200.0, 0.8)]
-    further = look._further(evaluation, [one], [])
+    further = look.stronger_trials(evaluation, [one], [])
     assert asked == pytest.approx([high / 4, high / 2]) and [t.fall for t in further] == [90.0, 200.0]
     asked.clear()
-    assert not look._further(evaluation, [replace(one, times=0.7)], [])  # less of it would do
-    assert not look._further(evaluation, [replace(one, fall=20.0)], [])  # nor is it worth it
-    assert not look._further(evaluation, [replace(one, values={jitter: high})], [])
+    assert not look.stronger_trials(evaluation, [replace(one, times=0.7)], [])  # less of it would do
+    assert not look.stronger_trials(evaluation, [replace(one, fall=20.0)], [])  # nor is it worth it
+    assert not look.stronger_trials(evaluation, [replace(one, values={jitter: high})], [])
     assert not asked
 
 
@@ -191,10 +193,10 @@ def looked_closer(path: ModelPath, monkeypatch: pytest.MonkeyPatch, added: Any) 
         path.evaluation = closer
         return True
 
-    monkeypatch.setattr("spadmnist.inference.model_selection._stands_out", stands_out)
+    monkeypatch.setattr("spadmnist.inference.model_selection.stands_out", stands_out)
     monkeypatch.setattr("spadmnist.inference.model_selection.best_added", added)
     monkeypatch.setattr(path.scan, "scan", lambda *_, **__: [])
-    return before, closer, _another(path, Notes([], False))
+    return before, closer, another_step(path, Notes([], False))
 
 
 def test_after_a_closer_look_that_led_to_nothing_the_model_is_as_it_was(lab, monkeypatch):
@@ -260,14 +262,14 @@ def test_what_looks_the_same_is_named_with_what_tells(lab):
     step = of("jitter", path.evaluation, path.replicates, intervals=30.0)
     path.steps.append(step)
     beside = Notes([], False)
-    assert _or_confused(path, beside, "explained") == "confused"
+    assert or_confused(path, beside, "explained") == "confused"
     assert step.alternatives[0]["what"] == "a dead time that differs from event to event"
     (told,) = beside.advice
     assert told["capture"] == "a pulsed source" and told["significance_then"] == 20.0
     assert told["separates"] == ["jitter", step.alternatives[0]["what"]]
     assert mimic(step.candidate) is not None
     path.steps = [of("crosstalk", path.evaluation, path.replicates, intervals=30.0)]
-    assert _or_confused(path, Notes([], False), "explained") == "explained"
+    assert or_confused(path, Notes([], False), "explained") == "explained"
 
 
 def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
@@ -284,10 +286,10 @@ def test_a_last_step_that_loses_a_line_is_not_taken(lab, monkeypatch):
         monkeypatch.setattr(
             "spadmnist.inference.joint_fit.square", lambda z, s=there: now if z is path.evaluation.residuals else s
         )
-        held = _bounded(path, fit)
+        held = bounded(path, fit)
         assert coordinates[0].value(float(held.point[0])) == pytest.approx(point)
     monkeypatch.setattr("spadmnist.inference.joint_fit.signatures", lambda *_, **__: [CannotSimulate("beyond")])
-    assert coordinates[0].value(float(_bounded(path, fit).point[0])) == pytest.approx(0.01)
+    assert coordinates[0].value(float(bounded(path, fit).point[0])) == pytest.approx(0.01)
 
 
 @pytest.mark.slow
@@ -353,7 +355,7 @@ def test_a_map_of_pixels_that_chance_made_odd_is_as_unlikely_as_they_are(
         for name in ("per_pixel dark_counts.rate", "add tdc_nonlinearity", "add blinking_dark_counts")
     )
     map_.maps, codes.maps, other.chips = {(): None}, {(): None}, odd  # type: ignore[dict-item]
-    monkeypatch.setattr("spadmnist.inference.evidence._share_of_counts", lambda *_: numbers)
+    monkeypatch.setattr("spadmnist.inference.evidence.share_of_counts", lambda *_: numbers)
     judged = {id(map_): (2.0, 0.02), id(codes): (2.1, 0.015), id(other): (4.0, 1e-4)}
     judge_maps_by_odd_pixels(replicates, evaluate(replicates, {}), [codes, map_, other], judged)
     best = best_of([codes, map_, other], lambda one: -judged[id(one)][1])
@@ -392,7 +394,7 @@ def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
             values = {CROSSTALK: 0.05}
         (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)])
         assert isinstance(signature, Signature) and candidate.effect
-        assert low <= _share_of_counts(replicates, evaluation, signature) <= high, name
+        assert low <= share_of_counts(replicates, evaluation, signature) <= high, name
 
 
 def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:

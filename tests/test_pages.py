@@ -24,7 +24,7 @@ from PIL import Image
 
 from spadmnist import pages
 from spadmnist.errors import SpadError
-from spadmnist.inference.comparison import Check, Comparison, _verdicts, light_of
+from spadmnist.inference.comparison import Check, Comparison, holm_corrected, light_of
 from spadmnist.inference.light_levels import Nuisance
 from spadmnist.inference.null_distribution import Judgement
 from spadmnist.pages import _comparison, _figures, _frame
@@ -130,7 +130,7 @@ def check_of(
 
 
 def comparison_of(checks: list[Check], tolerance: float | None = None, **options: Any) -> Comparison:
-    judged = _verdicts(checks, tolerance)
+    judged = holm_corrected(checks, tolerance)
     values: dict[str, Any] = {
         "sensor": "lab tr",
         "measurement": "monday",

@@ -16,7 +16,7 @@ from spadmnist.effects.readout_loss import ReadoutLoss, _taken
 from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
-from spadmnist.inference.light_levels import _last_digit, closed_form, in_counters, level_for, rising_until
+from spadmnist.inference.light_levels import closed_form, in_counters, last_digit, level_for, rising_until
 from spadmnist.inference.reduction import reduce_with
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
@@ -284,7 +284,7 @@ def test_a_level_that_hardly_anybody_knows_hides_no_dead_time() -> None:
     ("mean", "digit"), [(2.6, 0.1), (470.0, 1.0), (5e-05, 1e-5), (1.2e-05, 1e-6), (0.00011, 1e-5), (1e7, 1.0)]
 )
 def test_the_last_digit_of_a_mean(mean: float, digit: float) -> None:
-    assert _last_digit(mean) == pytest.approx(digit)
+    assert last_digit(mean) == pytest.approx(digit)
 
 
 def test_the_mean_of_frames_with_afterpulses_is_adequate() -> None:

@@ -34,16 +34,16 @@ from spadmnist.inference.results import Value
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.score_test import (
     ScoreTest,
-    _p_values,
     best_direction,
     explains_its_signature,
     p_of_best,
     p_of_spread,
+    p_values,
     score_test,
 )
 from spadmnist.inference.signature import Signature, signature_of_totals, signatures, template_of
 from spadmnist.inference.trial import Trial
-from spadmnist.inference.trial_fits import _boost, _fit_whole_number
+from spadmnist.inference.trial_fits import boost_of, fit_whole_number
 from spadmnist.recording import Capture, Light
 from spadmnist.statistics import Summary
 
@@ -121,7 +121,7 @@ def test_a_gate_that_takes_most_of_the_light_is_tried_where_it_does(lab) -> None
     replicates = bench_of(lab("    short_gate: {fraction: 0.4}\n", light=20, side=8))
     evaluation, look = evaluate(replicates, {}), quiet(replicates)
     candidate = change_of(replicates, "add short_gate")
-    tried = look._by_totals(evaluation, [(candidate, values) for values in look.begun(evaluation, candidate)])
+    tried = look.trials_by_totals(evaluation, [(candidate, values) for values in look.begun(evaluation, candidate)])
     best = max(tried, key=lambda one: one.fall)
     # the next strengths that are tried are a sixth away
     assert best.times == 1 and best.values["short_gate", "fraction"] == pytest.approx(0.4, abs=0.1)
@@ -155,7 +155,7 @@ def test_less_of_what_can_only_be_there_is_no_mark(lab) -> None:
         p = []
         for sign in (1, -1):
             evaluation.residuals[cell] = sign * 10.0 * trace / math.sqrt(float(trace @ trace))
-            p.append(_p_values(replicates, evaluation, [one])[0][0])
+            p.append(p_values(replicates, evaluation, [one])[0][0])
         assert p[0] < 1e-3 and p[1] == (pytest.approx(p[0]) if signed else 1.0)
 
 
@@ -242,7 +242,7 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     evaluation = evaluate(replicates, {})
     (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], 2, kept="sure")
     assert isinstance(signature, Signature)
-    boost, found = _boost(
+    boost, found = boost_of(
         replicates, evaluation, Trial(change_of(replicates, f"add {name}"), values, signature, 0.0, 1.0), values
     )
     assert boost > 2 and round(found) == power
@@ -609,7 +609,7 @@ def test_a_whole_number_is_fitted_by_its_neighbours(truth: int, first: int) -> N
         square = 1000.0 + 40.0 * math.log(queue / truth) ** 2 * truth
         return Fit((), np.zeros(0), np.zeros((0, 0)), {}, {}, square, dict(values))
 
-    found, ends = _fit_whole_number(fit({coordinate.key: float(first)}), coordinate, fit)
+    found, ends = fit_whole_number(fit({coordinate.key: float(first)}), coordinate, fit)
     low, high = ends[coordinate.key]
     assert low <= truth <= high and abs(math.log(found.values[coordinate.key] / truth)) < 0.15
     assert low >= 1 and (low, high) == (round(low), round(high))
@@ -642,7 +642,7 @@ def test_a_whole_number_that_was_fitted_from_afar_is_fitted_again(dependent: flo
         return Fit((time,), np.array([point]), covariance, {}, jacobian, square, new)
 
     first = fit({places.key: 8.0, time.key: 1e-8 * math.exp(best(8))})
-    found, ends = _fit_whole_number(first, places, fit)
+    found, ends = fit_whole_number(first, places, fit)
     assert found.values[places.key] == 4 and found.values[time.key] == pytest.approx(1e-8 * math.exp(best(4)), rel=0.05)
     assert ends[places.key] == ((4, 4) if alone else (3, 5)) and (time.key in ends) != alone
     if not alone:

@@ -12,7 +12,7 @@ from scipy import stats
 
 from spadmnist.inference.laws import Poisson
 from spadmnist.inference.replicates import TOTALS
-from spadmnist.inference.score_test import _p_values, _trials_corrected, score_test
+from spadmnist.inference.score_test import p_values, score_test, trials_corrected
 
 RECORDINGS, CELL = 32, ("flat", "windows")
 REPLICATES: Any = SimpleNamespace(seen={"flat": SimpleNamespace(total=1.0)})
@@ -50,8 +50,8 @@ def candidate(trace: np.ndarray, name: str, signed: bool = True, directions: int
 
 
 def p_of(evaluation: Any, tried: list[Any]) -> float:
-    data, own = _p_values(REPLICATES, evaluation, tried)
-    return _trials_corrected(own, min(data))
+    data, own = p_values(REPLICATES, evaluation, tried)
+    return trials_corrected(own, min(data))
 
 
 def test_p_values_of_many_candidates_are_no_smaller_than_uniform_and_not_far_larger() -> None:

@@ -16,7 +16,7 @@ from spadmnist.cli import comparing
 from spadmnist.effects import BackgroundLight
 from spadmnist.errors import InputError
 from spadmnist.inference import setups
-from spadmnist.inference.comparison import _between_wavelengths, compare
+from spadmnist.inference.comparison import compare, ratios_between_wavelengths
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.models import InTheDark
@@ -255,10 +255,10 @@ def test_pixels_that_differ_at_one_wavelength_alone(tmp_path):
     (dim,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "dim"]
     captures = [c for c in data.captures if c.id != "dark"]
     red = replace(captures[0], light=replace(captures[0].light, wavelength=700e-9))
-    (check,) = _between_wavelengths([red, captures[1]], [map_, dim], 8)
+    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, dim], 8)
     assert check.p_value > 1e-3
     shifted = replace(dim.judgement, residuals=dim.judgement.residuals + np.where(np.arange(64) == 17, 8.0, 0.0))
-    (check,) = _between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
+    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
     assert check.p_value < 1e-6 and "row 2, column 1" in check.where
 
 

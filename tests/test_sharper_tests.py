@@ -9,7 +9,7 @@ import pytest
 from tinylab import LIFETIME, PROBABILITY, bench_of, change_of, labs, quiet
 
 from spadmnist.inference.evaluation import Evaluation, evaluate, stacked
-from spadmnist.inference.map_fits import _width_of_most
+from spadmnist.inference.map_fits import width_of_most
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.score_test import best_direction, most_significant, p_of_best
 from spadmnist.inference.sharper_tests import sharper
@@ -74,5 +74,5 @@ def test_the_width_of_a_few_values_is_that_of_their_squares_without_odd_ones(odd
     for _ in range(2000):
         values = 0.01 * rng.standard_normal(32)
         values[:odd] += 1.0
-        widths.append(_width_of_most(values, 0.005**2) / 0.01)
+        widths.append(width_of_most(values, 0.005**2) / 0.01)
     assert abs(np.mean(widths) - 1) < 0.03 and np.std(widths) < 0.15

@@ -12,7 +12,7 @@ from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.laws import Poisson
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.shifts import beyond_noise, mean_shift
-from spadmnist.inference.signature import Signature, _signature
+from spadmnist.inference.signature import Signature, signature_from
 from spadmnist.statistics import Summary
 
 BLOCKS, RECORDINGS = 200, 32
@@ -103,7 +103,7 @@ def test_no_expectation_is_taken_from_where_none_was_learnt(lab) -> None:
         for id in evaluation.made
     ]
     made = dict(zip(evaluation.made, replicates.simulate(wanted), strict=True))
-    signature = _signature(replicates, evaluation, evaluation.sensors, made, "sure")  # type: ignore[arg-type]
+    signature = signature_from(replicates, evaluation, evaluation.sensors, made, "sure")  # type: ignore[arg-type]
     assert isinstance(signature, Signature)
     null, most = evaluation.nulls["dark", "intervals"], evaluation.made["dark"].totals.max()
     (values, usual), few = (made["dark"].values["intervals"], evaluation.made["dark"].values["intervals"]), slice(0, 4)  # type: ignore[union-attr]

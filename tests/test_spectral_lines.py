@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from spadmnist.inference.laws import Exponential
-from spadmnist.inference.spectral_lines import _line, _Spectrum, spectral_lines
+from spadmnist.inference.spectral_lines import CaptureSpectrum, fitted_line, spectral_lines
 
 STEPS = {"dark": 10.0, "dim": 20.0, "bright": 66.7, "red": 33.3}  # Hz, from bin to bin
 BINS = 400
@@ -172,9 +172,9 @@ def test_how_exactly_it_is_known(strength: float, frequency: float) -> None:
             x = frequency / step - np.arange(1, bins + 1)
             line = np.sqrt(strength) * np.sinc(x) * np.exp(1j * (2 * np.pi * rng.random() + np.pi * x))
             power = np.abs(line + (rng.standard_normal(bins) + 1j * rng.standard_normal(bins)) / np.sqrt(2)) ** 2
-            group.append(_Spectrum(power, np.sqrt(power), power, step, False))
+            group.append(CaptureSpectrum(power, np.sqrt(power), power, step, False))
         about = 20.0 * (1 + int(np.argmax(group[0].power[:60])))
-        found = _line(group, about, -50.0)
+        found = fitted_line(group, about, -50.0)
         pulls.append((found.frequency - frequency) / found.error)
     covered = np.abs(pulls) < 1.96
     # of 300 at 95 %, 265 and fewer have a chance of 1e-6

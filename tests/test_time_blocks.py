@@ -23,7 +23,7 @@ from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.models import Model
 from spadmnist.inference.reduction import halves_of
 from spadmnist.inference.signature import Signature, signatures
-from spadmnist.inference.time_blocks import _jacobian_of_halves, _same_places, measure
+from spadmnist.inference.time_blocks import jacobian_of_halves, measure, same_places
 from spadmnist.inference.trial import Trial
 from spadmnist.recording import COMMON_PERIOD, Capture, Light, Recording
 from spadmnist.statistics import Summary
@@ -146,14 +146,14 @@ def test_a_number_of_one_capture_is_judged_by_its_other_half(lab) -> None:
     statistic = "pixel_map"
     cells = len(replicates.seen["flat"].summaries[statistic].values)
     whole = np.linspace(1.0, 2.0, cells)[:, None]
-    found = _jacobian_of_halves(replicates, half, {("flat", statistic): whole, ("dark", statistic): whole}, {"flat"})
+    found = jacobian_of_halves(replicates, half, {("flat", statistic): whole, ("dark", statistic): whole}, {"flat"})
     odd, even = ((name, statistic) for name in halves_of("flat"))
     assert found.keys() == {odd, even}
     for cell in (odd, even):
         share = half.seen[cell[0]].total / replicates.seen["flat"].total
         assert found[cell] == pytest.approx(whole * math.sqrt(share), rel=1e-12)
     spectrum = np.ones((len(replicates.seen["flat"].summaries["spectrum"].values), 1))
-    other = _jacobian_of_halves(replicates, half, {("flat", "spectrum"): spectrum}, {"flat"})
+    other = jacobian_of_halves(replicates, half, {("flat", "spectrum"): spectrum}, {"flat"})
     assert len(other) == 2 and not any(x.any() for x in other.values())  # it has other frequencies
     first, second = found[odd][:, 0], found[even][:, 0]
     back = 2 * float(first @ first) / float(second @ second)
@@ -169,12 +169,12 @@ def test_cells_that_look_elsewhere_follow_nothing() -> None:
         values = np.zeros(n if axis is None else len(axis))
         return Summary(values, "normal", str, lambda *_: ("", 0.0), axis=None if axis is None else np.array(axis))
 
-    here, there = _same_places(summary([1.0, 2.0, 4.0]), summary([1.01, 2.0, 4.5, 9.0]))
+    here, there = same_places(summary([1.0, 2.0, 4.0]), summary([1.01, 2.0, 4.5, 9.0]))
     assert here.tolist() == [0, 1] and there.tolist() == [0, 1]
-    here, there = _same_places(summary([5.0, 6.0]), summary([1.0, 2.0]))  # as many: trends, maps
+    here, there = same_places(summary([5.0, 6.0]), summary([1.0, 2.0]))  # as many: trends, maps
     assert here.tolist() == there.tolist() == [0, 1]
     for a, b in ((summary(None, 3), summary([1.0, 2.0])), (summary([1.0]), summary(None, 4))):
-        assert not len(_same_places(a, b)[0])
+        assert not len(same_places(a, b)[0])
 
 
 def mapped(tmp_path: Path) -> tuple[ModelPath, Rung]:

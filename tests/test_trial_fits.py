@@ -25,7 +25,7 @@ from spadmnist.inference.results import Step
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import IGNORED, Signature, captures_showing, residuals_at
 from spadmnist.inference.trial import Trial
-from spadmnist.inference.trial_fits import _fails_own_checks, _probe
+from spadmnist.inference.trial_fits import fails_own_checks, fit_by_probes
 
 NOTHING = Signature({}, {}, {})
 SERVICE = ("readout_loss", "service_time")
@@ -75,7 +75,7 @@ def test_an_edge_is_probed_to_some_ten_picoseconds(monkeypatch) -> None:
     start = {DURATION: truth * math.exp(0.0022)}
     square = float(cost(start)["flat", "edge"][0]) ** 2
     found = Fit((coordinate,), np.log([start[DURATION]]), np.eye(1), {}, {}, square, start)  # type: ignore[arg-type]
-    found = _probe(None, evaluation, one, found, [])  # type: ignore[arg-type]
+    found = fit_by_probes(None, evaluation, one, found, [])  # type: ignore[arg-type]
     assert abs(found.values[DURATION] - truth) < 10e-12
     assert found.covariance[0, 0] < 1e-6
 
@@ -93,10 +93,10 @@ def test_probes_are_for_checks_that_the_candidate_moves(lab, monkeypatch, size: 
     monkeypatch.setattr("spadmnist.inference.trial_fits.template_of", lambda replicates, evaluation, signature: trace)
     one = Trial(change_of(replicates, "add crosstalk"), {}, NOTHING, 0.0, 1.0)
     found: Any = SimpleNamespace(residuals=residuals)
-    assert _fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
+    assert fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
     trace[cell][0], trace[TOTALS][:] = 0.0, size
     found.residuals = {**evaluation.residuals, TOTALS: np.full(len(evaluation.residuals[TOTALS]), 20.0)}
-    assert _fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
+    assert fails_own_checks(replicates, evaluation, one, found, ["dark", "flat"]) == asked
 
 
 def test_captures_that_show_hardly_anything_of_it_are_left_out() -> None:

@@ -251,10 +251,10 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     captures = [seen.capture for seen in replicates.seen.values()]
     nuisances, common = light_of(levels, captures)
     checks += common
-    checks += _between_wavelengths(captures, checks, replicates.start.layout.columns)
+    checks += ratios_between_wavelengths(captures, checks, replicates.start.layout.columns)
     if not checks:
         raise InputError(nothing_to_compare(replicates))
-    checks = _verdicts([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
+    checks = holm_corrected([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
     return Comparison(
         sensor.name,
@@ -278,7 +278,7 @@ def nothing_to_compare(replicates: Replicates) -> str:
     )
 
 
-def _between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], columns: int) -> list[Check]:
+def ratios_between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], columns: int) -> list[Check]:
     """The checks of the pixels' ratios between neighbouring wavelengths.
 
     Each wavelength has its capture with the most detections.
@@ -403,7 +403,7 @@ def light_of(
     return nuisances, checks
 
 
-def _verdicts(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
+def holm_corrected(checks: Sequence[Check], tolerance: float | None) -> list[Check]:
     """The checks with Holm's correction applied: which of them are significant, material, and fail."""
     # the light, the totals and the statistics have a share each of the false alarms, so that a wrong power meter is
     # not lost among a hundred statistics

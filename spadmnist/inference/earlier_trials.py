@@ -77,10 +77,10 @@ def has_moved(evaluation: Evaluation, known: Trial) -> bool:
     if then is None or now is None:
         return False
     others = [p for p in now.parameters if (name, p) not in known.values]
-    return any(_differ(getattr(then, p), getattr(now, p)) for p in others)
+    return any(values_differ(getattr(then, p), getattr(now, p)) for p in others)
 
 
-def _differ(a: Any, b: Any) -> bool:
+def values_differ(a: Any, b: Any) -> bool:
     """Whether two values of a parameter differ by more than the factor `_CHANGED`."""
     if a is b or a is None or b is None:
         return a is not b

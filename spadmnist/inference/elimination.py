@@ -48,10 +48,10 @@ def drop_needless(path: ModelPath) -> None:
             continue
         if step.candidate.carrier:
             if not path.steps[-1].candidate.carrier:  # a later map may be what makes the pixels differ
-                _drop_unless_missed(path, step)
+                drop_unless_missed(path, step)
             continue
         if step.fluctuates or step.chips:  # the squares of residuals do not judge what has a scatter of its own
-            _drop_unless_missed(path, step)
+            drop_unless_missed(path, step)
             continue
         rest = {k: v for k, v in path.values.items() if k not in keys_of(step.candidate, path)}
         chips = any(s.chips for s in path.steps)
@@ -87,7 +87,7 @@ def drop_needless(path: ModelPath) -> None:
             path.rung(f"- {title(step.candidate)}")
 
 
-def _drop_unless_missed(path: ModelPath, step: Step) -> None:
+def drop_unless_missed(path: ModelPath, step: Step) -> None:
     """Drop a step, unless more checks fail without it.
 
     A fluctuating step also stays where the likelihood is larger with it: its signature may be all that showed it.

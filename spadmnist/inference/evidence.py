@@ -201,12 +201,12 @@ def judge_maps_by_odd_pixels(
         judged: (significance, p-value) by the trial's id.
     """
     for odd in (t for t in fitted if t.chips):
-        if _share_of_counts(replicates, evaluation, odd.signature) > _MOSTLY:
+        if share_of_counts(replicates, evaluation, odd.signature) > _MOSTLY:
             for one in filter(is_map_of_pixels, fitted):
                 judged[id(one)] = min(judged[id(one)], judged[id(odd)], key=lambda x: x[1])
 
 
-def _share_of_counts(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> float:
+def share_of_counts(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> float:
     """The share of a signature's square in statistics of counts that compare no detections with each other."""
     squares = {
         cell: float(t @ t) for cell, t in template_of(replicates, evaluation, signature).items() if cell != TOTALS

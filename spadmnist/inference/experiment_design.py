@@ -52,7 +52,7 @@ def between(scan: Scan, evaluation: Evaluation, found: Candidate, other: Trial) 
     replicates.say("the capture that would separate the two explanations")
     best: tuple[float, str] | None = None
     for words, capture, like in _menu(replicates, evaluation):
-        z = _apart(replicates, evaluation, other.sensors, capture, like)
+        z = expected_significance(replicates, evaluation, other.sensors, capture, like)
         if best is None or z > best[0]:
             best = z, words
     if best is None:
@@ -114,7 +114,9 @@ def _brighter(replicates: Replicates, id: str, rate: float, times: float) -> Ite
     yield words, replace(capture, light=replace(capture.light, level=level * times)), id
 
 
-def _apart(replicates: Replicates, known: Evaluation, other: Model, capture: Capture, like: str) -> float:
+def expected_significance(
+    replicates: Replicates, known: Evaluation, other: Model, capture: Capture, like: str
+) -> float:
     """The expected significance of another model in a capture that was not taken, standard deviations."""
     new = copy.copy(replicates)
     capture = replace(capture, id=f"{capture.id} again")

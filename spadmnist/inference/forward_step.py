@@ -70,7 +70,7 @@ def best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], leas
     while True:
         before = path.kept()
         try:
-            return _best_of_scan_added(path, notes, failed, least)
+            return best_of_scan_added(path, notes, failed, least)
         except _NoCandidate as none:
             names = none.args[0]
         except UNABLE as error:  # not attributable to one candidate: the one with the largest fall is excluded
@@ -98,7 +98,13 @@ def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Ite
         raise _NoCandidate({candidate.name for candidate in candidates}) from error
 
 
-def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
+def best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
+    """Whether the best of the scan was added to the path.
+
+    Args:
+        failed: the checks that fail; without any, the scores alone are judged.
+        least: the largest p-value of a step.
+    """
     replicates, scan, faint = path.replicates, path.scan, not failed
     notes.waiting = []
     # a value that a step has set is fitted anew with every other one: it is no finding of its own
@@ -116,7 +122,7 @@ def _best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChe
     try:
         while k + 1 < len(groups):
             k += 1
-            fitted += _fitted(path, groups[k], faint)
+            fitted += fitted_trials(path, groups[k], faint)
             able = able or bool(fitted)
             while found := _best_of(path, notes, second[0], fitted, faint):
                 best, significance, p = found
@@ -181,7 +187,7 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
         if not group:
             break
         with contextlib.suppress(_NoCandidate, *UNABLE):  # the scan that follows records what cannot be simulated
-            found = _best_of(path, notes, None, _fitted(path, group, False), False)
+            found = _best_of(path, notes, None, fitted_trials(path, group, False), False)
             if found is not None and found[2] <= FALSE_ALARM and found[0].evidence >= LEAST_EVIDENCE:
                 best, significance, _ = found
                 if leads(best, notes.waiting) and _taken(path, notes, failed, group, best, significance):
@@ -232,7 +238,7 @@ def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
     return out if out and out[0].fall > PROMISING else []
 
 
-def _fitted(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]:
+def fitted_trials(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]:
     """The trials with their coordinates fitted and their evidence, without those that cannot be simulated."""
     path.replicates.say(f"step {len(path.steps) + 1}: fitting " + ", ".join(title(t.candidate) for t in worth))
     fitted = []

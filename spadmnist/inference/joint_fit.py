@@ -83,11 +83,11 @@ def fit_all(
     if coordinates:
         known_columns = _side_by_side(evaluation, coordinates, columns)
         given = evaluation, maps, coordinates, edge_errors(path, fit), known_columns, roughly, where_shown
-        found, evaluation, maps = _gauss_newton(path, *given)
+        found, evaluation, maps = repeated_steps(path, *given)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))
     path.evaluation = evaluation
-    path.fit = found = None if found is None else _bounded(path, found)
+    path.fit = found = None if found is None else bounded(path, found)
     _write_values(path, found or fit, maps)
 
 
@@ -135,7 +135,7 @@ def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], f
     return Fit(coordinates, np.zeros(n), np.full((n, n), np.inf), {}, jacobian, math.inf, {})
 
 
-def _gauss_newton(
+def repeated_steps(
     path: ModelPath,
     evaluation: Evaluation,
     maps: dict[Key, pixel_maps.PixelMap],
@@ -270,7 +270,7 @@ def _recordings(evaluation: Evaluation) -> int:
     return min(len(evaluation.replicate_residuals[TOTALS]), _MANY) if evaluation.fluctuates else 2 * FEW
 
 
-def _bounded(path: ModelPath, fit: Fit) -> Fit:
+def bounded(path: ModelPath, fit: Fit) -> Fit:
     """The fit, or the evaluated point where the last step of the fit raises the squares: a line, an edge.
 
     That step was not simulated before.

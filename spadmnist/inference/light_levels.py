@@ -232,7 +232,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     mean = max(expected(level), 1e-9)
     share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
     digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
-    rounding = _last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
+    rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
     # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one
     caused = 0.0 if capture.counts_events else sum(sensor.caused().values())
     scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2 + caused**2)
@@ -242,7 +242,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     return CaptureNull(level, stated, totals, expected, (0.0, 1.0), scatter), np.ones(replicates)
 
 
-def _last_digit(value: float) -> float:
+def last_digit(value: float) -> float:
     """The last decimal place of a number as written: 0.1 of 2.6, 1 of 470."""
     return 10.0 ** int(decimal.Decimal(f"{value:.10g}").as_tuple().exponent)
 
@@ -469,7 +469,7 @@ def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> floa
     if light.dark:
         error = max(error, 1 / math.sqrt(null.total_at(1.0)) / max(slope, 1e-3))
     stated = float(null.stated or 1.0)
-    z = _score(replicates, evaluation, id, replicates.seen[id].total, null.total_at(stated))
+    z = score_of_total(replicates, evaluation, id, replicates.seen[id].total, null.total_at(stated))
     if z is not None:
         level, _, _ = null.level_of(max(replicates.seen[id].total, 0.5))
         apart = abs(math.log(level / stated))
@@ -477,7 +477,9 @@ def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> floa
     return max(math.hypot(error, light.own_uncertainty), 1e-6)
 
 
-def _score(replicates: Replicates, evaluation: Evaluation, id: str, total: float, expected: float) -> float | None:
+def score_of_total(
+    replicates: Replicates, evaluation: Evaluation, id: str, total: float, expected: float
+) -> float | None:
     """The deviation of a total in standard deviations; None where the log of the level is normal enough.
 
     It is not normal for few dark counts, nor where the detections of the light are few compared with the dark ones.
@@ -535,7 +537,7 @@ def own_totals(replicates: Replicates, evaluation: Evaluation, k: int, draw: flo
     for id, slope, deviation in zip(ids, elasticities, own, strict=True):
         null = evaluation.rates[id]
         mean_log = null.law[0] + null.law[1] * math.log(null.expected(float(null.level * evaluation.factors[id][k])))
-        z = _score(replicates, evaluation, id, float(null.totals[k]), math.exp(mean_log))
+        z = score_of_total(replicates, evaluation, id, float(null.totals[k]), math.exp(mean_log))
         if z is not None:
             x.append(z * level_error(replicates, evaluation, id))
             continue

@@ -180,7 +180,7 @@ class _Fitted:
         noise = float(np.median(self.raw_variance))
         if noise < INFORMED**2:
             # of most pixels, beyond their noise; an iteration towards a width of 0 would be slow
-            self.sigma = math.sqrt(max(_width_of_most(self.raw, noise) ** 2 - noise, LEAST_WIDTH**2))
+            self.sigma = math.sqrt(max(width_of_most(self.raw, noise) ** 2 - noise, LEAST_WIDTH**2))
         apart = self.logs - self.middle
         odd = outside_bulk(apart, self.sigma**2 + self.variance)
         if noise >= INFORMED**2:
@@ -222,7 +222,7 @@ class _Fitted:
         return replace(PixelMap(self.candidate.carrier, self.base, *own), of_scene=of_scene)
 
 
-def _width_of_most(raw: np.ndarray, noise: float) -> float:
+def width_of_most(raw: np.ndarray, noise: float) -> float:
     """The standard deviation of most values.
 
     The median of their distances needs many: that of 32 rows is off by 20 %, the mean square of those that are not odd

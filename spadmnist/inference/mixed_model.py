@@ -163,7 +163,7 @@ def _most_likely(
     def cost(logs: np.ndarray) -> float:
         variances = [math.exp(2 * min(max(float(x), low), high)) for x in logs]
         of_pixel = variances.pop(0) if pixels else 0.0
-        return -_log_likelihood(y, noise + of_pixel, design, groups, variances.pop() if variances else 0.0)
+        return -log_likelihood_of_values(y, noise + of_pixel, design, groups, variances.pop() if variances else 0.0)
 
     if not free:
         return -cost(np.zeros(0))
@@ -182,7 +182,7 @@ def _most_likely(
     return max([-float(found.fun) for found in falls] + edges)
 
 
-def _log_likelihood(
+def log_likelihood_of_values(
     y: np.ndarray, variance: np.ndarray, design: np.ndarray, groups: np.ndarray | None, of_group: float
 ) -> float:
     """The log-likelihood at the best fixed coefficients, up to a constant.

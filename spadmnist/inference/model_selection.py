@@ -125,7 +125,7 @@ def _diagnosed(
     if path.steps:
         with or_as_before(path, "the fit of all numbers together"):
             complete(path)
-            if _is_as_stated(path, notes):
+            if is_as_stated(path, notes):
                 complete(path)
         if path.evaluation.borrowed:  # the budget has ended it: the steps are still judged by replicates of their own
             replicates.budget.until = math.inf
@@ -138,7 +138,7 @@ def _diagnosed(
                 drop_needless(path)
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
-        _take_setup_again(path, notes)
+        take_setup_again(path, notes)
     if path.steps and not short and not notes.explained:  # the rates follow from the stated light
         with or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)
@@ -163,7 +163,7 @@ def _diagnosed(
     null_95 = _measured(path, rungs)
     if verdict in ("explained", "partly_explained"):
         replicates.budget.until = 1.0
-        verdict = _or_confused(path, notes, verdict)
+        verdict = or_confused(path, notes, verdict)
     if notes.rival is not None:
         path.steps.append(rival_step(path, notes.rival))
     for step in path.steps:
@@ -216,10 +216,10 @@ def _in_vain(path: ModelPath, notes: Notes) -> bool:
 
 
 def _possible(path: ModelPath, notes: Notes) -> bool:
-    """As `_another`; False where the steps so far cannot be simulated often enough."""
+    """As `another_step`; False where the steps so far cannot be simulated often enough."""
     before = path.kept()
     try:
-        return _another(path, notes)
+        return another_step(path, notes)
     except OutOfBudget:
         path.back_to(before)
         record_end(path, f"step {len(path.steps) + 1}")
@@ -233,12 +233,12 @@ def _possible(path: ModelPath, notes: Notes) -> bool:
         return False
 
 
-def _another(path: ModelPath, notes: Notes) -> bool:
+def another_step(path: ModelPath, notes: Notes) -> bool:
     """Whether a step was added, or the model was simulated more often, so that another step may follow."""
     replicates, scan = path.replicates, path.scan
     if all(block.p > CLEARLY for block in path.failed) or scan.only_rates(path.evaluation):
         complete(path)  # what no check shows plainly, and what the set-up may explain, is decided by the whole fit
-    if _is_as_stated(path, notes):
+    if is_as_stated(path, notes):
         complete(path)
     failed, number = path.failed, len(path.steps) + 1
     waiting, notes.waiting = notes.waiting, []
@@ -254,7 +254,7 @@ def _another(path: ModelPath, notes: Notes) -> bool:
         notes.tried = scan.scan(path.evaluation, everywhere=True, known=notes.tried)
         before = notes.looked = path.evaluation
         largest_p = _P_LATER_SCORE if path.steps else _P_SCORE
-        if _stands_out(path, notes, largest_p):
+        if stands_out(path, notes, largest_p):
             closer = path.evaluation
             if closer is not before:  # more replicates may show lines that few did not
                 sharp = [one for one in notes.tried if one.sharp]
@@ -267,8 +267,8 @@ def _another(path: ModelPath, notes: Notes) -> bool:
         path.evaluation = before  # under this evaluation no check fails: nothing is left
         return False
     asked = notes.explained or notes.taken_back is not None
-    if not asked and scan.only_rates(path.evaluation) and _by_setup(path, notes):
-        return _is_freed(path, notes)
+    if not asked and scan.only_rates(path.evaluation) and explained_by_setup(path, notes):
+        return is_freed(path, notes)
     clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
     first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
@@ -278,7 +278,7 @@ def _another(path: ModelPath, notes: Notes) -> bool:
     return best_added(path, notes, failed) or (len(path.steps) == steps and complete(path))
 
 
-def _stands_out(path: ModelPath, notes: Notes, largest_p: float) -> bool:
+def stands_out(path: ModelPath, notes: Notes, largest_p: float) -> bool:
     """Whether the score of any candidate is significant.
 
     Where it may be, the model is simulated more often, so that a few replicates do not decide; and the most significant
@@ -307,7 +307,7 @@ def _stands_out(path: ModelPath, notes: Notes, largest_p: float) -> bool:
     return p <= largest_p
 
 
-def _or_confused(path: ModelPath, notes: Notes, verdict: str) -> str:
+def or_confused(path: ModelPath, notes: Notes, verdict: str) -> str:
     """The verdict on steps, "confused" where they leave nothing and something else is a tie.
 
     The mimics of steps, which no effect describes, stand under their alternatives in any case. The advice is added.
@@ -333,7 +333,7 @@ def _or_confused(path: ModelPath, notes: Notes, verdict: str) -> str:
     return verdict
 
 
-def _by_setup(path: ModelPath, notes: Notes) -> bool:
+def explained_by_setup(path: ModelPath, notes: Notes) -> bool:
     """Whether the set-up explains the totals that fail; adds its entries, a rival of the sensor, and the advice."""
     replicates, evaluation = path.replicates, path.evaluation
     likely = setups.explanations(replicates, evaluation)
@@ -373,7 +373,7 @@ def _by_setup(path: ModelPath, notes: Notes) -> bool:
     return True
 
 
-def _is_freed(path: ModelPath, notes: Notes) -> bool:
+def is_freed(path: ModelPath, notes: Notes) -> bool:
     """Whether the levels that the set-up explains are free now, for a score test of what other statistics show.
 
     They stay where a change of the sensor is a tie. Steps are fitted anew, without these totals.
@@ -388,7 +388,7 @@ def _is_freed(path: ModelPath, notes: Notes) -> bool:
     return True
 
 
-def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
+def is_as_stated(path: ModelPath, notes: Notes) -> bool:
     """Whether the steps explain the totals of freed levels, so that the set-up need not; its entries are then removed.
 
     Light that fluctuates slowly gives a capture another total, and so may another light level.
@@ -412,7 +412,7 @@ def _is_as_stated(path: ModelPath, notes: Notes) -> bool:
     return explained
 
 
-def _take_setup_again(path: ModelPath, notes: Notes) -> None:
+def take_setup_again(path: ModelPath, notes: Notes) -> None:
     """Put the entries of the set-up back where the step that explained the totals was dropped."""
     if notes.taken_back is None or notes.explained:
         return

@@ -66,9 +66,9 @@ def fit_named(
     say = progress or (lambda what: None)
     every, listed = candidates(sensor.resolved(), measurement.captures), {e.name for e in sensor.effects}
     wanted = [
-        *(_named(every, listed, "add", name, None) for name in add),
-        *(_named(every, listed, "set", *_halves(name)) for name in free),
-        *(_named(every, listed, "per_pixel", *_halves(name)) for name in per_pixel),
+        *(named_candidate(every, listed, "add", name, None) for name in add),
+        *(named_candidate(every, listed, "set", *_halves(name)) for name in free),
+        *(named_candidate(every, listed, "per_pixel", *_halves(name)) for name in per_pixel),
     ]
     if not wanted:
         raise InputError("nothing is to be fitted; name --add EFFECT, --free EFFECT.PARAMETER or --per-pixel ...")
@@ -291,9 +291,19 @@ def _halves(name: str) -> tuple[str, str]:
     return effect, parameter
 
 
-def _named(
+def named_candidate(
     every: Sequence[Candidate], known: Collection[str], kind: str, effect: str, parameter: str | None
 ) -> Candidate:
+    """The candidate that the caller names.
+
+    Args:
+        every: all candidates of the sensor and the data.
+        known: the effects that the sensor lists.
+        kind: "add", "set" or "per_pixel".
+        parameter: of a value; None for a whole effect.
+    Raises:
+        InputError: where there is none; it says which there are.
+    """
     listed = effect in known
     for candidate in every:
         if (candidate.kind, candidate.effect) == (kind, effect) and (kind == "add" or candidate.parameter == parameter):

@@ -28,7 +28,7 @@ ALONE = 0.6
 INFORMED, LEAST_WIDTH = 0.2, 1e-3
 # relative standard error of the variance of many pixels by the median of their distances, times the root of their
 # number: about twice that of the width, 1.166 for a normal law
-_DOUBT = 2.34
+DOUBT = 2.34
 # shares of hot pixels that are tried for the width of pixels with few counts; the likeliest is taken
 _HOT = (0.001, 0.01, 0.03, 0.1)
 # pixels whose likelihood gives the width of their law: drawn at random from more, to save time
@@ -148,7 +148,7 @@ class PixelMap:
         typical = float(np.median(noise))
         if typical >= INFORMED**2:
             return np.ones(noise.size)  # these have a law of their own
-        doubt = _DOUBT / math.sqrt(noise.size) * (self.sigma**2 + typical)
+        doubt = DOUBT / math.sqrt(noise.size) * (self.sigma**2 + typical)
         other = max(self.sigma**2 + draw * doubt, min(LEAST_WIDTH, self.sigma) ** 2)
         # by the prior's influence on each value: an odd one has none
         pulled = self._pulled

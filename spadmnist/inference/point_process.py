@@ -33,7 +33,7 @@ _PIECE = 1 << 20  # gaps that are looked at together: memory against time, and n
 # of a gap that may be short: itself, its hazard, its kind; and itself once more while the pieces are put together.
 # Plain meaning: they decide how many gaps have room
 BYTES_OF_A_GAP = 8 + 8 + 1 + 8
-_FOLLOWS, _LAST = 1, 2  # kinds of gaps: after another short one; to the end of the exposure
+FOLLOWS, LAST = 1, 2  # kinds of gaps: after another short one; to the end of the exposure
 # (pixels,) rates -> (log-likelihood, its derivative by the rate, minus about the second one), (pixels,) each
 Law = Callable[[np.ndarray], tuple[np.ndarray, ...]]
 
@@ -104,7 +104,7 @@ def _risen(x, tick, sigma):
 
 
 @kernels.jit
-def _followed(near, seen, pixel, stamps, out):
+def followed_gaps(near, seen, pixel, stamps, out):
     """(log-probability of all that does not depend on the rate, time awake in s), (pixels,) each.
 
     Args:
@@ -136,12 +136,12 @@ def _followed(near, seen, pixel, stamps, out):
             old[k] = 0.0
         none = 1.0  # a product, because logarithms are slow
         for m in range(offsets[i], offsets[i + 1]):
-            if not kinds[m] & _FOLLOWS:
+            if not kinds[m] & FOLLOWS:
                 for k in range(traps):
                     base[i] -= old[k]
                     old[k] = 0.0
             v = gaps[m] - dead[i]
-            last = kinds[m] & _LAST
+            last = kinds[m] & LAST
             if not last and dead[i] > 0.0 and v < tick + 8 * sigma:
                 base[i] += math.log(max(_risen(v, tick, sigma), _LEAST))
             if v < 0.0:
@@ -204,7 +204,7 @@ def _of_rate(hazard, start, used, count, awake, rate):
 
 
 @kernels.jit
-def _of_rates(hazard, offsets, used, counts, awake, rate):
+def likelihood_of_rates(hazard, offsets, used, counts, awake, rate):
     """(log-likelihood, its derivative by the rate, minus the second one), (pixels,) each."""
     value, first, second = np.zeros((3, counts.size))
     for i in range(counts.size):
@@ -307,7 +307,7 @@ class Stamps:
             near = gaps <= self.reach
             follows = np.append(before, (near & ~last)[:-1])
             before = bool(near[-1] and not last[-1])
-            kinds = np.where(last, _LAST, 0) | np.where(follows, _FOLLOWS, 0)
+            kinds = np.where(last, LAST, 0) | np.where(follows, FOLLOWS, 0)
             short.append(gaps[near])
             all_kinds.append(kinds[near].astype(np.uint8))
             inside = slice(*np.searchsorted(self.offsets, (part.start, part.stop)))
@@ -338,13 +338,13 @@ class Stamps:
             about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
             pixel = dead, chance, lifetime, about
             out = self.hazard, self.used
-            self.parts = np.array(_followed(self.near, (self.counts, end), pixel, (self.tick, blur), out))
+            self.parts = np.array(followed_gaps(self.near, (self.counts, end), pixel, (self.tick, blur), out))
             self.given = given
         base, awake = self.parts
         rest = self.hazard, self.near[2], self.used, self.counts, awake
 
         def law(rate: np.ndarray) -> tuple[np.ndarray, ...]:
-            return _of_rates(*rest, np.maximum(rate, 1e-12))
+            return likelihood_of_rates(*rest, np.maximum(rate, 1e-12))
 
         whole = float(base.sum())
         return whole + (_at_best(*rest, self.best) if own else 0.0), law

@@ -72,7 +72,7 @@ def recall(name: str | None) -> CaptureReplicates | None:
     """The replicates of an entry; None where no such entry can be read."""
     if name is None:
         return None
-    path = _folder() / f"{name}{SUFFIX}"
+    path = nulls_folder() / f"{name}{SUFFIX}"
     try:
         found = unpacked(path.read_bytes())
         os.utime(path)
@@ -85,7 +85,7 @@ def keep(name: str | None, made: CaptureReplicates) -> None:
     """Write an entry. An error of the disk is ignored: the cache is no part of the result."""
     if name is None:
         return
-    folder = _folder()
+    folder = nulls_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         disk.put_file(folder / f"{name}{SUFFIX}", packed(made))
@@ -159,5 +159,6 @@ def _make_room(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _folder() -> Path:
+def nulls_folder() -> Path:
+    """Where summaries of replicates are kept from one command to the next."""
     return cache_folder() / "nulls"

@@ -279,7 +279,7 @@ class Scan:
             if candidate.strengths or candidate.fixed:
                 tries += [(candidate, tried) for tried in self.begun(evaluation, candidate)]
         if not everywhere and self.only_rates(evaluation):
-            out = self._by_totals(evaluation, tries)
+            out = self.trials_by_totals(evaluation, tries)
         else:
             some = [] if everywhere else self.most_informative(evaluation)
             still = still_valid(self, evaluation, tries, [t for t in known if t.seen], everywhere)
@@ -287,10 +287,12 @@ class Scan:
             tries = [t for t in tries if not any(is_same(one, *t) for one in old)]
             out = old + self._raised(evaluation, self._looked_at(evaluation, tries, some), some)
             out += self._lowered(evaluation, out, some)
-            out += self._further(evaluation, out, some)
+            out += self.stronger_trials(evaluation, out, some)
         return sorted(out, key=lambda t: -t.fall)
 
-    def _by_totals(self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]]) -> list[Trial]:
+    def trials_by_totals(
+        self, evaluation: Evaluation, tries: Sequence[tuple[Candidate, dict[Key, Any]]]
+    ) -> list[Trial]:
         """The trials by the closed forms of the totals, where nothing but totals fails; nothing is simulated."""
         out = []
         for candidate, tried in tries:
@@ -356,7 +358,7 @@ class Scan:
         )
         return [t for t in weaker_trials if size_of(self.replicates, evaluation, t.signature) > _LEAST_SIZE]
 
-    def _further(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
+    def stronger_trials(self, evaluation: Evaluation, tried: Sequence[Trial], some: Sequence[str]) -> list[Trial]:
         """Stronger trials for edges whose squares fall further at a larger strength: a blur is not proportional."""
         return self._onward(evaluation, tried, some, further, lambda t: t.fall > PROMISING and t.times > 1)
 

@@ -80,8 +80,8 @@ def p_of_any(
         values: the values of the model, SI.
         lines: the spectral lines of the data.
     """
-    data, own = _p_values(replicates, evaluation, tried)
-    p = _trials_corrected(own, min(data, default=1.0))
+    data, own = p_values(replicates, evaluation, tried)
+    p = trials_corrected(own, min(data, default=1.0))
     levels = count_model.light_levels_of(replicates, evaluation)
     maps = [
         p_of_map(replicates, evaluation, c, values, levels)
@@ -120,14 +120,14 @@ def p_of_best(
         others = sum(c.carrier is not None for c in replicates.candidates(evaluation.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.p_value, LEAST_P) / 2)), min(1.0, best.p_value * max(others, 1))
     directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
-    _, own = _p_values(replicates, evaluation, tried if directions else [best, *tried])
+    _, own = p_values(replicates, evaluation, tried if directions else [best, *tried])
     significance, found, _ = best_direction(replicates, evaluation, best)
     # the noise of a fitted signature, at a small strength, takes nothing from the p-value of a test that was sharper;
     # the significance is that of the fitted one, as of its rivals
     looks = [t for t in tried if t.sharp and t.candidate.name == best.candidate.name and not large]
-    sharper = min(_p_values(replicates, evaluation, looks)[0], default=1.0)
+    sharper = min(p_values(replicates, evaluation, looks)[0], default=1.0)
     if found.size <= 0:
-        return 0.0, max(_trials_corrected(own, sharper), LEAST_P)
+        return 0.0, max(trials_corrected(own, sharper), LEAST_P)
     sides = max(len(best.candidate.strengths) if _sided(best) else 1, 1)
     # no direction by itself may be significant, but all together
     together = min((p for p, _ in _p_values_of_group(replicates, evaluation, directions)), default=1.0)
@@ -135,7 +135,7 @@ def p_of_best(
     if large:  # far from the model the signature is not linear: the evidence itself, in the same units
         significance = max(significance, math.sqrt(max(best.evidence, 0.0) / max(found.spread**2, 0.5)))
     one = float(_p_of_square(significance**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
-    return significance, max(_trials_corrected(own, min(one, together, sharper)), LEAST_P)
+    return significance, max(trials_corrected(own, min(one, together, sharper)), LEAST_P)
 
 
 def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: Trial) -> bool:
@@ -162,7 +162,7 @@ def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: 
     return abs(fit - found.data) < (1 - least) * abs(found.data)
 
 
-def _p_values(replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial]) -> tuple[list[float], np.ndarray]:
+def p_values(replicates: Replicates, evaluation: Evaluation, tried: Sequence[Trial]) -> tuple[list[float], np.ndarray]:
     """(p-value of each candidate, (replicates,) the smallest p-value in each replicate).
 
     The directions of one candidate are tested together. A candidate without a signature has none.
@@ -182,7 +182,7 @@ def _p_values(replicates: Replicates, evaluation: Evaluation, tried: Sequence[Tr
 def _p_values_of_group(
     replicates: Replicates, evaluation: Evaluation, group: Sequence[Trial]
 ) -> Iterator[tuple[float, np.ndarray]]:
-    """As `_p_values`, of a candidate or of all directions of one, for each strength with a signature of its own."""
+    """As `p_values`, of a candidate or of all directions of one, for each strength with a signature of its own."""
     for times in _strengths(group[0]) if group else ():
         found = [score_test(replicates, evaluation, one.signature.at(times)) for one in group]
         found = [x for x in found if x.size > 0]
@@ -251,7 +251,7 @@ def _p_of_square(square: np.ndarray | float, directions: int, freedom: float) ->
     return np.asarray(stats.f.sf(np.asarray(square) * second / (directions * freedom), directions, second))
 
 
-def _trials_corrected(own: np.ndarray, least: float) -> float:
+def trials_corrected(own: np.ndarray, least: float) -> float:
     """The p-value of the smallest of many p-values.
 
     Args:

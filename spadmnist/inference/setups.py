@@ -165,7 +165,7 @@ def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[Set
                     seen.add((id, name))
                     factor_of: dict[str, float | None] = {"value": value, "low": low, "high": high}
                     if name == "exposure":
-                        factor_of = _of_exposure(replicates, evaluation, id, float(log), float(error))
+                        factor_of = exposure_factor(replicates, evaluation, id, float(log), float(error))
                     confused = len(likely) > 1 or len(names) > 1
                     out.append({"capture": id, "quantity": name, "factor": factor_of, "confused": confused})
         if number == 0 and one.cost < likely[-1].cost - TIE:
@@ -173,7 +173,7 @@ def entries(replicates: Replicates, evaluation: Evaluation, likely: Sequence[Set
     return out
 
 
-def _of_exposure(
+def exposure_factor(
     replicates: Replicates, evaluation: Evaluation, id: str, log: float, error: float
 ) -> dict[str, float | None]:
     """The factor on an exposure or a frame time that gives as many detections as one on the level, with its interval.

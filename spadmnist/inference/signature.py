@@ -183,7 +183,7 @@ def signatures(
             continue
         made = {id: next(results) for id in ids}
         try:
-            out.append(_signature(replicates, evaluation, sensors, made, kept))
+            out.append(signature_from(replicates, evaluation, sensors, made, kept))
         except UNABLE as error:
             out.append(CannotSimulate.because(error))
     return out
@@ -207,7 +207,7 @@ def _more_replicates(
         if (
             few
             and isinstance(one, CaptureReplicates)
-            and _mean_shift(_shift_of_totals(replicates, evaluation, sensors, id, one), evaluation.rates[id].scatter)
+            and mean_deviation(_shift_of_totals(replicates, evaluation, sensors, id, one), evaluation.rates[id].scatter)
         ):
             doubtful.append(k)
     for k in doubtful:
@@ -239,13 +239,21 @@ def _shift_of_totals(
     return np.asarray(apart)
 
 
-def _signature(
+def signature_from(
     replicates: Replicates,
     evaluation: Evaluation,
     sensors: Model,
     made: Mapping[str, CaptureReplicates | CannotSimulate],
     kept: Kept,
 ) -> Signature:
+    """The signature of a model from its replicates.
+
+    Args:
+        made: the replicates of some captures; the totals of the others are those of the closed form.
+        kept: see `signatures`.
+    Raises:
+        CannotSimulate: where a capture could not be simulated.
+    """
     shifts: dict[Cell, np.ndarray] = {}
     noise: dict[Cell, float] = {}
     logs = {}
@@ -263,7 +271,7 @@ def _signature(
         scattered = scattered or far_wider(float(np.std(apart)), null_total.scatter)
         if sensors.typical is None:
             slope = null_total.level_of(math.exp(math.log(null_total.expected(null_total.level))))[2]
-            logs[id] -= _mean_shift(apart, null_total.scatter) / max(slope, 0.05)
+            logs[id] -= mean_deviation(apart, null_total.scatter) / max(slope, 0.05)
         for name, values in other.values.items():
             cell = id, name
             if cell not in evaluation.residuals:
@@ -369,7 +377,7 @@ def template_of(replicates: Replicates, evaluation: Evaluation, signature: Signa
     return out
 
 
-def _mean_shift(apart: np.ndarray, scatter: float) -> float:
+def mean_deviation(apart: np.ndarray, scatter: float) -> float:
     """The mean deviation of log totals from the closed form; 0 where it may be noise.
 
     The closed form has no noise: it holds where the replicates do not contradict it. For a few replicates with about

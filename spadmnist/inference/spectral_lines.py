@@ -55,7 +55,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class _Spectrum:
+class CaptureSpectrum:
     """The spectrum of one capture.
 
     Attributes:
@@ -95,7 +95,7 @@ def spectral_lines(replicates: Replicates, evaluation: Evaluation) -> list[Line]
             evaluation.nulls[id, name], np.asarray(summary.values, float), z, replicates.seen[id].total
         )
         dark = replicates.seen[id].capture.light.dark
-        spectra.append(_Spectrum(np.asarray(summary.values, float), z, surprise, step, dark))
+        spectra.append(CaptureSpectrum(np.asarray(summary.values, float), z, surprise, step, dark))
     groups = [[s] for s in spectra]
     lit = [s for s in spectra if not s.dark]
     if len(lit) > 1:
@@ -147,7 +147,7 @@ def _around(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return total / kept / ratios[number], kept
 
 
-def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
+def _in(group: Sequence[CaptureSpectrum], groups: int) -> list[Line]:
     """The lines of some spectra together.
 
     Args:
@@ -167,13 +167,13 @@ def _in(group: Sequence[_Spectrum], groups: int) -> list[Line]:
     for k in np.argsort(log_p)[: 2 * _MOST]:
         if log_p[k] > math.log(_CLEAR):
             break
-        line = _line(group, float(grid[k]), float(log_p[k]))
+        line = fitted_line(group, float(grid[k]), float(log_p[k]))
         if line.frequency >= _LEAST_PERIODS * step:
             out.append(line)
     return out
 
 
-def _line(group: Sequence[_Spectrum], about: float, log_p: float) -> Line:
+def fitted_line(group: Sequence[CaptureSpectrum], about: float, log_p: float) -> Line:
     """The line at a frequency, fitted by the likelihood of the powers about it in all spectra that show it."""
     step = min(s.step for s in group)
     grid = about + step * np.linspace(-_WITHIN, _WITHIN, _PLACES)

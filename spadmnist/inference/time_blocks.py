@@ -62,7 +62,7 @@ def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:
         left = _with_halves(rung.left, residuals, apart)
         if rung.fit is not None:
             jacobian = _with_halves(
-                rung.fit.jacobian, _jacobian_of_halves(replicates, half, rung.fit.jacobian, apart), apart
+                rung.fit.jacobian, jacobian_of_halves(replicates, half, rung.fit.jacobian, apart), apart
             )
             left = held_out.leave_one_capture_out(_with_halves(rung.evaluation.residuals, residuals, apart), jacobian)
         rung.left, rung.misfit = left, mean_misfit(own, left)
@@ -115,7 +115,7 @@ def _with_halves(
     }
 
 
-def _jacobian_of_halves(
+def jacobian_of_halves(
     replicates: Replicates, half: Replicates, jacobian: Mapping[Cell, np.ndarray], apart: Collection[str]
 ) -> dict[Cell, np.ndarray]:
     """The Jacobian of the halves, (cells, coordinates) by block.
@@ -131,13 +131,13 @@ def _jacobian_of_halves(
                 continue
             out[name, statistic] = new = np.zeros((len(here.values), whole.shape[1]))
             if not law_of(here.law, here.scale is not None).spectrum:
-                mine, its = _same_places(here, there)
+                mine, its = same_places(here, there)
                 share = half.seen[name].total / max(replicates.seen[id].total, 1.0)
                 new[mine] = whole[its] * math.sqrt(share)
     return out
 
 
-def _same_places(here: Summary, there: Summary) -> tuple[np.ndarray, np.ndarray]:
+def same_places(here: Summary, there: Summary) -> tuple[np.ndarray, np.ndarray]:
     """(cells here, cells there) at the same place on the axis."""
     if len(here.values) == len(there.values):
         return np.arange(len(here.values)), np.arange(len(here.values))

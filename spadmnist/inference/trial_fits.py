@@ -66,7 +66,7 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
         return _fit_phases(replicates, evaluation, one)
     given = one.scaled()
     coordinates = [d for d in one.candidate.coordinates if d.key in given and not d.whole]
-    boost, power = _boost(replicates, evaluation, one, given)
+    boost, power = boost_of(replicates, evaluation, one, given)
     template = template_of(replicates, evaluation, one.signature.at(one.times))
     # the squares that a faint effect leaves are those of this fit, and a whole number is not fitted again
     if boost > 1 or any(coordinate.whole for coordinate in one.candidate.coordinates):
@@ -88,10 +88,10 @@ def fit_trial(replicates: Replicates, evaluation: Evaluation, one: Trial, rounds
     found = fit(given)
     for coordinate in one.candidate.coordinates:
         if coordinate.whole and coordinate.key in given:
-            found, intervals = _fit_whole_number(found, coordinate, lambda v: fit(v, 2))
+            found, intervals = fit_whole_number(found, coordinate, lambda v: fit(v, 2))
             one.intervals |= intervals
-    if boost == 1 and _fails_own_checks(replicates, evaluation, one, found, some):
-        probed = _probe(replicates, evaluation, one, found, some, names)
+    if boost == 1 and fails_own_checks(replicates, evaluation, one, found, some):
+        probed = fit_by_probes(replicates, evaluation, one, found, some, names)
         found = probed if probed is found else _strengths_anew(one, probed, fit)
     one.faint = boost > 1
     one.sensors = evaluation.sensors.changed(found.values, one.phases, one.chips)
@@ -120,7 +120,7 @@ def _statistics_of(
     return sorted(failed.union(statistics_showing(template, *_HARDLY)))
 
 
-def _fails_own_checks(
+def fails_own_checks(
     replicates: Replicates, evaluation: Evaluation, one: Trial, found: Fit, only: Collection[str]
 ) -> bool:
     """Whether a check fails at the fitted values, of those with a signature.
@@ -134,7 +134,9 @@ def _fails_own_checks(
     return any(float(template[cell] @ template[cell]) > 1 for cell in own if cell in template)
 
 
-def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Mapping[Key, Any]) -> tuple[float, float]:
+def boost_of(
+    replicates: Replicates, evaluation: Evaluation, one: Trial, given: Mapping[Key, Any]
+) -> tuple[float, float]:
     """(factor by which a faint effect is simulated stronger, power with which its signature grows).
 
     (1, 1) where there is no such power: an edge moves, and a large effect saturates.
@@ -164,7 +166,7 @@ def _boost(replicates: Replicates, evaluation: Evaluation, one: Trial, given: Ma
     return (boost, power) if _POWERS[0] < power < _POWERS[1] else (1.0, 1.0)
 
 
-def _probe(
+def fit_by_probes(
     replicates: Replicates,
     evaluation: Evaluation,
     one: Trial,
@@ -293,7 +295,7 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     return one
 
 
-def _fit_whole_number(
+def fit_whole_number(
     found: Fit, coordinate: Coordinate, fit: Callable[[Mapping[Key, Any]], Fit]
 ) -> tuple[Fit, dict[Key, tuple[float, float]]]:
     """(best fit with a whole number, intervals by coordinate).

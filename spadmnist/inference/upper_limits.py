@@ -58,7 +58,7 @@ def upper_limits(
         (name, n): shape
         for name, all_ in shapes.items()
         for n, shape in enumerate(all_.values())
-        if shape is max(all_.values(), key=_strength_at_limit) or min(s[1] for s in all_.values()) > _SATURATED
+        if shape is max(all_.values(), key=strength_at_limit) or min(s[1] for s in all_.values()) > _SATURATED
     }
     times_of = _at_limit(scan, evaluation, asked)
     excluded, hidden = [], []
@@ -81,7 +81,7 @@ def upper_limits(
     return excluded, [{"effect": name} for name in sorted(hidden)], [{"effect": name} for name in sorted(others)]
 
 
-def _strength_at_limit(shape: _Shape) -> float:
+def strength_at_limit(shape: _Shape) -> float:
     """The distance of the strength from where the effect vanishes, at the limit of one shape."""
     times, _, one = shape
     coordinate = one.candidate.strengths[0]
