@@ -59,12 +59,18 @@ class Summary:
         """The same, but of a nested cell what it does not share with the one before: cells that are independent."""
         if self.nested is None:
             return self
-        shared, new = self.nested[1:], np.array(self.values, np.float64)
-        new[1:] = (new[1:] - shared * new[:-1]) / np.sqrt(1.0 - shared**2)
-        where = self.where
-        return replace(
-            self, values=new, where=lambda cell: where(cell) + ", beyond that in half of it" * (cell > 0), nested=None
-        )
+        shared, old, new = self.nested[1:], np.array(self.values, np.float64), np.array(self.values, np.float64)
+        root = np.append(1.0, np.sqrt(1.0 - shared**2))
+        new[1:] = (new[1:] - shared * new[:-1]) / root[1:]
+        where, size = self.where, self.size
+
+        def whole(cell: int, measured: float, expected: float) -> tuple[str, float]:
+            """The size of the whole score of a cell, of which `measured` is what it does not share."""
+            score = float(old[cell] + (measured - new[cell]) * root[cell])
+            return size(cell, score, score - float((measured - expected) * root[cell]))
+
+        beyond = ", beyond that in half of it"
+        return replace(self, values=new, where=lambda cell: where(cell) + beyond * (cell > 0), size=whole, nested=None)
 
 
 class Statistic(Plugin, abstract=True):

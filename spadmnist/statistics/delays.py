@@ -70,7 +70,8 @@ class Delays(Statistic):
         counts = steps.joined(counts)
         most = counts.max(axis=1)
         chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
-        scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
+        share = shares(np.append(recording.totals, most), most.size)  # another one for every recording
+        scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, share)
 
         def where(cell: int) -> str:
             k = int(counts[cell].argmax())

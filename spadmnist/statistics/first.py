@@ -169,8 +169,8 @@ def _arrivals(offsets, stamps, pixels, first, late, edges, bin_of, kind, last, c
         frame = first + f
         for i in range(offsets[f], offsets[f + 1]):
             stamp, p = np.int64(stamps[i]), pixels[i]
-            if frame > 0:  # nothing is known of the frame before the first
-                k = bin_of[stamp] if bin_of.size else np.searchsorted(edges, stamp, side="right") - 1
-                counts[kind[p] if last[p] == frame - 1 else 0, k] += 1
+            k = bin_of[stamp] if bin_of.size else np.searchsorted(edges, stamp, side="right") - 1
+            # before the first frame there was none
+            counts[kind[p] if frame > 0 and last[p] == frame - 1 else 0, k] += 1
             kind[p] = 2 if stamp >= late else 1
             last[p] = frame

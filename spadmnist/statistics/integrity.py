@@ -115,7 +115,8 @@ class RepeatedFrames(Statistic):
 
     A repetition counts where its probability over the capture, from the pixels' own shares of detections, is below
     1e-9. With few pixels or few detections frames repeat by chance (see `rare_frames`). STR: all stamps are equal.
-    Law: exact. There are none.
+    Law: exact. There are none, except where the light goes out at times and empty frames follow each other: of such a
+    model their number is a Poisson count.
     Shows: frames that were read out or stored twice.
     """
 

@@ -304,10 +304,10 @@ def _dithered(recording: Recording) -> tuple[np.ndarray, float]:
 
 
 class Outliers(Statistic):
-    """Number of pixels far below or above the middle of the array.
+    """Number of pixels far below or above the typical pixel.
 
-    Cells: below 1/4, 1/2 and 3/4, and above 1.33, 2, 4 and 10 times the middle. The middle is the mean without the
-    lowest and the highest tenth of the pixels (at least two detections). Rates are corrected for saturation and dead
+    Cells: below 1/4, 1/2 and 3/4, and above 1.33, 2, 4 and 10 times the typical pixel: the mean without the lowest and
+    the highest tenth of the pixels (at least two detections). Rates are corrected for saturation and dead
     time.
     Law: Poisson where counting noise decides; pixels that a map puts there scatter less.
     Shows: lazy and dead pixels (below), hot pixels (above), a PDP spread of tens of per cent.
@@ -332,16 +332,16 @@ class Outliers(Statistic):
         return Summary(
             np.concatenate([low, high]).astype(np.float64),
             "poisson",
-            lambda cell: f"pixels {edges[cell]} times the middle of the array",
+            lambda cell: f"pixels {edges[cell]} times the typical pixel",
             size,
         )
 
 
 class Tails(Statistic):
-    """Mean rate of the lowest and of the highest pixels relative to the middle of the array.
+    """Mean rate of the lowest and of the highest pixels relative to the typical pixel.
 
-    Cells: the lowest and the highest quarter, twelfth, and so on by threes, of at least 16 pixels each. The middle is
-    the mean without the lowest and the highest tenth (at least two detections). Rates are corrected for saturation and
+    Cells: the lowest and the highest quarter, twelfth, and so on by threes, of at least 16 pixels each. The typical
+    pixel is the mean without the lowest and the highest tenth (at least two detections). Rates are corrected for saturation and
     dead time.
     Law: normal, for means of many pixels. Of the highest pixels the logarithm is taken, because they are skewed.
     Shows: PDP spread (both sides), lazy pixels (low side), a spread of dark count rates or hot pixels (high side).
@@ -368,7 +368,7 @@ class Tails(Statistic):
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             if cell >= len(sizes):
                 measured, expected = np.exp(measured), np.exp(expected)
-            return f"{measured:.4g} times the middle, {expected:.4g} expected", float(measured - expected)
+            return f"{measured:.4g} times the typical pixel, {expected:.4g} expected", float(measured - expected)
 
         return Summary(values, "normal", lambda cell: names[cell], size)
 

@@ -13,6 +13,7 @@ from simple_sensor import FRAME, counted, grid, many, one_of_each, qis, qis_of, 
 
 from spadmnist.events import Layout
 from spadmnist.recording import Recording
+from spadmnist.statistics import Summary
 from spadmnist.statistics.fano import ArrayFano, PixelFano, event_pairs, frame_pairs
 
 KINDS = ("tr", "tr without ticks", "qis", "str", "counts", "counter")
@@ -287,3 +288,20 @@ def test_the_cells_do_not_depend_on_the_data(statistic: type) -> None:
     assert statistic().reduce(qis(1, (15, 4, 4), 0.5)) is None
     # the shortest exposures have at least one window
     assert len(reduced(statistic, tr(1, grid(2, 2), 1e6, 5e-6)).values) == 1
+
+
+def test_the_size_of_a_nested_cell_is_that_of_its_whole_score() -> None:
+    """Scores of 40 and 40 that share 0.7 of their scatter: the second one's own part is 17, its size that of 40."""
+    values = np.array([40.0, 40.0])
+    sizes: list[tuple[float, float]] = []
+
+    def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
+        sizes.append((measured, expected))
+        return "", measured - expected
+
+    summary = Summary(values, "normal", str, size, nested=np.array([0.0, 0.7])).apart()
+    own = (40 - 0.7 * 40) / math.sqrt(1 - 0.7**2)
+    assert summary.values.tolist() == pytest.approx([40.0, own])
+    summary.size(0, 40.0, 1.0)
+    summary.size(1, own, 0.0)
+    assert sizes[0] == pytest.approx((40.0, 1.0)) and sizes[1] == pytest.approx((40.0, 0.7 * 40))

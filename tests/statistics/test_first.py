@@ -27,7 +27,8 @@ def test_a_small_recording(share: float, tick: float, monkeypatch: pytest.Monkey
     coarse = np.rint(np.linspace(0, none, 41))
     edges = np.unique([*np.rint(np.linspace(0, coarse[1], 9)), *coarse])
     counts = np.zeros((3, len(edges) - 1))
-    for before, now in itertools.pairwise(stamps):
+    nothing = np.full((1, 35), none)  # before the first frame
+    for before, now in itertools.pairwise(np.concatenate([nothing, stamps])):
         for a, b in zip(before, now, strict=True):
             if b < none:
                 kind = 0 if a == none else 2 if a >= round(0.9 * none) else 1
@@ -143,3 +144,9 @@ def test_a_short_gate_and_what_a_frame_leaves_to_the_next_are_seen() -> None:
     pulses[1:] = np.minimum(stamps[1:], early)
     found = sigmas(FirstArrivals, str_of(pulses, 1e-9), STEADY).reshape(3, 47)
     assert found[1, 4] > 10 and np.abs(found[0]).max() < 5
+
+
+def test_one_frame_is_looked_at_as_well() -> None:
+    recording = stamped(3, (1, 40, 40), 0.3, 1e-9)
+    summary = reduced(FirstArrivals, recording)
+    assert summary.values.sum() == recording.totals.sum() > 300

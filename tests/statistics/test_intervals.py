@@ -163,7 +163,7 @@ def test_cells_belong_to_the_conditions() -> None:
         assert len({len(reduced(Intervals, r).values) for r in made}) == 1
         assert EdgeIntervals().reduce(made[0]).values.sum() == 0  # type: ignore[union-attr]
         assert reduced(Rescaled, made[0]).values.tolist() == [0.0] * 20
-        assert RescaledLag().reduce(made[0]) is None
+        assert len(reduced(RescaledLag, made[0]).values) == 6
         assert EarlyIntervals().reduce(made[0]) is None  # of four pixels
         few = [tr(1, grid(4, 4), rate, 1e-3, dead_time, tick=tick) for rate in (0.0, 1e3, 1e5)]
         early = [EarlyIntervals().reduce(recording) for recording in few]
