@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import spadmnist as sp
 from spadmnist import config, measurement, plugins, sensor_file
 from spadmnist.effects import Effect
 from spadmnist.inference.candidates import candidates
@@ -99,6 +100,21 @@ def test_candidates_come_from_the_registry(tmp_path):
             kind = Effect.registry.find(name)
             can = [p for p in kind.parameters.values() if p.off is not None and p.search is not None]
             assert bool(can and not kind.of_scene) == (f"add {name}" in names), name
+
+
+def test_a_number_that_needs_another_one_comes_with_it() -> None:
+    """The reach of crosstalk matters where it has a far part: both are one candidate, and none of an added effect."""
+
+    def of(*more: Effect) -> dict[str, list[str]]:
+        effects = [sp.effects.Detection(pdp=0.3), *more]
+        sensor = sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), effects, rules="device").resolved()
+        return {c.name: [d.parameter for d in c.coordinates] for c in candidates(sensor)}
+
+    assert of()["add crosstalk"] == ["probability", "diagonal_ratio", "delay"]
+    near, far = of(sp.effects.Crosstalk()), of(sp.effects.Crosstalk(reach=5.0, far_ratio=0.1))
+    assert near["set crosstalk.far_ratio"] == ["far_ratio", "reach"] and near["set crosstalk.reach"] == ["reach"]
+    assert far["set crosstalk.far_ratio"] == ["far_ratio"] and far["set crosstalk.reach"] == ["reach"]
+    assert of(sp.effects.Jitter())["set jitter.tail_weight"] == ["tail_weight", "tail"]
 
 
 def test_the_next_sensor_is_the_users_own_file(tmp_path):

@@ -46,6 +46,7 @@ def lit(id: str, modality: Any, rate: float, **more: Any) -> Capture:
 
 FRAMES = {"frames": 1000, "frame_time": FRAME}
 COUNTER = {**FRAMES, "bits": 4, "counting": "counter"}
+GAPS = {"frames": 2000, "frame_time": FRAME, "frame_period": 4 * FRAME, "bits": 8, "counting": "counter"}
 BUS = ReadoutLoss(service_time=1e-6, queue=4.0)
 RIGHT: dict[str, tuple[sp.Sensor, list[Capture]]] = {
     "no stamp": (
@@ -66,6 +67,10 @@ RIGHT: dict[str, tuple[sp.Sensor, list[Capture]]] = {
     "sums of 255 that are full": (
         sensor(ticks=False),
         [lit("f", "counts", 8.5e5, frames=255 * 12, frame_time=FRAME, bits=8)],
+    ),
+    "counters with gaps between frames": (
+        sensor(ticks=False, dark=1e4),
+        [sp.Capture("dark", "counts", dark=True, **GAPS), lit("f", "counts", 1e5, **GAPS)],
     ),
     "a bus at 0.8": (sensor(BUS), [lit("f", "tr", 0.8e6 / 16, exposure=2e-2)]),
     "a bus at 1": (sensor(BUS), [lit("f", "tr", 1e6 / 16, exposure=2e-2)]),
@@ -137,6 +142,38 @@ def test_the_closed_form_of_a_full_counter_has_its_elasticity() -> None:
     form = closed_form(sensor(ticks=False).resolved(), capture)
     assert form(1e7) == pytest.approx(16 * 1000 * 7, rel=0.01)  # 7 is the most
     assert form(1e3) / form(5e2) == pytest.approx((1e3 * 0.3 + 100) / (5e2 * 0.3 + 100), rel=1e-3)
+
+
+@pytest.mark.parametrize("modality", ["qis", "str", "counts"])
+def test_the_closed_form_counts_nothing_in_the_gaps_between_frames(modality: str) -> None:
+    frames = GAPS if modality == "counts" else {k: GAPS[k] for k in ("frames", "frame_time", "frame_period")}
+    capture, model = lit("f", modality, 1e4, **frames), sensor(dark=1e4, ticks=modality == "str")
+    level = 1e4 / 0.3
+    expected = closed_form(model.resolved(), capture)(level)
+    totals = [float(sp.simulate(model, [capture], seed=k).recording("f").totals.sum()) for k in range(20)]
+    assert np.mean(totals) == pytest.approx(expected, abs=4.9 * math.sqrt(expected / 20))  # 5 sigma: 1e-6
+    dense = closed_form(model.resolved(), lit("f", modality, 1e4, **{**frames, "frame_period": FRAME}))(level)
+    assert expected == pytest.approx(dense, rel=1e-9)
+
+
+def test_a_capture_whose_counters_are_full_tells_nothing_of_the_pixels() -> None:
+    """5 % of PDP spread, seen by a flat of 5000 counts a pixel, beside one in which every counter is full."""
+    pdp = 0.3 * np.exp(0.05 * np.random.default_rng(4).standard_normal(64))
+    bare = sensor(ticks=False, side=8)
+    frames = {**FRAMES, "bits": 8, "counting": "counter", "relative_uncertainty": 0.0}
+    plan = [
+        sp.Capture("good", "counts", wavelength=500e-9, irradiance=irradiance(5e5), **frames),
+        sp.Capture(
+            *("full", "counts"),
+            wavelength=500e-9,
+            irradiance=irradiance(4e6),
+            **{**frames, "frames": 20, "frame_time": 2e-4},
+        ),
+    ]
+    made = bare.with_values({"detection.relative": pdp / 0.3})
+    fit = sp.fit(bare, sp.simulate(made, plan, seed=3), per_pixel=["detection.pdp"], jobs=1)
+    sigma = fit.steps[0].values["sigma"]
+    assert 0.035 < sigma.value < 0.07, sigma
 
 
 @pytest.mark.parametrize("kept", [0, 1, 5, 20])

@@ -109,6 +109,13 @@ class Conditions:
         return self.frames if self.counting == "counter" else self.frames // max(1, self.largest_count)
 
     @property
+    def without_gaps(self) -> Conditions:
+        """The same frames without gaps between them: the exposure is the time in which something is recorded."""
+        if self.frame_period == self.frame_time:
+            return self
+        return replace(self, frame_period=self.frame_time, exposure=self.frames * self.frame_time)
+
+    @property
     def dark(self) -> bool:
         """No light falls on the sensor."""
         return self.wavelength is None

@@ -28,7 +28,7 @@ class Crosstalk(Effect, stage="correlated"):
     """
 
     counted = True
-    moves = ("neighbours", "ceiling", "level", "dark_level")
+    moves = ("neighbours", "far_pairs", "ceiling", "level", "dark_level")
 
     probability = parameter(
         0.002,
@@ -51,13 +51,21 @@ class Crosstalk(Effect, stage="correlated"):
         search=(20e-12, 1e-6),
     )
     reach = parameter(
-        1.5, "", "distance of the farthest pixels that are fired, pitches; 1.5: side and diagonal", bounds=(1, None)
+        1.5,
+        "",
+        "distance of the farthest pixels that are fired, pitches; 1.5: side and diagonal",
+        bounds=(1, None),
+        search=(1.5, 12),
+        kind="count",
+        needs="far_ratio",
     )
     far_ratio = parameter(
         0.0,
         "",
         "lower bound of d K(d) beyond the diagonal",
         bounds=(0, 1),
+        off=0.0,
+        search=(0.003, 1),
     )
 
     def chance(self, distance: np.ndarray) -> np.ndarray:

@@ -186,7 +186,10 @@ def _settings(effect: Effect) -> Iterator[Candidate]:
             continue  # a periodic effect at another frequency is another candidate
         low, high = _about(value, declared)
         coordinate = replace(coordinate_of(effect.name, declared, float(value)), low=float(low), high=float(high))
-        yield Candidate("set", effect.name, name, (coordinate,))
+        # what does nothing without this parameter has had no value so far
+        idle = [p for p in effect.parameters.values() if p.needs == name and _numeric(p) and p.per in ("", "pixel")]
+        shapes = tuple(coordinate_of(effect.name, p, None) for p in idle) if value == declared.off else ()
+        yield Candidate("set", effect.name, name, (coordinate,), shapes)
 
 
 def _about(value: float, declared: Parameter) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from scipy import stats
 from ..sensor import Sensor
 from .candidates import with_values
 from .coordinates import Key
-from .light_levels import in_frames
+from .light_levels import in_frames, pixel_counts
 from .models import InTheDark
 from .replicates import Replicates
 
@@ -38,12 +38,9 @@ class CountModel:
         """The expected detections of each pixel, (pixels,)."""
         if self.seen.capture.light.dark:
             sensor = InTheDark.of(sensor)
-        light = np.full((1, sensor.layout.pixels), self.level)
-        if self.seen.capture.counts_events:
-            return np.maximum(sensor.expected(light, self.conditions)[1][0], 1e-9)
-        share = in_frames(sensor, light, self.conditions)[0]
         if self.waited is None:
-            return np.maximum(self.conditions.frames * share, 1e-9)
+            return np.maximum(pixel_counts(sensor, self.seen.capture)(self.level), 1e-9)
+        share = in_frames(sensor, np.full((1, sensor.layout.pixels), self.level), self.conditions)[0]
         return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-15)), 1e-9))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
@@ -81,18 +78,20 @@ class CountModel:
         """
         return self.frames and float(np.median(counts)) > 0.9 * self.conditions.frames
 
-    def variance(self, n: np.ndarray, dead: float) -> np.ndarray:
+    def variance(self, n: np.ndarray, dead: float, least: float = 0.25) -> np.ndarray:
         """The variance of the counts, (pixels,).
 
         Args:
             n: (pixels,) expected detections.
             dead: dead time, s.
+            least: of the variance.
         """
         if self.waited is not None:
-            return np.maximum(n, 0.25)
+            return np.maximum(n, least)
         if self.frames:
-            return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), 0.25)
-        return np.maximum(n * (1 - np.minimum(n * dead / self.conditions.exposure, 0.99)) ** 2, 0.25)
+            return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), least)
+        live = self.conditions.without_gaps.exposure
+        return np.maximum(n * (1 - np.minimum(n * dead / live, 0.99)) ** 2, least)
 
 
 def expected_counts(replicates: Replicates, id: str, evaluation: Any, values: Mapping[Key, Any]) -> np.ndarray:

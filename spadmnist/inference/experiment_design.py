@@ -96,6 +96,8 @@ def _longer(capture: Capture, rate: float, words: str, like: str) -> Iterator[tu
         yield f"{words}, {units.show(most, 's', 3)}", replace(capture, conditions=replace(c, exposure=most)), like
         return
     frames = int(min(most, _MOST_FRAMES * c.exposure) / c.frame_period)
+    if capture.modality == "counts" and c.counting == "frames":  # whole counts
+        frames -= frames % c.largest_count
     longer = replace(c, frames=frames, exposure=frames * c.frame_period)
     yield f"{words}, {frames} frames", replace(capture, conditions=longer), like
 

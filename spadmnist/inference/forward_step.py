@@ -26,6 +26,7 @@ from .results import title
 from .score_test import explains_its_signature, p_of_best
 from .trial import Trial, is_pattern, tie
 from .trial_fits import fit_trial
+from .whole_numbers import refit_whole_numbers
 
 CLOSER = REPLICATES  # replicates of each capture for a closer look: as many as without `quick`
 # of the excess misfit: a step that leaves as many failing checks, and does not explain its own cells, falls short
@@ -336,6 +337,7 @@ def complete(path: ModelPath) -> bool:
     if not path.is_rough:
         return False
     complete_fit(path)
+    refit_whole_numbers(path)
     if path.steps:
         path.last_rung()
     return not path.is_rough

@@ -10,7 +10,7 @@ import decimal
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -249,20 +249,33 @@ def last_digit(value: float) -> float:
 
 def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
     """The function level -> detections of the whole array, by the effects' closed forms."""
-    conditions = capture.conditions
+    counts = pixel_counts(sensor, capture)
 
     @functools.lru_cache(maxsize=4096)
     def detections(level: float) -> float:
+        return max(float(counts(level).sum()), 1e-9)
+
+    return detections
+
+
+def pixel_counts(sensor: Sensor, capture: Capture) -> Callable[[float], np.ndarray]:
+    """The function level -> (pixels,) expected detections of each pixel, by the effects' closed forms.
+
+    Nothing is recorded in gaps between frames, and no counter counts beyond its largest count.
+    """
+    conditions = capture.conditions
+
+    def counts(level: float) -> np.ndarray:
         light = np.full((1, sensor.layout.pixels), level)
         if capture.counts_events:
-            made = sensor.expected(light, conditions)[1]
+            made = sensor.expected(light, conditions.without_gaps)[1][0]
         else:
-            made = conditions.frames * in_frames(sensor, light, conditions)
+            made = conditions.frames * in_frames(sensor, light, conditions)[0]
         if full is not None:
-            mean = made.ravel() / conditions.count_frames
+            mean = made / conditions.count_frames
             if np.any(mean + 10 * np.sqrt(mean) + 10 > full):  # otherwise none is full
                 made = in_counters(mean, full, slots) * conditions.count_frames
-        return max(float(made.sum()), 1e-9)
+        return np.asarray(made)
 
     full, slots = None, math.inf
     if capture.modality == "counts":
@@ -270,7 +283,7 @@ def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
         if conditions.counting == "frames":
             slots = float(conditions.largest_count)
             full = full if np.any(full < slots) else None  # by itself a sum of binary frames does not pile up
-    return detections
+    return counts
 
 
 def in_counters(mean: np.ndarray, full: np.ndarray, slots: float) -> np.ndarray:
@@ -298,9 +311,7 @@ def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.n
     Args:
         light: (images, pixels) photons/s.
     """
-    # without gaps between frames: nothing is recorded in them
-    live = replace(conditions, frame_period=conditions.frame_time, exposure=conditions.frames * conditions.frame_time)
-    candidates, _ = sensor.expected(light, live)
+    candidates, _ = sensor.expected(light, conditions.without_gaps)
     return np.asarray(-np.expm1(-candidates / conditions.frames))
 
 
