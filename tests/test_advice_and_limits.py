@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
 from spadmnist.inference import conclusion
@@ -18,9 +19,11 @@ from spadmnist.inference.comparison import compare
 from spadmnist.inference.conclusion import Notes, verdict_of
 from spadmnist.inference.coordinates import Key
 from spadmnist.inference.elimination import drop_needless, drop_unexplaining, no_step_explains
+from spadmnist.inference.error_budget import from_the_others, rms_beyond_noise
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import evidence_of
 from spadmnist.inference.experiment_design import between, expected_significance
+from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.map_trials import random_map_trials
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose
@@ -29,7 +32,7 @@ from spadmnist.inference.results import Step, canonical
 from spadmnist.inference.score_test import ScoreTest, p_of_best, score_test
 from spadmnist.inference.signature import Signature, captures_showing, residuals_at, signatures, template_of
 from spadmnist.inference.trial import Trial, tie
-from spadmnist.inference.upper_limits import upper_limits
+from spadmnist.inference.upper_limits import share_beside, upper_limits
 
 # --- which capture would tell ------------------------------------------------------------------------------------
 
@@ -404,4 +407,54 @@ def test_of_several_strengths_the_clearest_tells_the_limit(lab, monkeypatch, ord
 
     monkeypatch.setattr("spadmnist.inference.upper_limits.score_test", scored)
     (excluded,), hidden, _ = upper_limits(quiet(replicates), evaluation, tried[::order])
-    assert not hidden and excluded["upper_limit_95"] == pytest.approx(1.645 / 20 * 5e-9, rel=1e-6)
+    quantile = stats.t.isf(0.05, 15)
+    assert not hidden and excluded["upper_limit_95"] == pytest.approx(quantile / 20 * 5e-9, rel=1e-6)
+
+
+@pytest.mark.parametrize("score", [-3.0, 0.0, 3.0])
+def test_the_limit_of_either_sign_is_that_of_the_farther_side(lab, monkeypatch, score: float) -> None:
+    replicates = bench_of(lab())
+    evaluation, candidate = evaluate(replicates, {}), change_of(replicates, "add source_drift")
+    tried = [Trial(candidate, {candidate.strengths[0].key: 0.1}, Signature({}, {}, {"flat": 1.0}), 0.0, 1.0)]
+    monkeypatch.setattr(
+        "spadmnist.inference.upper_limits.score_test", lambda *_: ScoreTest(20.0, score, np.zeros(16), 1.0, 15.0)
+    )
+    (excluded,), hidden, _ = upper_limits(quiet(replicates), evaluation, tried)
+    wanted = (abs(score) + stats.t.isf(0.025, 15)) / 20 * 0.1
+    assert not hidden and excluded["upper_limit_95"] == pytest.approx(wanted, rel=1e-6)
+
+
+def test_a_limit_beside_a_fit_is_profiled_over_its_numbers(lab) -> None:
+    """A fitted number whose signature has the cosine 0.99 with an effect's: the limit is seven times as large."""
+    replicates = bench_of(lab())
+    evaluation, look, candidate = evaluate(replicates, {}), quiet(replicates), change_of(replicates, "add crosstalk")
+    tried = look.looked_at(evaluation, candidate, look.begun(evaluation, candidate)[:1])
+    template = template_of(replicates, evaluation, tried[0].signature)
+    keys = list(evaluation.residuals)
+    t = np.concatenate([template.get(k, np.zeros(len(evaluation.residuals[k]))) for k in keys])
+    other = np.random.default_rng(1).standard_normal(t.size)
+    other -= t * (t @ other) / (t @ t)
+    column = 0.99 * t / np.linalg.norm(t) + math.sqrt(1 - 0.99**2) * other / np.linalg.norm(other)
+    ends = np.cumsum([len(evaluation.residuals[k]) for k in keys])[:-1]
+    jacobian = {k: x[:, None] for k, x in zip(keys, np.split(column, ends), strict=True)}
+    known = change_of(replicates, "set dead_time.duration").coordinates
+    fit = Fit(known, np.zeros(1), np.eye(1), evaluation.residuals, jacobian, 0.0, {})
+    assert share_beside(fit, evaluation, template) == pytest.approx(math.sqrt(1 - 0.99**2), rel=1e-6)
+    limits = [upper_limits(look, evaluation, tried, one)[0][0]["upper_limit_95"] for one in (None, fit)]
+    assert limits[1] > 5 * limits[0]
+    same = replace(fit, jacobian={k: template.get(k, np.zeros(len(evaluation.residuals[k])))[:, None] for k in keys})
+    excluded, hidden, _ = upper_limits(look, evaluation, tried, same)
+    assert not excluded and hidden == [{"effect": "crosstalk"}]  # these captures cannot tell the two
+
+
+# --- physical errors -------------------------------------------------------------------------------------------------
+
+
+def test_two_lit_captures_differ_by_all_of_their_difference() -> None:
+    assert np.abs(from_the_others(np.array([0.0, 0.02]))).tolist() == pytest.approx([0.02, 0.02])
+    assert from_the_others(np.array([0.0, 0.02, 0.5]))[2] == pytest.approx(0.49)
+
+
+def test_noise_is_no_error_of_a_rate() -> None:
+    assert rms_beyond_noise(np.array([0.3, 0.0]), np.array([0.4, 0.0])) == 0.0
+    assert rms_beyond_noise(np.array([0.5, 0.5]), np.array([0.3, 0.3])) == pytest.approx(0.4)

@@ -72,9 +72,9 @@ def physical_errors(
 ) -> dict[str, float]:
     """The physical errors of a model, relative, by name; of what was not measured there is none.
 
-    The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates.
-    linearity: the largest deviation of a lit one from the others. The others are those of statistics
-    (`Statistic.physical_error`), in the mean over the captures.
+    The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates,
+    beyond that of their noise. linearity: the largest deviation of a lit capture from the median of the other ones, its
+    noise included. The others are those of statistics (`Statistic.physical_error`), in the mean over the captures.
 
     Args:
         residuals: (cells,) by block.
@@ -93,16 +93,14 @@ def physical_errors(
             x = x + np.array([shift.logs.get(i, 0.0) for i in ids])
         lit = np.array([not replicates.seen[i].capture.light.dark for i in ids], bool)
         width = float(common.max())
+        noise = np.array([level_error(replicates, evaluation, i) for i in ids])
         if lit.any() and width > 0:
-            weight = (
-                1
-                / np.array([level_error(replicates, evaluation, i) for i, on in zip(ids, lit, strict=True) if on]) ** 2
-            )
+            weight = 1 / noise[lit] ** 2
             light = float(weight @ x[lit]) / float(weight.sum() + 1 / width**2)
             x = x - light * lit
-        errors["mean_rate"] = float(np.sqrt(np.mean((x * elasticities) ** 2)))
+        errors["mean_rate"] = rms_beyond_noise(x * elasticities, noise * elasticities)
         if lit.sum() > 1:
-            errors["linearity"] = float(np.max(np.abs((x[lit] - np.median(x[lit])) * elasticities[lit])))
+            errors["linearity"] = float(np.max(np.abs(from_the_others(x[lit])) * elasticities[lit]))
     shares: dict[str, list[float]] = {}
     for cell, z in residuals.items():
         if cell == TOTALS or not (statistic := Statistic.registry.find(cell[1])).error:
@@ -121,6 +119,20 @@ def physical_errors(
         shares.setdefault(statistic.error, []).append(error)
     whole = errors | {k: float(np.mean(v)) for k, v in shares.items()}
     return {k: plain(v) for k, v in whole.items()}
+
+
+def rms_beyond_noise(deviations: np.ndarray, noise: np.ndarray) -> float:
+    """The root mean square of deviations beyond that of their noise, at least 0.
+
+    Args:
+        noise: its standard deviation, as `deviations`.
+    """
+    return math.sqrt(max(float(np.mean(deviations**2 - noise**2)), 0.0))
+
+
+def from_the_others(values: np.ndarray) -> np.ndarray:
+    """The deviation of each of at least two values from the median of the others."""
+    return np.array([x - np.median(np.delete(values, i)) for i, x in enumerate(values)])
 
 
 def placebo_of(

@@ -177,7 +177,7 @@ def _diagnosed(
         with or_as_before(path, "the upper limits"):
             if notes.looked is not path.evaluation:  # the last step was the last one allowed, or its values have moved
                 notes.tried = path.scan.scan(path.evaluation, everywhere=True, known=notes.tried)
-            limits = upper_limits.upper_limits(path.scan, path.evaluation, notes.tried)
+            limits = upper_limits.upper_limits(path.scan, path.evaluation, notes.tried, path.fit)
     replicates.budget.until = math.inf
     replicates.unstated = frozenset()  # measurement.yaml is as it was
     in_sample: Comparison | None = None

@@ -6,15 +6,21 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .evaluation import Evaluation
-from .replicates import FEW, CannotSimulate, Replicates
+import numpy as np
+from scipy import stats
+
+from .evaluation import Evaluation, stacked
+from .gauss_newton import Fit, column_of
+from .replicates import FEW, CannotSimulate, Cell, Replicates
 from .results import plain
 from .scan import Scan
 from .score_test import ScoreTest, score_test
 from .signature import Signature, captures_showing, odd_and_even, signatures, template_of
 from .trial import Trial, shape_of
 
-_ONE_SIDED = 1.645  # standard deviations of a one-sided limit of 95 % by a normal law
+_BEYOND = 0.05  # probability that a strength above its limit gives a score as small as that of the data
+# of a template's norm, least: with less of it beside the fitted coordinates the captures give no limit at all
+_LEAST_FREE = 1e-3
 # The others are rules of thumb: no measurement that is kept chose them.
 # standard deviations of a signature: one that noise does not hide, by which the growth is measured; one that it hides
 _CLEARLY, _HARDLY = 15.0, 0.5
@@ -28,15 +34,17 @@ _Shape = tuple[float, float, Trial]
 
 
 def upper_limits(
-    scan: Scan, evaluation: Evaluation, tried: Sequence[Trial]
+    scan: Scan, evaluation: Evaluation, tried: Sequence[Trial], fit: Fit | None = None
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     """(effects with their 95 % upper limits, effects that these captures cannot show, the others), for the JSON data.
 
     The others have directions or phases, and no limit is given for them. The limit of an effect is the weakest one
-    over its shapes. The growth of each signature with its strength is simulated once more.
+    over its shapes, and where its strength may have either sign, over both signs. The growth of each signature with
+    its strength is simulated once more.
 
     Args:
         tried: the trials of every candidate in all captures.
+        fit: the fitted coordinates of the model, which the limits are profiled over; None where nothing was fitted.
     """
     replicates = scan.replicates
     shapes: dict[str, dict[tuple[Any, ...], _Shape]] = {}
@@ -45,10 +53,7 @@ def upper_limits(
         if candidate.kind != "add" or len(candidate.strengths) != 1 or candidate.phases:
             continue
         test = score_test(replicates, evaluation, one.signature)
-        times = _linear_limit(test)
-        for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
-            # iterated with the root of the factor, because a quadratic signature would oscillate
-            times *= math.sqrt(_linear_limit(score_test(replicates, evaluation, one.signature.at(times))))
+        times = _times_at_limit(replicates, evaluation, one, test, fit)
         known = shapes.setdefault(candidate.effect, {})
         # of several strengths, the one with the largest signature
         if shape_of(one) not in known or known[shape_of(one)][1] < test.size:
@@ -88,9 +93,58 @@ def strength_at_limit(shape: _Shape) -> float:
     return times * abs(float(one.values[coordinate.key]) - (coordinate.off or 0.0))
 
 
-def _linear_limit(test: ScoreTest) -> float:
-    """The factor on the strength at its upper limit, if the signature were linear."""
-    return (max(test.data, 0.0) + _ONE_SIDED) / test.size if test.size > 0 else math.inf
+def _times_at_limit(
+    replicates: Replicates, evaluation: Evaluation, one: Trial, test: ScoreTest, fit: Fit | None
+) -> float:
+    """The factor on the strength of a trial at its upper limit, if the odd part of the signature were linear.
+
+    A strength of either sign has a limit on each side, and the farther one is taken.
+    """
+    free = share_beside(fit, evaluation, template_of(replicates, evaluation, one.signature.at(1.0)))
+    coordinate = one.candidate.strengths[0]
+    signed = coordinate.low < (coordinate.off or 0.0) < coordinate.high
+    limits = []
+    for sign in (1, -1) if signed else (1,):
+        times = linear_limit(test, sign, signed, free)
+        for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
+            # iterated with the root of the factor, because a quadratic signature would oscillate
+            there = score_test(replicates, evaluation, one.signature.at(sign * times))
+            times *= math.sqrt(linear_limit(there, 1, signed, free))
+        limits.append(times)
+    return max(limits)
+
+
+def share_beside(fit: Fit | None, evaluation: Evaluation, template: Mapping[Cell, np.ndarray]) -> float:
+    """The share of a template's norm that no change of the fitted coordinates imitates, 0 to 1.
+
+    Residuals of a fit have nothing along its Jacobian, whatever the data were: only this share tells of the effect.
+
+    Args:
+        template: (cells,) by block.
+    """
+    if fit is None or not fit.coordinates:
+        return 1.0
+    keys = list(evaluation.residuals)
+    t = stacked({key: template.get(key, np.zeros(len(evaluation.residuals[key]))) for key in keys}, keys)
+    columns = [stacked(column_of(fit, i, evaluation), keys) for i in range(len(fit.coordinates))]
+    known = np.stack(columns, axis=1)
+    rest = t - known @ np.linalg.lstsq(known, t, rcond=1e-8)[0]
+    return math.sqrt(float(rest @ rest) / float(t @ t)) if t.any() else 1.0
+
+
+def linear_limit(test: ScoreTest, sign: int = 1, signed: bool = False, free: float = 1.0) -> float:
+    """The factor on the strength at its upper limit, if the signature were linear.
+
+    Args:
+        test: of the signature.
+        sign: of the strength, 1 or -1.
+        signed: the limit is one of two, on both sides.
+        free: the share of the signature that no fitted coordinate imitates, see `share_beside`.
+    """
+    if test.size <= 0 or free < _LEAST_FREE:
+        return math.inf
+    quantile = float(stats.t.isf(_BEYOND / 2 if signed else _BEYOND, test.freedom))
+    return (max(sign * test.data / free, 0.0) + quantile) / (test.size * free)
 
 
 def _at_limit(
