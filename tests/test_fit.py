@@ -296,8 +296,16 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound(monkeypatch):
             (0, None),
             0.0,
             (-math.inf, 800.0),
+            (0.0, 1e-6 * math.exp(0.3)),
+        ),  # nothing tells it, so that it may be absent
+        ((1e-9, 1e-6), (0, None), 0.0, (math.log(1e-9), math.log(2e-9)), (0.0, 2e-9)),  # a profile that does not fall
+        (
+            (1e-9, 1e-6),
+            (0, None),
+            None,
+            (-math.inf, 800.0),
             (1e-9 / math.exp(0.3), 1e-6 * math.exp(0.3)),
-        ),  # nothing tells it
+        ),  # a shape, which is never absent
         ((1e-2, 1.0), (0, None), 0.0, (math.log(0.5), math.log(1.2)), (0.5, 1.2)),
         ((1e-2, 1.0), (0, None), 0.0, (math.log(0.5), math.log(1.6)), (0.5, math.exp(0.3))),  # no less than that
         ((-0.3, 5.0), (-0.35, None), 0.0, (-0.4, 5.5), (-0.35, 5.5)),

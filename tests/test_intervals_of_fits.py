@@ -171,3 +171,25 @@ def test_an_exposure_is_no_light_level(modality: str) -> None:
     found = exposure_factor(replicates, evaluation, "flat", log, error)
     assert found["value"] == pytest.approx(1.1, abs=0.01)
     assert found["low"] is not None and found["high"] is not None and found["low"] < 1.1 < found["high"]
+
+
+@pytest.mark.parametrize(("mean", "hidden"), [(0.2, 0.3), (0.05, 0.1)])
+def test_few_dark_counts_are_judged_by_their_own_law(mean: float, hidden: float) -> None:
+    """Half as many again of 0.2 counts in each of 4,096 pixels: 14 sigma of all of them, and nothing in one."""
+    dark = [sp.Capture("dark", "tr", dark=True, exposure=1.0)]
+    stated = sensor(side=64, dark=mean)
+    fit = sp.fit(
+        stated, sp.simulate(sensor(side=64, dark=hidden), dark, seed=1), per_pixel=["dark_counts.rate"], jobs=1
+    )
+    assert fit.verdict == "explained" and fit.steps[0].significance > 8
+    right = [sp.fit(stated, sp.simulate(stated, dark, seed=k), per_pixel=["dark_counts.rate"], jobs=1) for k in (2, 3)]
+    assert all(one.verdict == "adequate" and abs(one.steps[0].significance) < 4 for one in right)
+
+
+def test_afterpulses_of_the_model_are_no_other_dark_rates() -> None:
+    after = sp.effects.Afterpulsing(probability=0.05, lifetime=100e-9)
+    dark = [sp.Capture("dark", "tr", dark=True, exposure=1.0)]
+    stated = sensor(after, side=64, dark=200.0)
+    for seed in (1, 2):
+        fit = sp.fit(stated, sp.simulate(stated, dark, seed=seed), per_pixel=["dark_counts.rate"], jobs=1)
+        assert fit.verdict == "adequate", (fit.misfit, fit.steps[0].significance)

@@ -14,8 +14,9 @@ from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.evaluation import BlockCheck, failing
-from spadmnist.inference.null_distribution import learn
+from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.repeated_cells import repeated
+from spadmnist.inference.replicates import no_size
 from spadmnist.measurement import Measurement
 from spadmnist.recording import Recording
 from spadmnist.statistics import Summary
@@ -111,3 +112,19 @@ def test_compare_finds_an_echo_that_no_capture_shows_by_itself(tmp_path: Path) -
     (failed,) = found.failing
     assert failed.statistic == NAME and failed.where == "intervals of 249 to 250 ns, alike in 5 captures"
     assert compare(sensor, lab, replicates=32, jobs=1).verdict == "adequate"
+
+
+def test_what_must_never_be_and_yet_is_in_a_model_is_a_rare_event_of_it() -> None:
+    """Frames that repeat where the light goes out: other replicates have other numbers of them."""
+    rng = np.random.default_rng(5)
+
+    def null_of(numbers: np.ndarray) -> Null:
+        return learn([Summary(np.array([x]), "exact", str, no_size) for x in numbers], np.full(len(numbers), 1e4))
+
+    dark = null_of(rng.poisson(400.0, 96).astype(float))
+    p = [dark.judge(np.array([x]), 1e4).p_value for x in (402.0, 440.0, 800.0)]
+    assert p[0] > 0.1 and p[1] > 1e-3 and p[2] < 1e-9
+    never = null_of(np.zeros(96))
+    assert never.judge(np.array([1.0]), 1e4).p_value < 1e-9 and never.judge(np.array([0.0]), 1e4).p_value == 1.0
+    once = null_of(np.append(np.zeros(95), 1.0))
+    assert once.judge(np.array([1.0]), 1e4).p_value > 1e-3

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import spadmnist as sp
 from spadmnist import cli, config, sensor_file, twin
 from spadmnist import measurement as measurements
 from spadmnist.cli import comparing
@@ -20,9 +21,11 @@ from spadmnist.inference.comparison import compare, ratios_between_wavelengths
 from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.models import InTheDark
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.results import NONLINEARITY, sentence, table
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
+from spadmnist.workers import Serial
 
 SENSOR = """sensor:
   name: SPAD512
@@ -310,3 +313,27 @@ def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
         comparing._check_answer(free)
     done = CliRunner().invoke(cli.cli, ["compare", str(tmp_path / "s.yaml"), str(tmp_path), "--json", str(data)])
     assert done.exit_code != 0 and data.read_bytes().startswith(b"\x89HDF")
+
+
+GATED = sp.effects.ShortGate(fraction=0.9)
+NOISY = sp.effects.SourceNoise(contrast=1.0, coherence_time=1e-3)
+
+
+@pytest.mark.parametrize("which", ["a listed gate", "light that goes out"])
+def test_a_capture_that_ends_as_its_model_or_its_bursts_do_did_not_stop_early(which: str) -> None:
+    """A gate that the sensor lists is closed at the end; a lamp that goes out for a while may be out at the end."""
+    photon = 6.62607015e-34 * 299792458.0 / 500e-9
+    plain = [sp.effects.Detection(pdp=0.3), sp.effects.DeadTime(duration=50e-9), sp.effects.DarkCounts(rate=100.0)]
+    layout = sp.Layout(2, 2, 25e-12, 1.0)
+    made = sp.Sensor(layout, [*plain, GATED if which == "a listed gate" else NOISY], rules="device")
+    stated = made if which == "a listed gate" else sp.Sensor(layout, plain, rules="device")
+    light = {"wavelength": 500e-9, "irradiance": 2.5e4 / 0.3 * photon / 25e-12, "relative_uncertainty": 0.02}
+    flat = sp.Capture("flat", "tr", exposure=0.2, **light)
+    missing = 0
+    for seed in range(8):
+        replicates = Replicates(stated, sp.simulate(made, [flat], seed=seed), 0, Execution(Serial()), 2, reduced=False)
+        seen = replicates.seen["flat"]
+        assert seen.last is not None
+        missing += seen.total * (0.2 - seen.last) / seen.last > 20
+        assert setups.stopped_early(replicates) == {}
+    assert missing > 0  # by its rate alone it would have

@@ -112,3 +112,10 @@ def test_no_expectation_is_taken_from_where_none_was_learnt(lab) -> None:
     shift = signature.shifts["dark", "intervals"]
     seen = shift != 0
     assert seen.any() and np.all(np.abs(shift - new)[seen] <= np.abs(old.mean(axis=0))[seen] + 1e-9)
+
+
+def test_a_part_of_a_signature_fluctuates_as_the_whole_does() -> None:
+    noisy = Signature({("a", "x"): np.ones(2)}, {("a", "x"): 0.1}, {"a": 0.0, "b": 0.0}, fluctuates=True)
+    steady = Signature({("b", "x"): np.ones(2)}, {("b", "x"): 0.1}, {"a": 0.0, "b": 0.0})
+    assert noisy.only(["a"]).fluctuates and not steady.only(["b"]).fluctuates
+    assert steady.completed(noisy, ["a"]).fluctuates and noisy.completed(steady, ["b"]).fluctuates

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..plugins import Parameter
+from .levels import HALF_95
 
 Key = tuple[str, str]  # (effect, parameter)
 Values = Mapping[Key, Any]  # parameter values, SI units
@@ -81,7 +82,9 @@ class Coordinate:
     def interval(self, low: float, high: float) -> tuple[float, float]:
         """The interval (low, high) of the values between two coordinates.
 
-        The search range is no bound of the parameter: an interval may end a little beyond it, within `bounds`.
+        The search range is no bound of the parameter: an interval may end a little beyond it, within `bounds`. One of
+        a strength that ends where the range does next to `off`, or far beyond, ends at `off`: the data do not exclude
+        that the effect is absent.
         """
         low_bound, high_bound = self.bounds
         least = -math.inf if low_bound is None else low_bound
@@ -89,9 +92,22 @@ class Coordinate:
         beyond = _BEYOND if self.log else _BEYOND * (self.high - self.low)
         ends = []
         for u in (low, high):
+            if self.log and self.off is not None and self.off < self.low and self._at_least(u):
+                ends.append(self.off)
+                continue
             near = min(max(u, self.ends[0] - beyond), self.ends[1] + beyond)
             ends.append(min(max(self._anywhere(near), least), most))
         return min(ends), max(ends)
+
+    def _at_least(self, u: float) -> bool:
+        """Whether an end of an interval is that of the range, as a profile's is that does not fall, or far beyond."""
+        least = self.ends[0]
+        return u <= least - _BEYOND or math.isclose(u, least, rel_tol=0.0, abs_tol=1e-9)
+
+    def error(self, low: float, high: float) -> float:
+        """The standard error of the coordinate, of which (low, high) is the 95 % interval in the parameter's unit."""
+        ends = (self.coordinate(self.value(self.coordinate(end))) for end in (low, high))
+        return abs(next(ends) - next(ends)) / (2 * HALF_95)
 
     def _anywhere(self, coordinate: float) -> float:
         value = math.exp(min(coordinate, 700.0)) if self.log else coordinate

@@ -30,8 +30,12 @@ from .results import Diagnosis, Step, title
 
 # p-value below which a misfit is significant, of the stated model or of that with the map; a rule of thumb
 _SURE = 1e-3
-# factor by which afterpulses and the errors of a map may raise the misfit of a right map beyond that; a rule of thumb
+# factor by which the errors of a map may raise the misfit of a right map beyond that; a rule of thumb
 _WIDER = 1.1
+# counts, the least variance of a pixel: a pixel with hardly any count is not judged by one detection. A rule of thumb
+_LEAST_VARIANCE = 0.05
+_MOST_CAUSED = 0.9  # further detections of each, at most: with more of them no law of counts holds
+_LEAST_MEAN = 1e-2  # of a misfit, the least mean: where a model gives no counts at all, a misfit stays a finite number
 # share of the information on a map in lit captures that is neglected, at most: with more of it, models are simulated; a
 # rule of thumb
 _LIT = 0.02
@@ -87,11 +91,30 @@ def _level(replicates: Replicates, id: str) -> float:
 
 @dataclass(frozen=True)
 class _Judged:
-    """The errors of a model in the counts of captures: misfit, relative errors of the mean rate and of the map."""
+    """The errors of a model in the counts of captures: misfit, relative errors of the mean rate and of the map.
+
+    Attributes:
+        misfit: the mean square of the pixels' deviations, relative to what it is if the model is right.
+        variance: of the misfit, if the model is right.
+    """
 
     misfit: float
     mean_rate: float
     map: float
+    variance: float
+
+    def quantile(self, p: float) -> float:
+        """The misfit that a right model exceeds with a probability of p."""
+        return float(stats.gamma.isf(p, 1 / self.variance, scale=self.variance))
+
+    def significance(self, wider: float = 1.0) -> float:
+        """The significance of a misfit that is so many times too large, in standard deviations.
+
+        Args:
+            wider: factor by which a right model may exceed 1.
+        """
+        p = float(stats.gamma.sf(self.misfit / wider, 1 / self.variance, scale=self.variance))
+        return float(stats.norm.isf(max(p, LEAST_P) / 2))
 
     def row(self, model: str) -> dict[str, Any]:
         errors = {"mean_rate": self.mean_rate, "map": self.map}
@@ -104,17 +127,25 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
     Args:
         errors: (pixels,) relative, of the sensor's rates.
     """
-    squares, totals, excess = [], [], []
+    squares, totals, excess, means, variances = [], [], [], [], []
     for id in ids:
         line = count_model.CountModel(replicates, id, 1.0)
         expected, counts = line.expected(sensor), line.seen.counts
         assert counts is not None
-        variance = line.variance(np.maximum(expected, 0.5), replicates.dead)
+        # each detection causes further ones of its pixel, and these do, too: a branching process widens the counts
+        caused = sum(sensor.caused().values()) if line.seen.capture.counts_events else 0.0
+        own = line.variance(expected, replicates.dead, 0.0) / (1 - min(caused, _MOST_CAUSED)) ** 2
+        variance = np.maximum(own + (errors * expected) ** 2, _LEAST_VARIANCE)
         apart = counts - expected
-        squares.append(apart**2 / (variance + (errors * expected) ** 2))
+        squares.append(apart**2 / variance)
+        share = (own + (errors * expected) ** 2) / variance
+        means.append(share)
+        variances.append(2 * share**2 + own / variance**2)  # the fourth moment of a Poisson count
         totals.append(abs(math.log(max(float(counts.sum()), 0.5) / float(expected.sum()))))
-        excess.append(math.sqrt(max(float(np.mean(apart**2 - variance)), 0.0)) / max(float(expected.mean()), 1e-12))
-    return _Judged(float(np.mean(squares)), float(np.mean(totals)), float(np.mean(excess)))
+        excess.append(math.sqrt(max(float(np.mean(apart**2 - own)), 0.0)) / max(float(expected.mean()), 1e-12))
+    mean = max(float(np.mean(means)), _LEAST_MEAN)
+    spread = float(np.mean(variances)) / np.size(variances) / mean**2
+    return _Judged(float(np.mean(squares)) / mean, float(np.mean(totals)), float(np.mean(excess)), spread)
 
 
 def _answer(
@@ -134,20 +165,15 @@ def _answer(
         found = _judge(halves, others, with_values(replicates.start, {candidate.carrier: part.values()}), part.error)
     else:
         found = _judge(replicates, dark, with_values(replicates.start, {candidate.carrier: map_.values()}), map_.error)
-    free = replicates.start.layout.pixels * len(dark)
-    null_95 = float(stats.chi2.ppf(0.95, free) / free)
-    likely = float(stats.chi2.ppf(1 - _SURE, free) / free)
     rest: list[dict[str, Any]] = []
-    if found.misfit > _WIDER * likely:  # the rates differ between blocks of time
-        clear = _clear(found.misfit / _WIDER, free)
+    if found.misfit > _WIDER * found.quantile(_SURE):  # the rates differ between blocks of time
+        clear = found.significance(_WIDER)
         where = "pixels of one half of the blocks of time, by a map of the other"
         rest.append({"statistic": "pixel_map", "capture": dark[0], "significance": clear, "where": where})
-    right = "explained" if start.misfit > likely else "adequate"
+    right = "explained" if start.misfit > start.quantile(_SURE) else "adequate"
     mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
-    step = Step(
-        candidate, results, found.misfit, _clear(start.misfit, free), f"mean of the map {100 * (mean - 1):+.2f} %"
-    )
+    step = Step(candidate, results, found.misfit, start.significance(), f"mean of the map {100 * (mean - 1):+.2f} %")
     step.map = map_
     return Diagnosis(
         sensor=replicates.start.name,
@@ -155,7 +181,7 @@ def _answer(
         verdict="partly_explained" if rest else right,
         before=start.misfit,
         after=found.misfit,
-        null_95=null_95,
+        null_95=start.quantile(0.05),
         nuisances=[],
         steps=[step],
         setup=[],
@@ -170,11 +196,6 @@ def _answer(
         crop=str(replicates.start.window) if replicates.start.window else None,
         compared="the counts in the dark",
     )
-
-
-def _clear(misfit: float, free: int) -> float:
-    """The significance of a mean square, in standard deviations."""
-    return float(stats.norm.isf(max(float(stats.chi2.sf(misfit * free, free)), LEAST_P) / 2))
 
 
 def _listed(sensor: Sensor, candidate: Candidate) -> np.ndarray:

@@ -13,7 +13,6 @@ from .evaluation import evaluate, square
 from .exact_likelihood import NoLikelihood, maximise, not_in_likelihood, recordings
 from .gauss_newton import error_scale
 from .joint_fit import fit_all, model_of
-from .levels import HALF_95
 from .model_path import ModelPath, keys_of
 from .replicates import FEW, CannotSimulate
 from .results import Value
@@ -46,7 +45,7 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
         for coordinate in step.coordinates:
             v = step.values[coordinate.parameter]
             assert v.low is not None and v.high is not None
-            errors[coordinate.key] = abs(coordinate.coordinate(v.high) - coordinate.coordinate(v.low)) / (2 * HALF_95)
+            errors[coordinate.key] = coordinate.error(v.low, v.high)
     mapped = any(step.candidate.carrier for step in path.steps)
     try:
         data = recordings(measurement, replicates.start, {id: seen.total for id, seen in replicates.seen.items()})

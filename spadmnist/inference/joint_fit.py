@@ -353,7 +353,7 @@ def edge_errors(path: ModelPath, fit: Fit | None = None) -> dict[Key, float]:
         for coordinate in filter(is_edge, step.coordinates):
             v = step.values.get(coordinate.parameter)
             if v is not None and v.low is not None and v.high is not None:
-                out[coordinate.key] = abs(coordinate.coordinate(v.high) - coordinate.coordinate(v.low)) / (2 * HALF_95)
+                out[coordinate.key] = coordinate.error(v.low, v.high)
     if fit is not None:
         spread = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
         out |= {d.key: float(x) for d, x in zip(fit.coordinates, spread, strict=True) if is_edge(d)}

@@ -157,6 +157,8 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     n = len(values)
     middle = float(totals.mean()) or 1.0
     x = totals / middle - 1.0
+    if law.exact and np.ptp(values, axis=0).any():
+        law = law_of("poisson", False)  # of this model it is a rare event: its light goes out, its frames repeat
     if law.exact:
         coefficients = np.median(values, axis=0, keepdims=True)
         return Null(law, middle, coefficients, np.ones((1, 1)), np.zeros(values.shape[1]), n, 1.0, 1.0, np.zeros(n))

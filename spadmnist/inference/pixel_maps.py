@@ -238,14 +238,37 @@ def low_ratio(map_: PixelMap) -> tuple[float, float]:
 def summary(map_: PixelMap) -> dict[str, float]:
     """The statistics of a map by name: sigma, low_fraction, low_ratio, high_fraction."""
     low, high = odd_pixels(map_)
-    rest = ~(low | high) & map_.informed
-    spread = np.var(map_.raw[rest]) - np.mean(map_.raw_error[rest] ** 2) if rest.sum() > 3 else 0.0
+    _, spread, noise = _spread(map_)
     return {
-        "sigma": math.sqrt(max(float(spread), 0.0)),
+        "sigma": math.sqrt(max(spread - noise, 0.0)),
         "low_fraction": float(low.mean()),
         "low_ratio": low_ratio(map_)[0],
         "high_fraction": float(high.mean()),
     }
+
+
+def _spread(map_: PixelMap) -> tuple[int, float, float]:
+    """(number, variance, part of it that is noise) of the values that are not odd; one value has no variance."""
+    low, high = odd_pixels(map_)
+    rest = ~(low | high) & map_.informed
+    number = int(rest.sum())
+    if number < 2:
+        return number, 0.0, 0.0
+    return number, float(np.var(map_.raw[rest], ddof=1)), float(np.mean(map_.raw_error[rest] ** 2))
+
+
+def interval_of_sigma(number: int, variance: float, noise: float) -> tuple[float, float]:
+    """The 95 % interval of the standard deviation of the law of normal values beside noise: chi square of all of it.
+
+    Args:
+        number: of values, at least 2.
+        variance: of the values with their noise, unbiased.
+        noise: the mean variance of the noise.
+    """
+    free = number - 1
+    ends = (free * variance / float(stats.chi2.ppf(q, free)) - noise for q in (0.975, 0.025))
+    low, high = (math.sqrt(max(end, 0.0)) for end in ends)
+    return low, high
 
 
 def evidence_of_patterns(map_: PixelMap, patterns: dict[str, np.ndarray]) -> dict[str, PatternEvidence]:
@@ -312,11 +335,9 @@ def _width_of_few(map_: PixelMap) -> blind_times.Width | None:
 def map_values(map_: PixelMap) -> dict[str, Value]:
     """The results of a map by name, with 95 % intervals."""
     results = {name: Value(number, None, None) for name, number in summary(map_).items()}
-    sigma, noise = results["sigma"].value, float(np.median(map_.raw_error))
-    # sigma^2 is the variance of the differences less that of the noise
-    half = HALF_95 * (sigma**2 + noise**2) * math.sqrt(2 / len(map_.raw))
-    ends = [math.sqrt(max(sigma**2 + k * half, 0.0)) for k in (-1, 1)]
-    results["sigma"] = Value(sigma, ends[0], ends[1])
+    number, variance, noise = _spread(map_)
+    if number > 1:
+        results["sigma"] = Value(results["sigma"].value, *interval_of_sigma(number, variance, noise))
     width = map_.width or _width_of_few(map_)
     if width is not None:
         results["sigma"] = Value(width.sigma, width.low, width.high)

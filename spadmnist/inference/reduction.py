@@ -13,6 +13,10 @@ from ..recording import Capture, Recording
 from ..statistics import Statistic, Summary
 from .blind_times import ShortestIntervals
 
+# in mean times between detections: a longer time after the last detection is compared with the others; one in 20,000
+# steady captures is longer
+_EMPTY_END = 10.0
+
 
 def halves_of(id: str) -> tuple[str, str]:
     """The names of the two halves of a capture (`Replicates.halves`)."""
@@ -28,6 +32,7 @@ class ReducedCapture:
         counts: (pixels,) detections; None where the mean alone is known.
         summaries: by statistic.
         last: the last detection that has a stamp of its own, s.
+        silence: the longest time between two detections of the array, s; None where the last one is near the end.
         waited: (pixels,) of first stamps, the time before them, in frames.
         shortest: the shortest intervals, of time stamps.
         half_of: (the whole capture, whether this is its second, fourth, ... block of time); None where it is no half.
@@ -41,6 +46,7 @@ class ReducedCapture:
     waited: np.ndarray | None = None
     shortest: ShortestIntervals | None = None
     half_of: tuple[Capture, bool] | None = None
+    silence: float | None = None
 
     @classmethod
     def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
@@ -51,14 +57,16 @@ class ReducedCapture:
         """
         summaries = summaries_of(statistics_for(recording.capture) if reduced else (), recording)
         counts = np.asarray(recording.totals, float)
-        last = None
+        last = silence = None
         if recording.events is not None and len(recording.events):
             stamps, unit = recording.events.stamps
             last = float(stamps.max() * unit)
+            if (recording.conditions.exposure - last) * len(stamps) > _EMPTY_END * last:
+                silence = float(np.diff(np.sort(stamps)).max(initial=0) * unit)
         waited = None if recording.waited is None else recording.waited[0]
         shortest = ShortestIntervals.of(recording)
         capture = replace(recording.capture, tick=recording.tick)
-        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest)
+        return cls(capture, float(counts.sum()), counts, summaries, last, waited, shortest, silence=silence)
 
 
 def statistics_for(capture: Capture) -> list[Statistic]:

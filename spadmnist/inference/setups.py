@@ -7,6 +7,7 @@ them as simply is a rival.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,12 +18,13 @@ import numpy as np
 from scipy import stats
 
 from .. import twin
+from ..errors import UNABLE
 from .candidates import templates
 from .evaluation import Evaluation, square, with_totals_anew
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM, HALF_95
-from .light_levels import closed_form, totals_space
+from .light_levels import closed_form, level_for, totals_space
 from .models import InTheDark
-from .replicates import TOTALS, CannotSimulate, Replicates
+from .replicates import TOTALS, CannotSimulate, Replicates, simulated
 from .results import plain
 from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures
@@ -36,6 +38,10 @@ _MOST = 300.0  # of a logarithm: beyond any light; a larger one would overflow a
 # detections missing at the end of a capture that stopped early: by Poisson's law so many are missing by chance with a
 # probability of 2e-9
 _MISSING = 20.0
+# factor by which the end without detections must be longer than any other silence of the capture, and than the end of
+# the model's own recordings: bursts and gates end early, too. A rule of thumb; steady captures are far beyond it
+_LONGER = 2.0
+_MODELS = 4  # recordings of the model that are looked at, of captures whose end is empty
 
 
 @dataclass(frozen=True)
@@ -349,12 +355,34 @@ def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
 
 
 def stopped_early(replicates: Replicates) -> dict[str, tuple[float, float]]:
-    """The captures that stopped early, by their last detection: (share that was exposed, its standard deviation)."""
+    """The captures that stopped early, by their last detection: (share that was exposed, its standard deviation).
+
+    Their end is without detections for longer than chance, the rest of the capture and the model allow.
+    """
     out = {}
     for id, seen in replicates.seen.items():
         if seen.last is None or seen.total < 2:
             continue
-        share = seen.last * (1 + 1 / seen.total) / seen.capture.conditions.exposure
-        if seen.total * (1 - share) / max(share, 1e-9) > _MISSING:
+        exposure = seen.capture.conditions.exposure
+        share = seen.last * (1 + 1 / seen.total) / exposure
+        if seen.total * (1 - share) / max(share, 1e-9) <= _MISSING:
+            continue
+        if exposure - seen.last > _LONGER * max(seen.silence or 0.0, _end_of_model(replicates, id)):
             out[id] = share, share / seen.total
     return out
+
+
+def _end_of_model(replicates: Replicates, id: str) -> float:
+    """The longest time without detections at the end of a few recordings that the stated model makes, s."""
+    seen, sensor = replicates.seen[id], replicates.start
+    capture = seen.capture
+    sensor = InTheDark.of(sensor) if capture.light.dark else sensor
+    level = 0.0 if capture.light.dark else level_for(closed_form(sensor, capture), seen.total, None)
+    longest = 0.0
+    numbers = np.arange(_MODELS, dtype=np.uint64)
+    with contextlib.suppress(*UNABLE):  # a model that cannot be simulated is reported where it is evaluated
+        for recording in simulated(sensor, capture, np.full(_MODELS, level), numbers, replicates.seed):
+            if recording.events is not None and len(recording.events):
+                stamps, unit = recording.events.stamps
+                longest = max(longest, capture.conditions.exposure - float(stamps.max() * unit))
+    return longest

@@ -62,7 +62,7 @@ class Signature:
         shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
         noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
         even = None if self.even is None else self.even.only(ids)
-        return Signature(shifts, noise, self.logs, self.nothing, even)
+        return Signature(shifts, noise, self.logs, self.nothing, even, self.fluctuates)
 
     def completed(self, other: Signature, ids: Collection[str]) -> Signature:
         """The signature, completed by that of `other` in captures of which this one has the totals alone."""
@@ -72,7 +72,8 @@ class Signature:
         if even is not None or there.even is not None:
             even = (even or Signature({}, {}, {})).completed(there.even or Signature({}, {}, {}), ids)
         shifts, noise = {**self.shifts, **there.shifts}, {**self.noise, **there.noise}
-        return Signature(shifts, noise, logs, self.nothing and other.nothing, even)
+        fluctuates = self.fluctuates or other.fluctuates
+        return Signature(shifts, noise, logs, self.nothing and other.nothing, even, fluctuates)
 
     def at(self, times: float) -> Signature:
         """The shifts at `times` the strength, as a signature without an even part."""
