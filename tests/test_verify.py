@@ -583,3 +583,11 @@ def test_damage_that_reconstruct_does_not_read_stays_visible(few: dict[int, Path
     (root / "config.yaml").write_text("x")
     factory.add_reconstructions(root, METHODS[2:3], 1)
     assert str(victim.relative_to(root)) in verify.verify(root).changed
+
+
+@pytest.mark.parametrize(
+    "option", [("--jobs", "1"), ("--cluster", "tcp://host:1"), ("--no-shared",), ("--images-dir", ".")]
+)
+def test_what_repair_alone_takes_is_refused_without_it(tmp_path: Path, option: tuple[str, ...]) -> None:
+    found = run("verify", tmp_path, *option)
+    assert found.returncode == 2 and f"{option[0]}: belongs to --repair" in found.stderr, found

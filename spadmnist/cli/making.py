@@ -325,7 +325,8 @@ def verify(
 ) -> None:
     """Compare every byte of DATASET with its manifest, and name each file that is changed, missing or extra.
 
-    DATASET is a folder, a zip of it, or its address (https://, http://, s3://).
+    DATASET is a folder, a zip of it, or its address (https://, http://, s3://). Workers make files again (--repair);
+    without it the files are read, and --jobs, --cluster, --no-shared and --images-dir are refused.
     Exit status: 0 the dataset is intact, 1 damage was found and not repaired.
 
     \b
@@ -336,6 +337,10 @@ def verify(
     from .. import verify as library
 
     options.load_plugins(plugin_files)
+    given = {"--images-dir": images_dir, "--jobs": jobs, "--cluster": cluster, "--no-shared": no_shared or None}
+    for option, value in given.items():
+        if value is not None and not repair:
+            raise SpadError(f"{option}: belongs to --repair, which makes files again; add --repair, or leave it out")
     root = datasets.at(dataset)
     if not isinstance(root, Path):
         if repair:
