@@ -37,8 +37,8 @@ sensor:
 # key of a JSON answer -> what it says; a key that is not here is an error of the build
 MEANINGS = {
     "format": "name and number of the format",
-    "verdict": "`compare`: `adequate` or `fails`. `diagnose` and `fit`: `adequate`, `setup`, `explained`, `confused`, "
-    "`partly_explained` or `unexplained`",
+    "verdict": "`compare`: `adequate` or `fails`. `diagnose`: `adequate`, `setup`, `explained`, `confused`, "
+    "`partly_explained` or `unexplained`. `fit`: `adequate`, `explained` or `partly_explained`",
     "finished": "`false` where the budget of `--within` ended the diagnosis",
     "misfit": "mean over (statistic, capture) of the mean squared standardised residual; 1 is the model's own scatter",
     "misfit.before": "misfit of the sensor that was given",
