@@ -421,11 +421,11 @@ def test_the_limit_of_either_sign_is_that_of_the_farther_side(lab, monkeypatch, 
     )
     (excluded,), hidden, _ = upper_limits(quiet(replicates), evaluation, tried)
     wanted = (abs(score) + stats.t.isf(0.025, 15)) / 20 * 0.1
-    assert not hidden and excluded["upper_limit_95"] == pytest.approx(wanted, rel=1e-6)
+    assert not hidden and excluded["upper_limit_95"] == pytest.approx(wanted, rel=1e-4)
 
 
 def test_a_limit_beside_a_fit_is_profiled_over_its_numbers(lab) -> None:
-    """A fitted number whose signature has the cosine 0.99 with an effect's: the limit is seven times as large."""
+    """A fitted number whose signature has the cosine 0.9 with an effect's: the limit is twice as large."""
     replicates = bench_of(lab())
     evaluation, look, candidate = evaluate(replicates, {}), quiet(replicates), change_of(replicates, "add crosstalk")
     tried = look.looked_at(evaluation, candidate, look.begun(evaluation, candidate)[:1])
@@ -434,14 +434,15 @@ def test_a_limit_beside_a_fit_is_profiled_over_its_numbers(lab) -> None:
     t = np.concatenate([template.get(k, np.zeros(len(evaluation.residuals[k]))) for k in keys])
     other = np.random.default_rng(1).standard_normal(t.size)
     other -= t * (t @ other) / (t @ t)
-    column = 0.99 * t / np.linalg.norm(t) + math.sqrt(1 - 0.99**2) * other / np.linalg.norm(other)
+    column = 0.9 * t / np.linalg.norm(t) + math.sqrt(1 - 0.9**2) * other / np.linalg.norm(other)
     ends = np.cumsum([len(evaluation.residuals[k]) for k in keys])[:-1]
     jacobian = {k: x[:, None] for k, x in zip(keys, np.split(column, ends), strict=True)}
     known = change_of(replicates, "set dead_time.duration").coordinates
     fit = Fit(known, np.zeros(1), np.eye(1), evaluation.residuals, jacobian, 0.0, {})
-    assert share_beside(fit, evaluation, template) == pytest.approx(math.sqrt(1 - 0.99**2), rel=1e-6)
-    limits = [upper_limits(look, evaluation, tried, one)[0][0]["upper_limit_95"] for one in (None, fit)]
-    assert limits[1] > 5 * limits[0]
+    assert share_beside(fit, evaluation, template) == pytest.approx(math.sqrt(1 - 0.9**2), rel=1e-6)
+    none = replace(fit, jacobian={k: 0 * x for k, x in jacobian.items()})  # of a number that moves nothing
+    limits = [upper_limits(look, evaluation, tried, one)[0][0]["upper_limit_95"] for one in (None, none, fit)]
+    assert limits[1] == limits[0] and limits[2] > 1.5 * limits[0]
     same = replace(fit, jacobian={k: template.get(k, np.zeros(len(evaluation.residuals[k])))[:, None] for k in keys})
     excluded, hidden, _ = upper_limits(look, evaluation, tried, same)
     assert not excluded and hidden == [{"effect": "crosstalk"}]  # these captures cannot tell the two

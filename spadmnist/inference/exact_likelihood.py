@@ -85,8 +85,10 @@ def not_in_likelihood(sensor: Sensor, capture: Capture) -> str:
 
 def _idle(effect: Effect) -> bool:
     """Whether an effect is listed at the value at which it vanishes."""
-    offs = [np.all(np.asarray(getattr(effect, n)) == p.off) for n, p in effect.parameters.items() if p.off is not None]
-    return bool(offs) and all(offs)
+    # a parameter that is off by default is a refinement of the effect: whether that is there, the others say
+    offs = {n: p for n, p in effect.parameters.items() if p.off is not None}
+    first = {n: p for n, p in offs.items() if p.default != p.off} or offs
+    return bool(first) and all(np.all(np.asarray(getattr(effect, n)) == p.off) for n, p in first.items())
 
 
 class Likelihood:

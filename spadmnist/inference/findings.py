@@ -114,7 +114,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
         steps: the steps between them.
     """
     blocks = block_checks(replicates, start, start.residuals)
-    failed = [b for b in failing(blocks) if b.cell[0] and b.cell in last.nulls and not start.nulls[b.cell].law.exact]
+    failed = [b for b in failing(blocks) if b.cell[0] and b.cell in start.residuals and b.cell in last.residuals]
     seen = [_failed(replicates, start, start.residuals, block) for block in failed]
     passing = {block.cell for block in blocks} - {block.cell for block in failed}
     out: list[Trace] = []

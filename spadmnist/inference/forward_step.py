@@ -109,7 +109,7 @@ def best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChec
     replicates, scan, faint = path.replicates, path.scan, not failed
     notes.waiting = []
     # a value that a step has set is fitted anew with every other one: it is no finding of its own
-    notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or path.values.keys().isdisjoint(t.values)]
+    notes.tried = [t for t in notes.tried if t.candidate.kind != "set" or not _is_set(path, t)]
     replicates.say(f"step {len(path.steps) + 1}: the best of them on all captures")
     second = patterns_first(scan, path.evaluation, scan.again(path.evaluation, path.values, notes.tried, faint))
     notes.second = [replace(one, intervals=dict(one.intervals)) for one in second]  # a fit writes into a trial
@@ -239,6 +239,12 @@ def _still_promising(path: ModelPath, group: Sequence[Trial]) -> list[Trial]:
     return out if out and out[0].fall > PROMISING else []
 
 
+def _is_set(path: ModelPath, one: Trial) -> bool:
+    """Whether a step has set the parameter that names a trial."""
+    strengths = {d.key for d in one.candidate.strengths} | {key for key, _ in one.candidate.fixed}
+    return not path.values.keys().isdisjoint(strengths)
+
+
 def fitted_trials(path: ModelPath, worth: Sequence[Trial], faint: bool) -> list[Trial]:
     """The trials with their coordinates fitted and their evidence, without those that cannot be simulated."""
     path.replicates.say(f"step {len(path.steps) + 1}: fitting " + ", ".join(title(t.candidate) for t in worth))
@@ -335,6 +341,8 @@ def complete(path: ModelPath) -> bool:
         Whether that was done; not where it was done before, or the model cannot be simulated around its values.
     """
     if not path.is_rough:
+        return False
+    if path.not_completed is path.evaluation:
         return False
     complete_fit(path)
     refit_whole_numbers(path)

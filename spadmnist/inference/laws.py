@@ -158,8 +158,9 @@ class Scaled(Law):
         return np.ones(values.shape[1]) if scale is None else scale
 
     def factor(self, z: np.ndarray) -> float:
-        """Their root mean square."""
-        return max(float(np.sqrt(np.mean(z**2))), 1e-6)
+        """The root mean square of the cells that vary: those without enough data in any replicate are all 0."""
+        live = z.any(axis=0)
+        return max(float(np.sqrt(np.mean(z[:, live] ** 2))), 1e-6) if live.any() else 1.0
 
     def standardized(
         self, values: np.ndarray, expected: np.ndarray, spread: np.ndarray, leverage: float | np.ndarray, n: int

@@ -287,9 +287,14 @@ def material(one: Trial) -> str:
 def keys_of(candidate: Candidate, path: ModelPath) -> set[Key]:
     """The parameters that a candidate changes in the model of a path, without those that a later step changes."""
     if candidate.kind == "add":
-        later = {(c.effect, c.parameter) for c in path.scan.accepted if c.kind != "add"}
+        later = set().union(*(_own_keys(c) for c in path.scan.accepted if c.kind != "add"))
         return {k for k in path.values if k[0] == candidate.effect and k not in later}
-    return {(candidate.effect, candidate.parameter or "")}
+    return _own_keys(candidate)
+
+
+def _own_keys(candidate: Candidate) -> set[Key]:
+    """The parameters of a candidate that adds no effect: the one that names it, and those that come with it."""
+    return {(candidate.effect, candidate.parameter or ""), *(d.key for d in candidate.coordinates)}
 
 
 def rests_on(step: Step, other: Step) -> bool:

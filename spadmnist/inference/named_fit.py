@@ -67,7 +67,8 @@ def fit_named(
     every, listed = candidates(sensor.resolved(), measurement.captures), {e.name for e in sensor.effects}
     wanted = [
         *(named_candidate(every, listed, "add", name, None) for name in add),
-        *(named_candidate(every, listed, "set", *_halves(name)) for name in free),
+        # of a named parameter alone: what comes with it in a search stays as it is listed
+        *(replace(named_candidate(every, listed, "set", *_halves(name)), shapes=()) for name in free),
         *(named_candidate(every, listed, "per_pixel", *_halves(name)) for name in per_pixel),
     ]
     if not wanted:

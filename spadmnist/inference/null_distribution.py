@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 # of the range of the replicates' totals: how far beyond it they inform expectations. Farther off, where wrong models
 # had been called right, the expectation is that of the end; a rule of thumb
 _BEYOND = 1.0
+# factor on scores that are normal by themselves, least: replicates without a detection all have the same score, and one
+# detection would then be any number of sigma. A rule of thumb
+_LEAST_OF_SCORES = 0.5
 _LEAST = 1e-300  # in place of a variance of 0: near the least number of a double
 
 
@@ -157,7 +160,8 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     n = len(values)
     middle = float(totals.mean()) or 1.0
     x = totals / middle - 1.0
-    if law.exact and np.ptp(values, axis=0).any():
+    whole = bool(np.all((values >= 0) & (values == np.rint(values))))
+    if law.exact and whole and np.ptp(values, axis=0).any():
         law = law_of("poisson", False)  # of this model it is a rare event: its light goes out, its frames repeat
     if law.exact:
         coefficients = np.median(values, axis=0, keepdims=True)
@@ -174,6 +178,8 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     spread = law.spread(values, fitted, len(coefficients), np.mean(scales, axis=0) if scales else None)
     z = law.of_their_own(values, fitted, spread, hat[:, None], len(coefficients))
     factor = law.factor(z)
+    if first.law == "normal" and first.scale is not None and np.all(np.asarray(first.scale) == 1.0):
+        factor = max(factor, _LEAST_OF_SCORES)
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
@@ -186,7 +192,8 @@ def _terms(x: np.ndarray, terms: int) -> np.ndarray:
 
 def tail_of(z: np.ndarray) -> float:
     """The factor by which the largest residuals of replicates exceed those of a normal law; at least 1."""
-    magnitudes = np.sort(np.abs(z).ravel())
+    live = z.any(axis=0)  # cells without enough data are 0 in all replicates
+    magnitudes = np.sort(np.abs(z[:, live] if live.any() else z).ravel())
     beyond = 10 if magnitudes.size > 1000 else 3
     place = magnitudes[-beyond]
     normal = -float(special.ndtri((beyond - 0.5) / magnitudes.size / 2))

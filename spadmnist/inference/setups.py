@@ -377,10 +377,10 @@ def _end_of_model(replicates: Replicates, id: str) -> float:
     seen, sensor = replicates.seen[id], replicates.start
     capture = seen.capture
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    level = 0.0 if capture.light.dark else level_for(closed_form(sensor, capture), seen.total, None)
     longest = 0.0
     numbers = np.arange(_MODELS, dtype=np.uint64)
     with contextlib.suppress(*UNABLE):  # a model that cannot be simulated is reported where it is evaluated
+        level = level_for(closed_form(sensor, capture), seen.total, 1.0)
         for recording in simulated(sensor, capture, np.full(_MODELS, level), numbers, replicates.seed):
             if recording.events is not None and len(recording.events):
                 stamps, unit = recording.events.stamps

@@ -342,8 +342,9 @@ def fit_whole_number(
             there(further, best[far])
             step *= 2
     out = [x for x, square in squares.items() if square > excluded]
-    low = max((x + 1 for x in out if x < here), default=coordinate.low)
-    high = min((x - 1 for x in out if x > here), default=coordinate.high)
+    # a range may end between two whole numbers
+    low = min(max((x + 1 for x in out if x < here), default=coordinate.low), here)
+    high = max(min((x - 1 for x in out if x > here), default=coordinate.high), here)
     ends = {coordinate.key: (low, high)}
     for i, other in enumerate(found.coordinates):
         intervals = [

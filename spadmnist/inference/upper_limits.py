@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,10 @@ def _times_at_limit(
 
     A strength of either sign has a limit on each side, and the farther one is taken.
     """
-    free = share_beside(fit, evaluation, template_of(replicates, evaluation, one.signature.at(1.0)))
+    template = template_of(replicates, evaluation, one.signature.at(1.0))
+    free = share_beside(fit, evaluation, template)
+    if free < 1:  # the score of what is left beside the fitted numbers, of which the residuals may hold a little
+        test = replace(test, data=_score_beside(fit, evaluation, template) / test.spread)
     coordinate = one.candidate.strengths[0]
     signed = coordinate.low < (coordinate.off or 0.0) < coordinate.high
     limits = []
@@ -109,6 +113,8 @@ def _times_at_limit(
         for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
             # iterated with the root of the factor, because a quadratic signature would oscillate
             there = score_test(replicates, evaluation, one.signature.at(sign * times))
+            if free < 1:
+                there = replace(there, data=sign * test.data)
             times *= math.sqrt(linear_limit(there, 1, signed, free))
         limits.append(times)
     return max(limits)
@@ -124,12 +130,32 @@ def share_beside(fit: Fit | None, evaluation: Evaluation, template: Mapping[Cell
     """
     if fit is None or not fit.coordinates:
         return 1.0
+    t, rest = _beside(fit, evaluation, template)
+    return min(math.sqrt(float(rest @ rest) / float(t @ t)), 1.0) if t.any() else 1.0
+
+
+def _beside(fit: Fit, evaluation: Evaluation, template: Mapping[Cell, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """(a template, what no change of the fitted coordinates imitates of it), (cells,) of all blocks."""
     keys = list(evaluation.residuals)
     t = stacked({key: template.get(key, np.zeros(len(evaluation.residuals[key]))) for key in keys}, keys)
+    basis = evaluation.once(("columns of a fit", id(fit)), lambda: _basis_of(fit, evaluation))
+    return t, t - basis @ (basis.T @ t)
+
+
+def _basis_of(fit: Fit, evaluation: Evaluation) -> np.ndarray:
+    """An orthonormal basis of the columns of a fit's Jacobian, (cells, rank)."""
+    keys = list(evaluation.residuals)
     columns = [stacked(column_of(fit, i, evaluation), keys) for i in range(len(fit.coordinates))]
-    known = np.stack(columns, axis=1)
-    rest = t - known @ np.linalg.lstsq(known, t, rcond=1e-8)[0]
-    return math.sqrt(float(rest @ rest) / float(t @ t)) if t.any() else 1.0
+    u, size, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
+    return np.asarray(u[:, size > 1e-8 * max(float(size.max(initial=0.0)), 1e-300)])
+
+
+def _score_beside(fit: Fit | None, evaluation: Evaluation, template: Mapping[Cell, np.ndarray]) -> float:
+    """The data's score along what is left of a template, in standard deviations of independent cells."""
+    assert fit is not None
+    _, rest = _beside(fit, evaluation, template)
+    norm = math.sqrt(float(rest @ rest))
+    return float(stacked(evaluation.residuals, list(evaluation.residuals)) @ rest) / norm if norm > 0 else 0.0
 
 
 def linear_limit(test: ScoreTest, sign: int = 1, signed: bool = False, free: float = 1.0) -> float:
@@ -144,7 +170,7 @@ def linear_limit(test: ScoreTest, sign: int = 1, signed: bool = False, free: flo
     if test.size <= 0 or free < _LEAST_FREE:
         return math.inf
     quantile = float(stats.t.isf(_BEYOND / 2 if signed else _BEYOND, test.freedom))
-    return (max(sign * test.data / free, 0.0) + quantile) / (test.size * free)
+    return (max(sign * test.data, 0.0) + quantile) / (test.size * free)
 
 
 def _at_limit(
@@ -162,7 +188,7 @@ def _at_limit(
     where: dict[tuple[str, int], list[str]] = {}
     for name, (times, size, one) in weakest.items():
         out[name] = times
-        if size > 2 * _CLEARLY:
+        if size > 2 * _CLEARLY and math.isfinite(times):
             where[name] = captures_showing(template_of(replicates, evaluation, one.signature), _LEFT_OUT)
             seen = score_test(replicates, evaluation, one.signature.only(where[name])).size
             here = one.signature if one.signature.even is None else one.signature.at(times)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from .coordinates import Coordinate, Key
+from .evaluation import square
 from .gauss_newton import Effort, Fit, gauss_newton
 from .joint_fit import WORTH, fit_all
 from .replicates import CannotSimulate
@@ -48,8 +49,14 @@ def _refit(path: ModelPath, step: Step, coordinate: Coordinate) -> None:
         found, intervals = fit_whole_number(begun, coordinate, fit)
     except CannotSimulate:
         return
-    step.intervals |= intervals
+    own = {d.key for d in step.candidate.coordinates}
+    intervals = {key: ends for key, ends in intervals.items() if key in own}
     if found.values[coordinate.key] == here[coordinate.key] or begun.square - found.square < WORTH:
         return
+    before, squares = path.kept(), square(path.evaluation.residuals)
     path.values = {**path.values, **found.values}
     fit_all(path)
+    if path.fit is None or square(path.evaluation.residuals) > squares - WORTH:  # few replicates, of some captures
+        path.back_to(before)
+    else:
+        step.intervals |= intervals

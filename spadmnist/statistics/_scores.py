@@ -23,7 +23,6 @@ from ..kernels import inline, jit
 _FEW = 128  # up to so many detections the law of their pairs is worked out exactly
 _THIN = 0.1  # and if they fill less than this share of the slots, so that slots hardly matter
 _SPARSE = 30.0  # expectations below it are no normal variable
-_FINITE = 37.0  # scores up to it have tails (1e-300) that are doubles
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -59,21 +58,14 @@ def poisson_score(count: np.ndarray | float, mean: np.ndarray | float, share: np
     few = mean < _SPARSE
     if few.any():
         exact = _exact_score(count[few], mean[few], share[few])
-        score[few] = np.where(np.abs(exact) < _FINITE, exact, _beyond(score[few]))
+        score[few] = np.where(np.abs(exact) < 6.7, exact, score[few])
     return score
 
 
 def _poisson_score_of_one(count: float, mean: float, share: float) -> float:
     """`poisson_score` of one number: much quicker, for it is needed for every cell of every recording."""
-    if mean >= _SPARSE:
-        return float(wilson_hilferty(count + share, mean))
-    exact = float(_exact_score(count, mean, share))
-    return exact if abs(exact) < _FINITE else float(_beyond(wilson_hilferty(count + share, mean)))
-
-
-def _beyond(score: Any) -> Any:
-    """Score of a count whose tails are no doubles any more: a larger count has a larger score, all the same."""
-    return np.copysign(np.maximum(np.abs(score), _FINITE), score)
+    exact = float(_exact_score(count, mean, share)) if mean < _SPARSE else math.inf
+    return exact if abs(exact) < 6.7 else float(wilson_hilferty(count + share, mean))
 
 
 def wilson_hilferty(count: Any, mean: Any) -> Any:

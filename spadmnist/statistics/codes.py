@@ -12,7 +12,6 @@ from ..recording import COMMON_PERIOD
 from . import Recording, Statistic, Summary
 from ._counting import of_detections, per_cent
 from ._frames import first_stamps
-from ._scores import shares
 
 # All periods below divide it: a histogram of stamps modulo this number holds those of all of them.
 _COMMON = COMMON_PERIOD
@@ -83,8 +82,7 @@ class CodePeriods(Statistic):
     Cells: the 76 periods from 2 to 1000 ticks that divide 672,000; their prime factors are 2, 3, 5 and 7. `codes` shows
     the codes of one period in many cells; here each period has one.
     Law: normal, as the cube root of chi squared of the codes' counts (Wilson and Hilferty), with one degree of freedom
-    less than codes. A random score where there are too few detections: a cell that is always 0 would make all others
-    look too far out.
+    less than codes. 0 where there are too few detections.
     Shows: unequal codes that repeat with an unknown period.
     """
 
@@ -95,8 +93,6 @@ class CodePeriods(Statistic):
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Normal scores of the periods."""
-        from scipy import special
-
         periods = _allowed(recording)
         if not periods:
             return None
@@ -107,8 +103,7 @@ class CodePeriods(Statistic):
         products = np.array([counts @ counts for counts in (folded[period].astype(np.float64) for period in periods)])
         squares = products * axis / max(total, 1.0) - total
         enough = total * total >= 2 * _COINCIDENCES * axis
-        silent = special.ndtri(shares(np.append(recording.totals, folded[periods[0]]), len(periods)))
-        values = np.where(enough, (np.cbrt(squares / freedom) - (1 - part)) / np.sqrt(part), silent)
+        values = np.where(enough, (np.cbrt(squares / freedom) - (1 - part)) / np.sqrt(part), 0.0)
         uneven = np.where(enough, (squares - freedom) / max(total, 1.0), 0.0)  # squared relative spread of the widths
 
         def where(cell: int) -> str:

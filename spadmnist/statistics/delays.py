@@ -70,8 +70,7 @@ class Delays(Statistic):
         counts = steps.joined(counts)
         most = counts.max(axis=1)
         chance = steps.joined(_meeting(n.reshape(rows, columns)).ravel()) * step / looked_at
-        share = shares(np.append(recording.totals, most), most.size)  # another one for every recording
-        scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, share)
+        scores = largest_score(most, np.maximum(chance, _LEAST_CHANCE), delays, shares(most, most.size))
 
         def where(cell: int) -> str:
             k = int(counts[cell].argmax())

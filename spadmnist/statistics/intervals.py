@@ -279,8 +279,8 @@ class Rescaled(Statistic):
 class RescaledLag(Statistic):
     """Correlation of a pixel's rescaled intervals (see `rescaled`) 1, 2, 3, 5, 10 and 20 apart.
 
-    Law: normal, with spread 1/sqrt(products), as the mean product of many independent bounded numbers; a random score
-    below 300 products. Intervals of a Poisson process with dead time are independent.
+    Law: normal, with spread 1/sqrt(products), as the mean product of many independent bounded numbers; 0 below 300
+    products. Intervals of a Poisson process with dead time are independent.
     Shows: a rate that changes slowly (blinking, drift, source noise), and afterpulses, which come in pairs.
     """
 
@@ -291,12 +291,9 @@ class RescaledLag(Statistic):
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Correlations in units of their spread."""
-        from scipy import special
-
         _, sums, products = _rescale(recording)
         spread = 1 / np.sqrt(np.maximum(products, 1))
-        few = special.ndtri(shares(np.append(recording.totals, products), len(_LAGS)))
-        values = np.where(products < _FEWEST, few, 12 * sums * spread)
+        values = np.where(products < _FEWEST, 0.0, 12 * sums * spread)
 
         def where(cell: int) -> str:
             return "an interval and the next" if cell == 0 else f"intervals {_LAGS[cell]} apart"

@@ -341,8 +341,8 @@ class Tails(Statistic):
     """Mean rate of the lowest and of the highest pixels relative to the typical pixel.
 
     Cells: the lowest and the highest quarter, twelfth, and so on by threes, of at least 16 pixels each. The typical
-    pixel is the mean without the lowest and the highest tenth (at least two detections). Rates are corrected for saturation and
-    dead time.
+    pixel is the mean without the lowest and the highest tenth (at least two detections). Rates are corrected for
+    saturation and dead time.
     Law: normal, for means of many pixels. Of the highest pixels the logarithm is taken, because they are skewed.
     Shows: PDP spread (both sides), lazy pixels (low side), a spread of dark count rates or hot pixels (high side).
     """

@@ -187,16 +187,3 @@ def test_scores_of_few_share_less_than_their_counts(mean: float) -> None:
     counted = [scores.Pairs(*(np.asarray(m) for _ in range(3))) for m in (mean, 2 * mean)]
     first, shared = scores.nested(counted)
     assert first == 0 and shared == pytest.approx(np.corrcoef(z)[0, 1], abs=0.02)
-
-
-@pytest.mark.parametrize("mean", [1e-6, 1e-4, 1e-2, 0.3, 5.0, 29.0])
-def test_the_score_of_a_count_rises_with_it_and_is_that_of_its_tail(mean: float) -> None:
-    """Also of rare counts: two pairs where one in a million is expected are a chance of 1e-12, 7.2 sigma."""
-    counts = np.arange(0.0, 400.0)
-    found = scores.poisson_score(counts, mean, 0.5)
-    assert np.all(np.diff(found) >= 0) and np.all(np.diff(found[:20]) > 0)
-    law = scores.Pairs(np.array(mean), np.array(mean), np.array(mean))
-    assert [scores.pooled_score(n, law, 0.5) for n in counts] == pytest.approx(found, rel=1e-12)
-    for n in (1, 2, 3, 4):
-        tail = stats.poisson.sf(n, mean) + 0.5 * stats.poisson.pmf(n, mean)
-        assert found[n] == pytest.approx(stats.norm.isf(tail), rel=1e-6, abs=1e-9)
