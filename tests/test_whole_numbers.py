@@ -25,7 +25,7 @@ def sensor(*more: sp.effects.Effect) -> sp.Sensor:
 @pytest.mark.slow
 @pytest.mark.parametrize("listed", [True, False])
 def test_crosstalk_that_reaches_far_is_found_with_its_reach(listed: bool) -> None:
-    """1 % in a neighbour, and 0.2 % / d to six pitches. Beside a bare sensor a near crosstalk stands for it at first."""
+    """1 % in a neighbour, and 0.2 % / d to six pitches; to a bare sensor a near crosstalk is added first."""
     far = sensor(sp.effects.Crosstalk(**NEAR, reach=6.0, far_ratio=0.2))
     light = {"wavelength": 500e-9, "irradiance": 2e3 / 0.3 * PHOTON / PIXEL, "relative_uncertainty": 0.02}
     captures = [sp.Capture("dark", "tr", dark=True, exposure=1.0), sp.Capture("flat", "tr", exposure=0.1, **light)]
