@@ -17,7 +17,7 @@ from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
 from spadmnist.inference.light_levels import closed_form, in_counters, last_digit, level_for, rising_until
-from spadmnist.inference.reduction import reduce_with
+from spadmnist.inference.reduction import ReducedCapture, early_ticks, reduce_with, total_of
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
 from spadmnist.statistics import Statistic, Summary
@@ -95,6 +95,37 @@ def test_half_of_the_light_is_seen_all_the_same(which: str) -> None:
     made = sp.simulate(model, dim, seed=3)
     data = in_memory("dim", model.layout, [dataclasses.replace(made.recording(c.id), capture=c) for c in captures])
     assert comparison.compare(model, data, 0, None, 1, 48).verdict == "fails"
+
+
+@pytest.mark.parametrize("number", [7.0, 12.0, 20.0])
+def test_first_stamps_of_every_frame_give_a_free_light_level(number: float) -> None:
+    """Their number is that of the frames at any such level; how early they come says which.
+
+    By the number alone the misfit of a right model was 226 at 20 events in a frame, and 1.5 to 2.2 at 10.
+    """
+    capture = sp.Capture("f", "str", wavelength=500e-9, **FRAMES)
+    lamp = dataclasses.replace(capture.light, level=irradiance(number / FRAME), kind_of_level="irradiance")
+    for seed in (1, 2):
+        made = sp.simulate(sensor(), [dataclasses.replace(capture, light=lamp)], seed=seed).recording("f")
+        data = in_memory("free", sensor().layout, [dataclasses.replace(made, capture=capture)])
+        found = comparison.compare(sensor(), data, 0, None, 1, 48)
+        assert found.verdict == "adequate", [(c.statistic, c.capture, c.p_value) for c in found.failing]
+        late = sensor(sp.effects.Jitter(sigma=20e-9))  # of stamps that come some 100 ns after the start
+        assert comparison.compare(late, data, 0, None, 1, 48).verdict == "fails"
+
+
+def test_early_stamps_are_counted_where_nearly_every_frame_has_one() -> None:
+    captures = [lit("f", "str", rate, **FRAMES) for rate in (2e5, 1e6)]
+    dim, full = (sp.simulate(sensor(), [capture], seed=1).recording("f") for capture in captures)
+    assert early_ticks(dim) is None and total_of(dim, None) == dim.totals.sum()
+    early = early_ticks(full)
+    assert early is not None and early == pytest.approx(math.log(4) / 1e6 / 1e-10, rel=0.05)
+    share = total_of(full, early) / (1000 * 16)
+    assert 0.75 <= share < 0.76
+    seen = ReducedCapture.of(full, reduced=False)
+    assert seen.counted.conditions.frame_time == pytest.approx(early * 1e-10)
+    assert seen.total == share * 16000 and seen.detections == full.totals.sum()
+    assert early_ticks(full.on_ticks(FRAME / 2)) is None  # 0.99 of them within the first tick
 
 
 @pytest.mark.parametrize("load", [0.0, 0.1, 0.5, 0.8, 1.0, 1.5, 4.0])

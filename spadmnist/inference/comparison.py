@@ -229,7 +229,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     several = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, evaluation.residuals)
     together = {check.clearest: check for check in several}
     for id, seen in replicates.seen.items():
-        checks += _level_checks(replicates.start, seen.capture, seen.total, evaluation.rates[id], levels)
+        checks += _level_checks(replicates.start, seen.counted, seen.total, evaluation.rates[id], levels)
         for name, summary in seen.summaries.items():
             judged = evaluation.judgements.get((id, name))
             if judged is not None:

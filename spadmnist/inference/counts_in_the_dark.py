@@ -86,7 +86,7 @@ def _level(replicates: Replicates, id: str) -> float:
     stated = twin.photons_at(seen.capture, replicates.start.layout)
     if stated is not None:
         return stated
-    return level_for(closed_form(replicates.start, seen.capture), seen.total, None)
+    return level_for(closed_form(replicates.start, seen.counted), seen.total, None)
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def physical_errors(
         expected = null.expected(seen.total)[0] + (shift.shifts.get(cell, 0.0) if shift else 0.0)
         try:
             with plugins.blaming(statistic):
-                error = float(statistic.physical_error(seen.summaries[cell[1]].values, expected, z, seen.total))
+                error = float(statistic.physical_error(seen.summaries[cell[1]].values, expected, z, seen.detections))
                 if not math.isfinite(error):
                     raise ValueError(f"physical_error must be a finite number, not {error}")
         except EffectError:

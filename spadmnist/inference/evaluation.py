@@ -194,10 +194,11 @@ def _evaluate(
         centre, stated, expected, half = centres[id]
         factors = np.exp(half * spread)
         about[id] = centre, stated, expected, factors
-        # the entry does not depend on the data
+        # the entry does not depend on the data, but for the ticks that count
         if remember and sensors.alike and centre == stated and id not in before:
             sensor = sensors.of(id, 0)
-            entries[id] = replicate_cache.entry_name(sensor, seen.capture, half, replicates.seed, replicates.dead)
+            rest = half, replicates.seed, replicates.dead, seen.early
+            entries[id] = replicate_cache.entry_name(sensor, seen.capture, *rest)
             found = replicate_cache.recall(entries[id])
             # a statistic that only a later replicate lacks is in none of a longer entry
             if found is not None and (len(found.numbers) <= n or seen.summaries.keys() <= found.values.keys()):
@@ -216,7 +217,7 @@ def _evaluate(
             replicate_cache.keep(entries[id], made)
         evaluation.made[id] = made
         law, scatter = law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
-        most = most_detections(replicates.seen[id].capture, sensors.one.layout.pixels)
+        most = most_detections(replicates.seen[id].counted, sensors.one.layout.pixels)
         evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter, most)
         evaluation.factors[id] = factors
         for name, summary in replicates.seen[id].summaries.items():
@@ -321,9 +322,9 @@ def _centres(replicates: Replicates, sensors: Model, without: Collection[str] = 
             off = float(logs.mean()) - math.log(expected(level))
             if abs(off) > half + noise:
                 seen = replicates.seen[id]
-                most = most_detections(seen.capture, sensors.one.layout.pixels)
+                most = most_detections(seen.counted, sensors.one.layout.pixels)
                 # the total at which the closed form would have to be, for the measured one to come out
-                start, half = levels_about(expected, seen.total / math.exp(off), stated, seen.capture, most)
+                start, half = levels_about(expected, seen.total / math.exp(off), stated, seen.counted, most)
             out[id] = start, stated, expected, half
             if abs(math.log(start / level)) > half + noise:
                 at[id] = start

@@ -74,7 +74,7 @@ def _menu(replicates: Replicates, evaluation: Evaluation) -> Iterator[tuple[str,
     rates = {}
     for id, seen in replicates.seen.items():
         if seen.counts is not None and seen.total > 0:
-            rates[id] = seen.total / seen.capture.conditions.exposure
+            rates[id] = seen.detections / seen.capture.conditions.exposure
     lit = sorted((id for id in rates if not replicates.seen[id].capture.light.dark), key=lambda id: rates[id])
     dark = [id for id in rates if replicates.seen[id].capture.light.dark]
     for id in dark[:1]:

@@ -48,7 +48,7 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
             errors[coordinate.key] = coordinate.error(v.low, v.high)
     mapped = any(step.candidate.carrier for step in path.steps)
     try:
-        data = recordings(measurement, replicates.start, {id: seen.total for id, seen in replicates.seen.items()})
+        data = recordings(measurement, replicates.start, {id: seen.detections for id, seen in replicates.seen.items()})
         found = maximise(sensor, data, wanted, start=start, errors=errors, mapped=mapped)
     except NoLikelihood:
         return

@@ -327,7 +327,7 @@ def variances_by_pixels(path: ModelPath, step: Step, maps: Mapping[Key, pixel_ma
     pattern = Effect.registry.find(step.candidate.effect).is_pattern
     if not (pattern and step.coordinates and lights and lit):
         return np.zeros(len(step.coordinates))
-    id = max(lit, key=lambda i: replicates.seen[i].total)
+    id = max(lit, key=lambda i: replicates.seen[i].detections)
     columns = []
     for coordinate in step.coordinates:
         u = coordinate.coordinate(float(path.values[coordinate.key]))

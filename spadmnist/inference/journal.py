@@ -55,7 +55,7 @@ class Journal:
         capture, second = seen.half_of or (seen.capture, None)
         digest = hashlib.sha256(np.asarray(photons, float).tobytes() + np.asarray(numbers, np.uint64).tobytes())
         for sensor in sensors:
-            name = replicate_cache.entry_name(sensor, capture, second, *more)
+            name = replicate_cache.entry_name(sensor, capture, second, seen.early, *more)
             if name is None:
                 return None
             digest.update(name.encode())

@@ -366,8 +366,8 @@ class Nuisance:
 
 
 def expected_total(replicates: Replicates, sensor: Sensor, id: str) -> Callable[[float], float]:
-    """The function level -> detections of the array in a capture; in the dark the level is a factor on the rates."""
-    capture = replicates.seen[id].capture
+    """The function level -> the total of a capture; in the dark the level is a factor on the rates."""
+    capture = replicates.seen[id].counted
     return closed_form(InTheDark.of(sensor) if capture.light.dark else sensor, capture)
 
 
@@ -412,7 +412,7 @@ def central_level(
         sensor: the sensor whose closed forms hold.
         seen: the reduced capture.
     """
-    capture = seen.capture
+    capture = seen.counted
     if capture.light.dark:
         sensor, stated = InTheDark.of(sensor), 1.0
     else:

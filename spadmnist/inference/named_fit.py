@@ -133,7 +133,7 @@ def _maximum_likelihood(
     """The maximum-likelihood fit of the wanted changes to all captures; raises NoLikelihood where there is none."""
     if any(capture.mean is not None for capture in measurement.captures):
         raise NoLikelihood("a mean alone")
-    totals = {id: seen.total for id, seen in replicates.seen.items()}
+    totals = {id: seen.detections for id, seen in replicates.seen.items()}
     return maximise(replicates.start, recordings(measurement, replicates.start, totals), wanted)
 
 

@@ -25,7 +25,7 @@ from . import memory
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, maps_added
 from .models import InTheDark, Model, Packed
-from .reduction import ReducedCapture, halves_of, statistics_for, summaries_of
+from .reduction import ReducedCapture, halves_of, statistics_for, summaries_of, total_of
 
 if TYPE_CHECKING:
     from .journal import Journal
@@ -69,7 +69,7 @@ class CaptureReplicates:
 
     Attributes:
         numbers: (replicates,) the numbers that seed each of them.
-        totals: (replicates,) detections of the whole array.
+        totals: (replicates,) detections of the whole array that inform the light level (`ReducedCapture.total`).
         values: (replicates, cells) by statistic.
         laws: (law, scale of the cells) by statistic, as in `Summary`.
     """
@@ -97,6 +97,7 @@ class _Task:
         hasty: without costly statistics.
         names: of the statistics; all where it is empty.
         second: of a half, whether it is of the second, fourth, ... blocks of time; None for a whole capture.
+        early: ticks of a frame whose first stamps are counted in the total; None where all are.
     """
 
     models: Sequence[Packed]
@@ -108,12 +109,13 @@ class _Task:
     hasty: bool
     names: Collection[str]
     second: bool | None
+    early: int | None
 
 
 def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
     """The replicates of one capture, reduced, in a worker."""
     capture, photons, numbers = task.capture, task.photons, task.numbers
-    totals: list[int] = []
+    totals: list[float] = []
     found: dict[str, list[Summary]] = {}
     task.models[0].sensor  # noqa: B018  # the user's own statistics come with it
     known = [
@@ -126,7 +128,7 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
             assert half is not None  # the measurement's own half is there
             recording = half
         recording = recording.beside(task.dead)
-        totals.append(int(recording.totals.sum()))
+        totals.append(total_of(recording, task.early))
         for name, summary in summaries_of(known, recording).items():
             found.setdefault(name, []).append(summary)
 
@@ -263,7 +265,7 @@ class Replicates:
         seen = self.seen[id]
         capture, second = seen.half_of or (seen.capture, None)
         frames = 0 if capture.modality == "tr" else capture.conditions.frames * self.start.layout.pixels
-        if seen.total + frames < _FEW_EVENTS:
+        if seen.detections + frames < _FEW_EVENTS:
             return 0.0
         sensor = InTheDark.of(sensor) if capture.light.dark else sensor
         needed = memory.bytes_with(sensor, capture, float(photons.max()), second is not None)
@@ -292,7 +294,7 @@ class Replicates:
         seen = self.seen[id]
         capture = seen.capture if seen.half_of is None else seen.half_of[0]
         whole = 1 if seen.half_of is None else 2  # for a half the whole is simulated
-        return work_of(capture, whole * seen.total, self.start.layout.pixels, twin.draws_bits(sensor, capture))
+        return work_of(capture, whole * seen.detections, self.start.layout.pixels, twin.draws_bits(sensor, capture))
 
     # --- simulating ----------------------------------------------------------------------------------------------
 
@@ -334,7 +336,7 @@ class Replicates:
                 del sensors  # there may be many, with a map each
                 for part in parts:
                     models = packed if model.alike else [packed[i] for i in part]
-                    rest = self.seed, self.dead, hasty, some_of[k], second
+                    rest = self.seed, self.dead, hasty, some_of[k], second, self.seen[id].early
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
                 tasks[k], out[k] = [], CannotSimulate.because(error)

@@ -145,7 +145,7 @@ def brightest(replicates: Replicates, one: SetupExplanation) -> str | None:
     named = {id for factor in one.factors for id in factor.captures}
     rates = {}
     for id, seen in replicates.seen.items():
-        c = seen.capture.conditions
+        c = seen.counted.conditions
         if not seen.capture.light.dark:  # frames may have gaps between them
             rates[id] = seen.total / (c.exposure if seen.capture.modality == "tr" else c.frames * c.frame_time)
     most = max(rates, key=lambda id: rates[id], default=None)
@@ -187,7 +187,7 @@ def exposure_factor(
     Args:
         log, error: of the factor on the level, with its standard error.
     """
-    capture, sensor = replicates.seen[id].capture, evaluation.sensors.mean_sensor(id)
+    capture, sensor = replicates.seen[id].counted, evaluation.sensors.mean_sensor(id)
     level = float(evaluation.rates[id].stated or evaluation.rates[id].level)
     clock = capture.conditions
 

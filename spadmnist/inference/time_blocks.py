@@ -132,7 +132,7 @@ def jacobian_of_halves(
             out[name, statistic] = new = np.zeros((len(here.values), whole.shape[1]))
             if not law_of(here.law, here.scale is not None).spectrum:
                 mine, its = same_places(here, there)
-                share = half.seen[name].total / max(replicates.seen[id].total, 1.0)
+                share = half.seen[name].detections / max(replicates.seen[id].detections, 1.0)
                 new[mine] = whole[its] * math.sqrt(share)
     return out
 
