@@ -170,3 +170,17 @@ def test_light_that_hardly_tells_is_done_without_and_other_light_is_not(tmp_path
     sensor, data = lab(tmp_path / "c", DIM, dead=50)
     with pytest.raises(AssertionError, match="a model was simulated"):
         fit(sensor, data)
+
+
+@pytest.mark.parametrize(("rate", "verdict"), [(10e3, "adequate"), (10.2e3, "explained")])
+def test_what_all_pixels_have_in_common_is_seen_in_the_total(rate: float, verdict: str, tmp_path: Path) -> None:
+    """2 % more in 576 pixels of 200 counts each: 7 sigma in the total, 1.4 sigma in the squares of the pixels."""
+    found = fit(*lab(tmp_path, dark_counts__rate=rate))
+    assert found.verdict == verdict and not found.unexplained
+    assert (found.steps[0].significance > 5.5) == (verdict == "explained")
+    assert found.ladder[0]["misfit"] < 1.2
+
+
+def test_no_detection_where_none_is_expected_is_no_error_of_the_rate(tmp_path: Path) -> None:
+    found = fit(*lab(tmp_path, TR.replace("20 ms", "1 ns"), dark_counts__rate=1e-3))
+    assert found.verdict == "adequate" and found.ladder[0]["errors"]["mean_rate"] == 0

@@ -23,7 +23,8 @@ from ..sensor import Sensor
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .levels import LEAST_P
-from .light_levels import closed_form, level_for
+from .laws import poisson_scores
+from .light_levels import CLOSED, closed_form, level_for
 from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
@@ -96,25 +97,31 @@ class _Judged:
     Attributes:
         misfit: the mean square of the pixels' deviations, relative to what it is if the model is right.
         variance: of the misfit, if the model is right.
+        p_of_totals: the p-value of the totals of the captures, which are to the misfit what all pixels have in common.
     """
 
     misfit: float
     mean_rate: float
     map: float
     variance: float
+    p_of_totals: float
 
     def quantile(self, p: float) -> float:
         """The misfit that a right model exceeds with a probability of p."""
         return float(stats.gamma.isf(p, 1 / self.variance, scale=self.variance))
 
-    def significance(self, wider: float = 1.0) -> float:
-        """The significance of a misfit that is so many times too large, in standard deviations.
+    def p_value(self, wider: float = 1.0) -> float:
+        """The p-value of misfit and totals together: the smaller of the two, of two tests.
 
         Args:
-            wider: factor by which a right model may exceed 1.
+            wider: factor by which the misfit of a right model may exceed 1.
         """
         p = float(stats.gamma.sf(self.misfit / wider, 1 / self.variance, scale=self.variance))
-        return float(stats.norm.isf(max(p, LEAST_P) / 2))
+        return min(2 * min(p, self.p_of_totals), 1.0)
+
+    def significance(self, wider: float = 1.0) -> float:
+        """That p-value in standard deviations."""
+        return float(stats.norm.isf(max(self.p_value(wider), LEAST_P) / 2))
 
     def row(self, model: str) -> dict[str, Any]:
         errors = {"mean_rate": self.mean_rate, "map": self.map}
@@ -127,7 +134,7 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
     Args:
         errors: (pixels,) relative, of the sensor's rates.
     """
-    squares, totals, excess, means, variances = [], [], [], [], []
+    squares, totals, excess, means, variances, scores = [], [], [], [], [], []
     for id in ids:
         line = count_model.CountModel(replicates, id, 1.0)
         expected, counts = line.expected(sensor), line.seen.counts
@@ -141,11 +148,18 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
         share = (own + (errors * expected) ** 2) / variance
         means.append(share)
         variances.append(2 * share**2 + own / variance**2)  # the fourth moment of a Poisson count
-        totals.append(abs(math.log(max(float(counts.sum()), 0.5) / float(expected.sum()))))
+        total, mean_total = float(counts.sum()), float(expected.sum())
+        # a map of other counts has the errors of their total, and the closed forms theirs
+        known = max(float(np.sum((errors * expected) ** 2)), mean_total) if np.any(errors) else 0.0
+        wider = (float(own.sum()) + known + (CLOSED * mean_total) ** 2) / max(mean_total, 1e-300)
+        score = float(poisson_scores(np.array([total]), np.array([mean_total]))[0])
+        scores.append(score / math.sqrt(max(wider, 1.0)))
+        totals.append(abs(math.log(max(total, 0.5) / mean_total)) if abs(score) > 1 else 0.0)
         excess.append(math.sqrt(max(float(np.mean(apart**2 - own)), 0.0)) / max(float(expected.mean()), 1e-12))
     mean = max(float(np.mean(means)), _LEAST_MEAN)
     spread = float(np.mean(variances)) / np.size(variances) / mean**2
-    return _Judged(float(np.mean(squares)) / mean, float(np.mean(totals)), float(np.mean(excess)), spread)
+    p_of_totals = float(stats.chi2.sf(float(np.square(scores).sum()), len(scores)))
+    return _Judged(float(np.mean(squares)) / mean, float(np.mean(totals)), float(np.mean(excess)), spread, p_of_totals)
 
 
 def _answer(
@@ -166,11 +180,11 @@ def _answer(
     else:
         found = _judge(replicates, dark, with_values(replicates.start, {candidate.carrier: map_.values()}), map_.error)
     rest: list[dict[str, Any]] = []
-    if found.misfit > _WIDER * found.quantile(_SURE):  # the rates differ between blocks of time
+    if found.p_value(_WIDER) < _SURE:  # the rates differ between blocks of time
         clear = found.significance(_WIDER)
         where = "pixels of one half of the blocks of time, by a map of the other"
         rest.append({"statistic": "pixel_map", "capture": dark[0], "significance": clear, "where": where})
-    right = "explained" if start.misfit > start.quantile(_SURE) else "adequate"
+    right = "explained" if start.p_value() < _SURE else "adequate"
     mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
     step = Step(candidate, results, found.misfit, start.significance(), f"mean of the map {100 * (mean - 1):+.2f} %")

@@ -37,7 +37,7 @@ _NOISE = 4.0  # standard deviations of the counts: within it a total is the expe
 # of a logarithm: the noise of the counts beyond which it extends the range of the replicates; the most that it counts
 _MUCH, _MOST_NOISE = 0.05, 0.7
 _DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
-_CLOSED = 5e-4  # relative error of the closed forms, at most: it adds to the scatter where the mean alone is known
+CLOSED = 5e-4  # relative error of the closed forms, at most: it adds to the scatter where the mean alone is known
 LEAST_ELASTICITY = 0.01  # the least elasticity of a total that informs the light level
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm, lit and dark: the most that a level moves for as many detections
 # expected detections: the least that inform the level; below the other, none are expected
@@ -235,7 +235,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
     # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one
     caused = 0.0 if capture.counts_events else sum(sensor.caused().values())
-    scatter = math.sqrt(share / mean + rounding**2 + _CLOSED**2 + caused**2)
+    scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
     totals = mean * np.exp(scatter * normal[order])
