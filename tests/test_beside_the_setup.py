@@ -13,7 +13,7 @@ import pytest
 from tinylab import bench_of, labs
 
 import spadmnist as sp
-from spadmnist.inference.conclusion import Notes
+from spadmnist.inference.conclusion import Notes, left_over
 from spadmnist.inference.levels import HALF_95
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose, is_as_stated, is_freed, take_setup_again
@@ -66,6 +66,19 @@ def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float,
     assert path.replicates.unstated == frozenset() and path.evaluation is stated
     take_setup_again(path, notes)  # the step is gone
     assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
+
+
+def test_the_set_up_excuses_the_totals_that_it_explains_and_no_others() -> None:
+    totals, other = (SimpleNamespace(cell=cell) for cell in (TOTALS, ("flat", "spacing")))
+    path: Any = SimpleNamespace(failed=[totals], replicates=SimpleNamespace(unstated=frozenset()))
+    explained = Notes([dict(ENTRY)], explained=True)
+    assert left_over(path, explained) == [] and left_over(path, Notes([])) == [totals]
+    path.replicates.unstated = frozenset({"flat"})  # whose level is free: the total of another capture fails
+    assert left_over(path, explained) == [totals]
+    path.failed, path.replicates.unstated = [totals, other], frozenset()
+    assert left_over(path, explained) == [totals, other]
+    path.failed = []
+    assert left_over(path, explained) == []
 
 
 def test_levels_are_not_freed_where_a_change_of_the_sensor_is_a_tie(tmp_path: Path) -> None:

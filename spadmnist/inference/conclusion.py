@@ -59,9 +59,13 @@ class Notes:
 
 
 def left_over(path: ModelPath, notes: Notes) -> list[BlockCheck]:
-    """The checks that fail with all steps; none where these are totals that the set-up explains."""
+    """The checks that fail with all steps; none where these are totals that the set-up explains.
+
+    Where the levels that it explains are free, totals that fail are those of other captures.
+    """
     left = path.failed
-    return [] if left and notes.explained and all(b.cell[0] == "" for b in left) else left
+    among = notes.explained and not path.replicates.unstated
+    return [] if among and all(b.cell[0] == "" for b in left) else left
 
 
 def so_far(path: ModelPath, start: Evaluation, notes: Notes) -> Diagnosis:

@@ -95,9 +95,8 @@ def chances_of_repeats(frames, same, likely, log_best, loss, least, of_stamp):
 
 
 @jit
-def faults(stamps, offsets, end):
-    """(stamps that are smaller than the one before in the same row, equal to it, and those behind `end`)."""
-    smaller = 0
+def equal_and_late(stamps, offsets, end):
+    """(stamps that are equal to the one before in the same row, those behind `end`); rows ascend."""
     equal = 0
     late = 0
     for row in range(offsets.size - 1):
@@ -105,9 +104,8 @@ def faults(stamps, offsets, end):
             if not stamps[i] <= end:  # one may have been rounded to the end
                 late += 1
             if i > offsets[row]:
-                smaller += stamps[i] < stamps[i - 1]
                 equal += stamps[i] == stamps[i - 1]
-    return smaller, equal, late
+    return equal, late
 
 
 class RepeatedFrames(Statistic):
@@ -241,38 +239,6 @@ class RareFrames(Statistic):
         return Summary(values, "poisson", lambda cell: f"frames {names[cell]}", size)
 
 
-def _faults(recording: Recording) -> tuple[int, int, int]:
-    """`faults` of a recording."""
-    if "faults" not in recording._kept:
-        assert recording.events is not None
-        found, unit = stamps(recording)
-        recording._kept["faults"] = faults(found, recording.events.offsets, recording.conditions.exposure / unit)
-    return recording._kept["faults"]  # type: ignore[return-value]
-
-
-class Disorder(Statistic):
-    """Time stamps that are smaller than the one before in the same pixel.
-
-    Law: exact. There are none.
-    Shows: stamps out of order, an overflow of the coarse counter.
-    """
-
-    modalities = ("tr",)
-    unit = "1"
-
-    def reduce(self, recording: Recording) -> Summary | None:
-        if not has_data(recording) or recording.events is None:
-            return None
-        smaller = _faults(recording)[0]
-        events = max(1, len(recording.events))
-
-        def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            text = f"{measured:g} stamps go back in time, {whole(expected)} expected"
-            return text, float((measured - expected) / events)
-
-        return Summary(np.array([float(smaller)]), "exact", lambda cell: "successive stamps of a pixel", size)
-
-
 class EqualStamps(Statistic):
     """Time stamps that occur twice in a pixel, and stamps after the end of the exposure.
 
@@ -286,7 +252,8 @@ class EqualStamps(Statistic):
     def reduce(self, recording: Recording) -> Summary | None:
         if not has_data(recording) or recording.events is None:
             return None
-        _, equal, late = _faults(recording)
+        found, unit = stamps(recording)
+        equal, late = equal_and_late(found, recording.events.offsets, recording.conditions.exposure / unit)
         events = max(1, len(recording.events))
         names = ("equal stamps of a pixel", "stamps behind the end of the exposure")
 
