@@ -17,6 +17,7 @@ from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
 from spadmnist.inference.light_levels import closed_form, in_counters, last_digit, level_for, rising_until
+from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.reduction import ReducedCapture, early_ticks, reduce_with, total_of
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
@@ -112,6 +113,15 @@ def test_first_stamps_of_every_frame_give_a_free_light_level(number: float) -> N
         assert found.verdict == "adequate", [(c.statistic, c.capture, c.p_value) for c in found.failing]
         late = sensor(sp.effects.Jitter(sigma=20e-9))  # of stamps that come some 100 ns after the start
         assert comparison.compare(late, data, 0, None, 1, 48).verdict == "fails"
+
+
+@pytest.mark.parametrize(("id", "full"), [("every bit is 1", True), ("counters of 15 with 12", False)])
+def test_a_full_capture_is_said_to_test_hardly_anything(id: str, full: bool) -> None:
+    """An adequate model of full frames says nothing of the sensor."""
+    model, captures = RIGHT[id]
+    found = comparison.compare(model, sp.simulate(model, captures, seed=1), 0, None, 1, 16)
+    assert found.verdict == "adequate" and found.full == (("f",) if full else ())
+    assert after_comparison(found).startswith("take f with less light" if full else "spadmnist diagnose")
 
 
 def test_early_stamps_are_counted_where_nearly_every_frame_has_one() -> None:

@@ -86,6 +86,8 @@ class Comparison:
         replicates: of each capture.
         tolerance: relative; None for none.
         false_alarm_rate: probability that a right model fails.
+        crop: the part of the sensor that was measured: rows, columns; None for all of it.
+        full: the captures of which nearly every frame or counter is full: they test hardly anything.
     """
 
     sensor: str
@@ -98,7 +100,8 @@ class Comparison:
     replicates: int
     tolerance: float | None = None
     false_alarm_rate: float = FALSE_ALARM
-    crop: str | None = None  # the part of the sensor that was measured: rows, columns
+    crop: str | None = None
+    full: tuple[str, ...] = ()
 
     @property
     def failing(self) -> list[Check]:
@@ -267,6 +270,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         len(evaluation.replicate_residuals[TOTALS]),
         tolerance,
         crop=str(sensor.window) if sensor.window else None,
+        full=tuple(id for id, seen in replicates.seen.items() if seen.is_full(sensor)),
     )
 
 

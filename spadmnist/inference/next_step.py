@@ -13,6 +13,11 @@ _ANOTHER = "a measurement that it was not fitted to tests it"
 def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str = MEASUREMENT) -> str:
     """What follows a comparison. sensor, measurement: as the command named them, quoted for a shell."""
     if found.verdict == "adequate":
+        if found.full:
+            return (
+                f"take {' and '.join(found.full)} with less light: nearly all of it is full, so that it tests hardly "
+                "anything."
+            )
         return (
             f"spadmnist diagnose {sensor} {measurement} gives a 95 % upper limit on each effect; a brighter, a darker "
             "or a longer capture tests the model further."

@@ -10,6 +10,7 @@ import numpy as np
 from .. import plugins
 from ..errors import SpadError
 from ..recording import Capture, Recording
+from ..sensor import Sensor
 from ..statistics import Statistic, Summary
 from .blind_times import ShortestIntervals
 
@@ -20,6 +21,7 @@ _EMPTY_END = 10.0
 # share that is early. For c events in a frame, the number of frames with a detection has the information
 # c^2 exp(-c) / (1 - exp(-c)) on log c: 0.47 a frame at 0.95 (c = 3) and falling, 0.64 at 0.75; at most 0.65, at 0.80
 _FULL, _EARLY = 0.95, 0.75
+_FREE = 30.0  # detections for which there is room left: fewer of them test hardly anything; a rule of thumb
 _TOO_COARSE = 0.9  # share of frames within one tick: of more the ticks are too long for that; a rule of thumb
 
 
@@ -65,6 +67,16 @@ class ReducedCapture:
     def detections(self) -> float:
         """Detections of the whole array."""
         return self.total if self.counts is None else float(self.counts.sum())
+
+    def is_full(self, sensor: Sensor) -> bool:
+        """Whether so little of it is free that it tests hardly anything; of full first stamps, their times still do."""
+        if self.capture.modality not in ("qis", "counts"):
+            return False
+        c = self.capture.conditions
+        room = c.frames * float(sensor.layout.pixels)
+        if self.capture.modality == "counts":
+            room = c.count_frames * float(sensor.full_counts(c).sum())
+        return room - self.detections < _FREE
 
     @classmethod
     def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
