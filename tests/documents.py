@@ -3,7 +3,8 @@
 A shell block is run command by command, a Python block with the names of those before it in the same page. A block
 whose first line is a comment with the name of a file is that file. Of MATLAB each line is checked against the file that
 it reads; of a Makefile what it would run is asked. Code cells (`{code-cell}`) are run by the build of the pages; `text`
-is output, which nobody runs. `RULES` says which commands are run otherwise, and why.
+is output, which nobody runs, and `bibtex` is compared with CITATION.cff (`test_readme.py`). `RULES` says which commands
+are run otherwise, and why.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from spadmnist.experiments import PaperExperiment
 
 ROOT = Path(__file__).parents[1]
 MNIST = Path(__file__).parents[2] / "shared" / "mnist"
+NOT_RUN = ("text", "bibtex")  # languages of blocks
 _SLOW = r"^spadmnist (?:diagnose|fit|compare)\b|\b(?:sp|spadmnist)\.diagnose\("
 
 _CLUSTER = "it needs a scheduler and workers, which test_cluster.py starts"
@@ -225,7 +227,7 @@ class Reader:
             Path(block.file).write_text(block.text)
         elif block.language == "yaml":
             document.parse(block.text, block.place)
-        elif block.language != "text":
+        elif block.language not in NOT_RUN:
             takes = {"bash": self._shell, "python": self._python, "matlab": self._matlab, "make": self._make}
             takes[block.language](block)
 
