@@ -189,6 +189,7 @@ def test_every_method_and_public_name_has_a_section() -> None:
 
 
 def test_every_key_of_a_json_answer_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(formats.answers()) == {f"spadmnist-{name}/1" for name in ("comparison", "diagnosis", "fit")}
     for data in formats.answers().values():
         assert {key for key, _ in formats.keys(data)} <= set(formats.MEANINGS)
     monkeypatch.setattr(formats, "answers", lambda: {"spadmnist-planted/1": {"planted": 1.0}})

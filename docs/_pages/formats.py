@@ -75,6 +75,8 @@ MEANINGS = {
     "steps[].values.*.low": "lower end of the 95 % interval",
     "steps[].values.*.high": "upper end of the 95 % interval",
     "steps[].values.*.unit": "SI unit",
+    "steps[].values.*.method": "how it was estimated: by the exact `likelihood`, by `simulation`, of a map by "
+    "`counts`, `intervals` or the statistic that informs it",
     "steps[].misfit": "misfit after this step",
     "steps[].significance": "improvement in standard deviations",
     "steps[].material": "how far the step changes what is recorded, in words",
@@ -193,7 +195,11 @@ def answers() -> dict[str, dict[str, Any]]:
     told = list(compared.as_data()["nuisances"])
     lists: dict[str, Any] = {name: [] for name in ("setup", "unexplained", "ladder", "advice", "excluded")}
     found = Diagnosis("sensor", "lab", "explained", 60.0, 1.0, 1.2, told, [step], **lists)
-    return {data["format"]: data for data in (compared.as_data(), found.as_data())}
+    candidate, values = Candidate("per_pixel", "dark_counts", "rate", ()), {"sigma": Value(0.5, 0.4, 0.6, "", "counts")}
+    step = Step(candidate, values, 1.0, 20.0, "mean of the map +2 %")
+    lists |= {"in_sample": compared, "file": "fitted.yaml", "crop": "0:8,0:8", "compared": "the counts in the dark"}
+    fitted = Diagnosis("sensor", "lab", "explained", 4.0, 1.0, 1.2, told, [step], **lists, asked="fit")
+    return {data["format"]: data for data in (compared.as_data(), found.as_data(), fitted.as_data())}
 
 
 def _any(parameter: inspect.Parameter) -> Any:
