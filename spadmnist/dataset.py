@@ -61,7 +61,11 @@ class _Backend(Protocol):
 
 
 class Field(Generic[T]):
-    """One kind of data of a part, by image: `[i]`, `[a:b:step]`, `[[3, 1, 2]]`, an array of numbers or a mask."""
+    """One kind of data of a part, by image: `[i]`, `[a:b:step]`, `[[3, 1, 2]]`, an array of numbers or a mask.
+
+    What is asked for is read, or simulated, then. Of one number it gives the data of that image, otherwise those of
+    several images, (images, ...) of arrays. It has a length and can be iterated over.
+    """
 
     def __init__(self, length: int, get: Callable[[int, int], Any], one: Callable[[Any], Any]):
         self._length = length
@@ -99,7 +103,7 @@ def _first(value: Any) -> Any:
 
 
 class Reconstruction(Field[np.ndarray]):
-    """Images of one method: `[i]` raw, (rows, columns) float32; `.normalised[i]` divided by `.normalisation`."""
+    """Flux images of one method, a `Field`: `[i]` is (rows, columns) float32, raw, in the unit of the method."""
 
     def __init__(self, length: int, backend: _Backend, method: str):
         self._backend = backend
@@ -116,6 +120,7 @@ class Reconstruction(Field[np.ndarray]):
 
     @property
     def normalised(self) -> Field[np.ndarray]:
+        """The same divided by `normalisation`, 1; raw where the method is not normalised."""
         return Field(self._length, self._divided, _first)
 
     def _divided(self, start: int, stop: int) -> np.ndarray:
@@ -125,9 +130,10 @@ class Reconstruction(Field[np.ndarray]):
 
 
 class Image:
-    """One image of a part: its streams and fluxes, read as they are asked for; see `Part`.
+    """One image of a part: its streams and fluxes, read, or simulated, as they are asked for.
 
-    index: its number in the part; label: int, or None where the source has none; image: the 8-bit original.
+    Attributes:
+        index: its number in the part.
     """
 
     def __init__(self, part: Part, index: int):
@@ -139,30 +145,37 @@ class Image:
 
     @property
     def label(self) -> int | None:
+        """Its label; None where the source has none."""
         return None if self._part.labels is None else int(self._part.labels[self.index])
 
     @property
     def image(self) -> np.ndarray:
+        """The original, as the source has it: (rows, columns) uint8, uint16 or float32."""
         return self._part.images[self.index]
 
     @property
     def tr(self) -> Events:
+        """TR: the detections of its pixels as `spadmnist.Events`, row by row."""
         return self._part.tr[self.index]
 
     @property
     def frames(self) -> Frames:
+        """QIS and STR as they are stored, bits packed."""
         return self._part.frames[self.index]
 
     @property
     def counts(self) -> np.ndarray:
+        """(count frames, rows, columns) unsigned: the readout `counts`."""
         return self._part.counts[self.index]
 
     @property
     def qis(self) -> np.ndarray:
+        """(frames, rows, columns) uint8, 0 or 1."""
         return self._part.qis[self.index]
 
     @property
     def str(self) -> np.ndarray:
+        """(frames, rows, columns) float64, s since the start of the frame; the frame time without a detection."""
         return self._part.str[self.index]
 
     def reconstruction(self, method: Any, normalised: bool = False) -> np.ndarray:
@@ -182,13 +195,23 @@ class _ByMethod(dict[str, "Reconstruction"]):
 class Part:
     """One split at one light level. Nothing of it needs the whole split in memory.
 
-    tr: `Events` of an image's pixels, row by row; qis: (frames, rows, columns) uint8; str: (frames, rows, columns)
-    float64, s, the frame time where there is no detection; reconstruction: by method; images: the originals;
-    labels: (n,) uint8, or None where the source has none; tiles: of charts, `part.tiles.cut(image)` and
-    `part.tiles.labels`; readouts: what was recorded; stored: read from a dataset, or simulated when it is asked for.
-    Colour adds a leading channel axis. causes: what the numbers in `Events.cause` mean, where the causes were asked
-    for.
+    `part[i]` is one image, `part[a:b]` a smaller part. Colour adds a leading channel axis to each image.
+
+    Attributes:
+        images: the originals, a `Field`.
+        reconstruction: flux images by method, a `Reconstruction` each.
+        readouts: what was recorded, of `tr`, `str`, `qis`, `counts`.
+        shape: of an image, (rows, columns), or (channels, rows, columns).
+        stored: read from a dataset, or simulated when it is asked for.
+        causes: what the numbers in `Events.cause` mean, where the causes were asked for.
     """
+
+    images: Field[np.ndarray]
+    reconstruction: Mapping[str_, Reconstruction]
+    readouts: tuple[str_, ...]
+    shape: tuple[int, ...]
+    stored: bool
+    causes: tuple[str_, ...]
 
     def __init__(
         self,
@@ -206,10 +229,8 @@ class Part:
         self.stored = stored
         self.readouts = tuple(readouts)
         self.shape = shape
-        self.reconstruction: Mapping[str, Reconstruction] = _ByMethod(
-            {name: Reconstruction(length, backend, name) for name in methods}
-        )
-        self.images: Field[np.ndarray] = Field(length, backend.originals, _first)
+        self.reconstruction = _ByMethod({name: Reconstruction(length, backend, name) for name in methods})
+        self.images = Field(length, backend.originals, _first)
 
     def __len__(self) -> int:
         return self._length
@@ -248,6 +269,7 @@ class Part:
 
     @cached_property
     def labels(self) -> np.ndarray | None:
+        """(images,) uint8; None where the source has none."""
         return self._backend.labels()
 
     def to_dask(self, name: str_) -> Any:
@@ -260,7 +282,10 @@ class Part:
 
     @property
     def tiles(self) -> Tiles:
-        """The tiles of the chart that these images are of. Raises SpadError where they are of none, or of several."""
+        """The tiles of the chart that these images are of: `tiles.cut(image)`, `tiles.labels`.
+
+        Raises SpadError where they are of none, or of several.
+        """
         found = self._backend.tiles()
         if found is None:
             raise SpadError("these images are not of one chart; scene.images of a chart has source: chart")
@@ -275,6 +300,7 @@ class Part:
 
     @property
     def tr(self) -> Field[Events]:
+        """TR: `Events` of an image's pixels, row by row."""
         self._recorded("tr")
         return Field(self._length, partial(self._backend.recorded, what="tr"), _same)
 
@@ -292,11 +318,13 @@ class Part:
 
     @property
     def qis(self) -> Field[np.ndarray]:
+        """QIS: (frames, rows, columns) uint8, 0 or 1."""
         self._recorded("qis")
         return Field(self._length, partial(self._frames, what="qis", unpack=Frames.unpacked), _first)
 
     @property
     def str(self) -> Field[np.ndarray]:
+        """STR: (frames, rows, columns) float64, s since the start of the frame; the frame time without a detection."""
         self._recorded("str")
         return Field(self._length, partial(self._frames, what="str", unpack=Frames.stamps), _first)
 
@@ -350,6 +378,7 @@ class Dataset:
 
     @property
     def splits(self) -> tuple[str, ...]:
+        """Their names, "train" and "test" for one."""
         return tuple(self._splits)
 
     def __len__(self) -> int:

@@ -10,6 +10,8 @@ from numba import njit
 from .errors import SpadError
 from .events import Events
 
+__all__ = ["Frames", "TimeSurface", "VoxelGrid", "structured"]
+
 _jit = njit(cache=True, error_model="numpy", nogil=True)
 
 
@@ -48,7 +50,20 @@ class Grid:
 
 
 class Frames(Grid):
-    """Detections in `frames` bins of equal time; binary: 1 where there is one or more."""
+    """Detections in `frames` bins of equal time.
+
+    Args:
+        shape: of an image, (rows, columns), or (channels, rows, columns).
+        frames: number of bins.
+        exposure: s, from 0 on.
+        binary: 1 where there is one or more, as in QIS.
+
+    Called with `Events` it returns (bins, rows, columns) float32 of one image, with leading axes for several images and
+    for channels.
+
+    Raises:
+        SpadError: for a shape, number or time that is none, and where the events are of another number of pixels.
+    """
 
     def __init__(self, shape: Sequence[int], frames: int, exposure: float, binary: bool = False):
         super().__init__(shape, frames, exposure)
@@ -61,8 +76,9 @@ class Frames(Grid):
 class VoxelGrid(Grid):
     """Detections shared out between the two bins whose middles lie around them, in proportion.
 
-    A detection before the first middle, or behind the last one, is that bin's alone. Source: Zhu et al., Unsupervised
-    event-based learning of optical flow, CVPR 2019, eq. 1, without polarity.
+    A detection before the first middle, or behind the last one, is that bin's alone. Arguments and result are those of
+    `Frames`, `bins` those of `frames`. Source: Zhu et al., Unsupervised event-based learning of optical flow, CVPR
+    2019, eq. 1, without polarity.
     """
 
     def _into(self, offsets: np.ndarray, times: np.ndarray, out: np.ndarray) -> None:
@@ -72,7 +88,8 @@ class VoxelGrid(Grid):
 class TimeSurface(Grid):
     """exp(-(t - t_last) / tau) at the ends t of `bins` equal parts of the exposure; 0 before the first detection.
 
-    tau: s. Source: Lagorce et al., HOTS, IEEE TPAMI 39 (2017), eq. 3, without polarity.
+    tau: s. Other arguments and the result are those of `Frames`. Source: Lagorce et al., HOTS, IEEE TPAMI 39 (2017),
+    eq. 3, without polarity.
     """
 
     def __init__(self, shape: Sequence[int], tau: float, exposure: float, bins: int = 1):
@@ -88,8 +105,17 @@ class TimeSurface(Grid):
 def structured(events: Events, columns: int, unit: float | None = None) -> np.ndarray:
     """The events of one image in order of time, as programs for event cameras take them.
 
-    Returns (events,) with the fields x, y, t (int64) and p (bool, always true: a SPAD has no polarity). t: whole ticks
-    of the converter, or multiples of `unit` s, rounded down. Channels of colour lie below one another in y.
+    Args:
+        events: of one image.
+        columns: of the image.
+        unit: of t, s; None for whole ticks of the converter.
+
+    Returns:
+        (events,) with the fields x, y, t (int64) and p (bool, always true: a SPAD has no polarity). t is rounded down.
+        Channels of colour lie below one another in y.
+
+    Raises:
+        SpadError: without a unit for events that have no ticks, and for one that is not possible.
     """
     if unit is None and events.ticks is None:
         raise SpadError("unit: these events have no converter's ticks; give the unit of t in s, for example 1e-6")

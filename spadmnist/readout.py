@@ -46,10 +46,14 @@ def no_detection(frame_time: float, tick: float) -> int:
 class Frames:
     """Frames of many rows, a row being one pixel of one image.
 
-    bits: (rows, ceil(frames / 8)) uint8: is there a detection? Most significant bit first.
-    first: for each bit set, in order, the first stamp since the start of its frame; None where STR is not recorded.
-    frames: their number; frame_time: s.
-    cause, parent: for each bit set, in order, what made the detection, as in `Events`; None where not asked for.
+    Attributes:
+        bits: (rows, ceil(frames / 8)) uint8: is there a detection? Most significant bit first.
+        first: for each bit set, in order, the first stamp since the start of its frame, as `Events`; None where STR is
+            not recorded.
+        frames: number of frames.
+        frame_time: s.
+        pixels: rows per image.
+        cause, parent: for each bit set, in order, what made the detection, as in `Events`; None where not asked for.
     """
 
     bits: np.ndarray
@@ -93,6 +97,7 @@ class Frames:
         return [slice(image * self.pixels, (image + 1) * self.pixels) for image in range(images)]
 
     def images(self, start: int, stop: int) -> Frames:
+        """The images `start` to `stop` alone."""
         rows = slice(start * self.pixels, stop * self.pixels)
         first = None if self.first is None else self.first.images(start, stop)
         cause = parent = None

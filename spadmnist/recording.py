@@ -38,10 +38,13 @@ COMMON_PERIOD = 2**8 * 3 * 5**3 * 7
 class Light:
     """What fell on the sensor during a capture.
 
-    wavelength: m; level: irradiance in W/m^2 or lux, as `kind_of_level` ("irradiance", "lux") says, None where it is
-    not known. relative_uncertainty: standard deviation of the light's calibration, common to all captures;
-    own_uncertainty: the capture's own part. Both relative, 1. A dark capture has no wavelength. scene: the image that
-    the light follows, whose white has that level; None where it is the same on all pixels.
+    Attributes:
+        wavelength: m; None in a dark capture.
+        level: irradiance in W/m^2 or illuminance in lux, as `kind_of_level` says; None where it is not known.
+        kind_of_level: "irradiance" or "lux".
+        relative_uncertainty: relative standard uncertainty of the light's calibration, common to all captures.
+        own_uncertainty: that of this capture alone, relative.
+        scene: the image that the light follows, whose white has that level; None where it is the same on all pixels.
     """
 
     wavelength: float | None = None
@@ -61,9 +64,13 @@ class Light:
 class Capture:
     """One entry of a measurement: how it was made.
 
-    id: its name; modality: "tr", "str", "qis" or "counts"; conditions: exposure, frames, wavelength (SI).
-    mean: detections per pixel over the capture where that alone is known. tick: s, in which stamps are written; None
-    where they are written as the converter gives them.
+    Attributes:
+        id: its name.
+        modality: "tr", "str", "qis" or "counts".
+        light: what fell on the sensor, a `Light`.
+        conditions: exposure, frames and wavelength, a `spadmnist.Conditions`.
+        mean: detections per pixel over the capture where that alone is known; otherwise None.
+        tick: s, in which stamps are written; None where they are written as the converter gives them.
     """
 
     id: str

@@ -24,8 +24,11 @@ _LARGEST = 1 << 30  # bytes of a scene's file
 class Scene:
     """What share of white each pixel sees; scenes of the same values are equal.
 
-    name: of its file; stored: (rows, columns) as it lies there, uint8 (white 255) or float (0 to 1), read-only.
-    tiles: of the chart that it is, None where they are not known.
+    Attributes:
+        name: of its file.
+        stored: (rows, columns) as it lies there, uint8 (white 255) or float (0 to 1), read-only.
+        sha256: digest of the values.
+        tiles: of the chart that it is; None where they are not known.
     """
 
     name: str = field(compare=False)

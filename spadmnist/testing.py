@@ -34,6 +34,8 @@ from .sensor import Sensor
 from .signatures import BLOCKS, Shots
 from .streams import BLOCK, Streams
 
+__all__ = ["Report", "check_effect", "check_method", "strong"]
+
 MOVED = 6.0  # by so many standard errors the first block of `moves` must change at least
 STAYED = 5.5  # and by no more a block that is not named
 
@@ -63,9 +65,13 @@ _SCENE = np.array([int(bit) for bit in f"{0xC3A5_1E78_5AD2_3C96:064b}"], np.floa
 
 @dataclass
 class Report:
-    """What `check_effect` found: a verdict on each check, and by how many standard errors each statistic moved.
+    """What `check_effect` found. Printed, it is a table.
 
-    warnings: sentences on what is no fault of the effect, but should be mended.
+    Attributes:
+        name: of the effect.
+        checks: the verdict on each check, by its name: "kept", or what is to be said besides.
+        moved: by how many standard errors the effect moved each statistic, by the names of `signatures.BLOCKS`.
+        warnings: sentences on what is no fault of the effect, but should be mended.
     """
 
     name: str
@@ -80,10 +86,17 @@ class Report:
 
 
 def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
-    """Does an effect keep the contract? Raises AssertionError with one sentence where it does not.
+    """Does an effect keep the contract?
 
-    Returns what was found, to be printed; a docstring without a `Source:` is a warning there.
-    effect: the class or its name. parameters: values in SI in place of those that the contract chooses; see `strong`.
+    Args:
+        effect: the class or its name.
+        parameters: values in SI in place of those that the contract chooses; see `strong`.
+
+    Returns:
+        Report: what was found; a docstring without a `Source:` is a warning there.
+
+    Raises:
+        AssertionError: with one sentence, at the first check that the effect does not keep.
     """
     kind: type[Effect] = Effect.registry.find(effect) if isinstance(effect, str) else effect
     if not __debug__:
@@ -102,9 +115,15 @@ def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
 
 
 def check_method(method: type[Method] | str) -> None:
-    """Does a reconstruction method keep the contract? Raises AssertionError with one sentence where it does not.
+    """Does a reconstruction method keep the contract?
 
     Its image is finite, 0 where nothing was recorded, and that of each exposure whatever others stand beside it.
+
+    Args:
+        method: the class or its name.
+
+    Raises:
+        AssertionError: with one sentence, where it does not.
     """
     kind: type[Method] = Method.registry.find(method) if isinstance(method, str) else method
     sensor = _sensor(None, "paper", lacking=("dark",))
@@ -157,6 +176,15 @@ def strong(declared: Parameter) -> Any:
 
     What can switch the effect off is taken far from there, anything else from the middle of its range; a parameter
     that may vary over the array is a distribution, about off where the range lies on both sides of it.
+
+    Args:
+        declared: the parameter, `MyEffect.parameters["rate"]`.
+
+    Returns:
+        A number in SI, or a `Distribution`.
+
+    Raises:
+        AssertionError: where it has neither `search` nor a default.
     """
     if declared.search is None:
         assert declared.default is not None, f"no value is known for {declared.name}: give one, or declare `search`"

@@ -16,11 +16,12 @@ from .errors import SpadError
 class Tiles:
     """Where the tiles of a chart lie, and which images they are.
 
-    shape    (rows, columns) of the chart
-    size     (rows, columns) of every tile
-    corners  (n, 2) int64, the first row and the first column of each tile
-    numbers  (n,) int64, which image of its source each tile is, counted from 0
-    labels   (n,) uint8, or None where the source has none
+    Attributes:
+        shape: (rows, columns) of the chart.
+        size: (rows, columns) of every tile.
+        corners: (n, 2) int64, the first row and the first column of each tile.
+        numbers: (n,) int64, which image of its source each tile is, counted from 0.
+        labels: (n,) uint8, or None where the source has none.
     """
 
     shape: tuple[int, int]

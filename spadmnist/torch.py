@@ -67,8 +67,15 @@ class _Set(Dataset[Any]):
 class Fluxes(_Set):
     """Flux images of a method: items of a (channels, rows, columns) float32 tensor and the label.
 
-    normalised: divided by the training median of the level. Up to 1 GB of them are read once and kept in memory; more
-    are read as they are asked for. Raises SpadError for a method that the part lacks.
+    Up to 1 GB of them are read once and kept in memory; more are read as they are asked for.
+
+    Args:
+        part: of a dataset, a `spadmnist.Part`.
+        method: the reconstruction.
+        normalised: divided by the training median of the level, where the method has one.
+
+    Raises:
+        SpadError: for a method that the part lacks.
     """
 
     def __init__(self, part: Part, method: str = "counts", normalised: bool = True):
@@ -103,8 +110,13 @@ class Fluxes(_Set):
 class Frames(_Set):
     """Frames: items of a (frames, rows, columns) tensor, colour a leading channel axis, and the label.
 
-    readout: qis (uint8, 0 or 1), str (float32, s since the start of the frame, the frame time where there is no
-    detection) or counts (int32).
+    Args:
+        part: of a dataset, a `spadmnist.Part`.
+        readout: "qis" (uint8, 0 or 1), "str" (float32, s since the start of the frame, the frame time where there is no
+            detection) or "counts" (int32).
+
+    Raises:
+        SpadError: for a readout that was not recorded.
     """
 
     def __init__(self, part: Part, readout: str = "qis"):
@@ -122,6 +134,13 @@ class Events(_Set):
     """Time stamps (TR): items of a `spadmnist.Events` of one image, or what `transform` makes of it, and the label.
 
     Collate them with `collate_packed`, `collate_padded` or `collate_nested`.
+
+    Args:
+        part: of a dataset, a `spadmnist.Part`.
+        transform: called with the events of an image, `ToFrames` for one.
+
+    Raises:
+        SpadError: where TR was not recorded.
     """
 
     def __init__(self, part: Part, transform: Callable[[EventBatch], Any] | None = None):
@@ -164,7 +183,7 @@ def _transformed(events: EventBatch, transform: Callable[[EventBatch], Any] | No
 
 
 class Stream(IterableDataset[Any]):
-    """Items in an order of chance, read shard by shard; see `stream`."""
+    """What `stream` returns: items in an order of chance, read shard by shard."""
 
     def __init__(
         self, part: Part, kind: str, method: str | None, seed: int, rank: int, world: int, transform: Any, buffer: int
@@ -192,7 +211,7 @@ class Stream(IterableDataset[Any]):
             raise SpadError("method: events have none; leave it out, or take kind='fluxes'")
 
     def set_epoch(self, epoch: int) -> None:
-        """Another order, from the next pass on. It reaches workers that are kept."""
+        """Set the epoch, which gives another order from the next pass on. It reaches workers that are kept."""
         self._epoch.value = epoch
 
     def __len__(self) -> int:
@@ -293,11 +312,23 @@ def stream(
 ) -> Stream:
     """Items of a part in an order of chance, each once over all workers and ranks; an iterable set for a DataLoader.
 
-    kind: "events", "fluxes" (normalised; method: the reconstruction, counts if not given) or "frames" (method: the
-    readout, the first of qis, str, counts that was recorded). rank, world: which of how many processes this is; each
-    gets as many items as another, or one more. transform: of events. buffer: shards whose images are shuffled together,
-    and held in memory. The order is a function of seed, epoch (`set_epoch`), and the numbers of workers and ranks.
-    Raises SpadError with a sentence.
+    The order is a function of the seed, the epoch (`set_epoch`), and the numbers of workers and ranks.
+
+    Args:
+        part: of a dataset, a `spadmnist.Part`.
+        kind: "events" (items of `Events`), "fluxes" (of `Fluxes`, normalised) or "frames" (of `Frames`).
+        method: of fluxes the reconstruction, by default counts; of frames the readout, by default the first of qis,
+            str, counts that was recorded.
+        seed: of the order.
+        rank, world: which of how many processes this is; each gets as many items as another, or one more.
+        transform: called with the events of an image.
+        buffer: number of shards whose images are shuffled together, and held in memory.
+
+    Returns:
+        Stream: it iterates over (data, label).
+
+    Raises:
+        SpadError: for a kind, method, rank or buffer that is not possible.
     """
     return Stream(part, kind, method, seed, rank, world, transform, buffer)
 
@@ -325,8 +356,11 @@ class _Shared:
 class Packed(NamedTuple):
     """Events of several images, one after the other.
 
-    times: (events,) float64, s; pixel: (events,) int64 within its image; offsets: (images + 1,) int64, where each
-    image's events begin; labels: (images,) int64.
+    Attributes:
+        times: (events,) float64, s.
+        pixel: (events,) int64, within its image.
+        offsets: (images + 1,) int64, where each image's events begin, and the end.
+        labels: (images,) int64.
     """
 
     times: torch.Tensor
@@ -338,8 +372,11 @@ class Packed(NamedTuple):
 class Padded(NamedTuple):
     """Events of several images, as many to each as the longest has.
 
-    times: (images, most) float64, s, 0 behind the last; pixel: (images, most) int64, alike; mask: (images, most) bool,
-    true where there is an event; labels: (images,) int64.
+    Attributes:
+        times: (images, most) float64, s, 0 behind the last.
+        pixel: (images, most) int64, within its image, 0 behind the last.
+        mask: (images, most) bool, true where there is an event.
+        labels: (images,) int64.
     """
 
     times: torch.Tensor
@@ -349,7 +386,13 @@ class Padded(NamedTuple):
 
 
 class Nested(NamedTuple):
-    """Events of several images as jagged nested tensors (images, events of each): times, s, and pixel; labels."""
+    """Events of several images as jagged nested tensors.
+
+    Attributes:
+        times: (images, events of each) float64, s.
+        pixel: (images, events of each) int64, within its image.
+        labels: (images,) int64.
+    """
 
     times: torch.Tensor
     pixel: torch.Tensor
@@ -357,7 +400,7 @@ class Nested(NamedTuple):
 
 
 def collate_packed(items: Sequence[tuple[EventBatch, int]]) -> Packed:
-    """Items of `Events` as one `Packed`."""
+    """Items of `Events` as one `Packed`. Raises SpadError for items that are no events."""
     events = [one for one, _ in items]
     for one in events:
         if not isinstance(one, EventBatch):
@@ -390,30 +433,34 @@ def collate_nested(items: Sequence[tuple[EventBatch, int]]) -> Nested:
 
 
 class ToFrames(grids.Frames):
-    """As `grids.Frames`: detections in bins of equal time, as a float32 tensor (frames, rows, columns)."""
+    """Detections in `frames` bins of equal time, as a float32 tensor (frames, rows, columns); as `grids.Frames`."""
 
     def __call__(self, events: EventBatch) -> torch.Tensor:
         return torch.from_numpy(super().__call__(events))
 
 
 class ToVoxelGrid(grids.VoxelGrid):
-    """As `grids.VoxelGrid`: detections shared out between two bins, as a float32 tensor (bins, rows, columns)."""
+    """Detections shared out between two bins, as a float32 tensor (bins, rows, columns); as `grids.VoxelGrid`."""
 
     def __call__(self, events: EventBatch) -> torch.Tensor:
         return torch.from_numpy(super().__call__(events))
 
 
 class ToTimeSurface(grids.TimeSurface):
-    """As `grids.TimeSurface`: what fades since the last detection, as a float32 tensor (bins, rows, columns)."""
+    """Time since the last detection, fading, as a float32 tensor (bins, rows, columns); as `grids.TimeSurface`."""
 
     def __call__(self, events: EventBatch) -> torch.Tensor:
         return torch.from_numpy(super().__call__(events))
 
 
 class ToStructured:
-    """The events of an image as a structured array x, y, t, p, which the transforms of tonic take; see `structured`.
+    """The events of an image as a structured array x, y, t, p, which the transforms of tonic take.
 
-    columns: of the image; unit: of t, s, or None for whole ticks of the converter.
+    What it returns is that of `grids.structured`.
+
+    Args:
+        columns: of the image.
+        unit: of t, s; None for whole ticks of the converter.
     """
 
     def __init__(self, columns: int, unit: float | None = None):
@@ -429,15 +476,26 @@ class ToStructured:
 class Simulated(Dataset[Any]):
     """Any map-style set of images, seen by a sensor: fresh photons in every epoch, never the same noise twice.
 
-    images: items of an image, or of (image, label): PIL images, arrays or tensors of (rows, columns), (channels, rows,
-    columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1. sensor: as `read_sensor` gives it.
-    recording: a mapping, as in a config. lux: a level (lux, or as "5 mlux"), or (low, high): then each image has a
-    level of its own in each epoch, drawn evenly on a logarithmic scale. returns: a reconstruction (float32 tensor
-    (channels, rows, columns), divided by `scale`), or a readout: tr (`Events`), qis, str or counts (tensors as of
-    `Frames`).
-
     In epoch 0, at one level, image i is image i of `generate` with the same seed and split. `set_epoch` begins another
-    epoch, in workers that are kept, too; an image that is asked for a second time in one epoch raises SpadError.
+    epoch, in workers that are kept, too.
+
+    Args:
+        images: items of an image, or of (image, label): PIL images, arrays or tensors of (rows, columns), (channels,
+            rows, columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1.
+        sensor: as `read_sensor` gives it.
+        recording: a mapping, as in a config.
+        lux: a level (lux, or as "5 mlux"), or (low, high): then each image has a level of its own in each epoch, drawn
+            evenly on a logarithmic scale.
+        returns: the name of a reconstruction, for items of a float32 tensor (channels, rows, columns); or a readout:
+            "tr" (items of `spadmnist.Events`), "qis", "str" or "counts" (tensors as of `Frames`).
+        split, seed: they name the streams of random numbers.
+        wavelength: of the light, m, or as "555 nm".
+        scale: a reconstruction is divided by it.
+        transform: called with the events of an image.
+
+    Raises:
+        SpadError: for arguments that are not possible, for images of another size than the sensor's, and for an image
+            that is asked for a second time in one epoch.
     """
 
     def __init__(

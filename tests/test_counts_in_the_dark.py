@@ -89,6 +89,8 @@ def test_the_map_is_that_of_the_closed_form(captures: str, tmp_path: Path) -> No
         many &= n < 3000
     closed = n / (0.02 - n * 200e-9) if captures == TR else -np.log1p(-np.minimum(n, 3999) / 4000) / 1e-5
     assert many.sum() > 100 and found.verdict == "explained" and found.steps[0].values["sigma"].method == "counts"
+    step = found.steps[0]
+    assert (step.change, step.effect, step.parameter) == ("per_pixel", "dark_counts", "rate")
     # what keeps noise out pulls a pixel by a small part of its error
     pulled = np.abs(np.log(found.values[RATE] / closed))[many] * np.sqrt(n[many])
     assert (pulled < 0.3).mean() > 0.9 and pulled.max() < 1

@@ -12,9 +12,11 @@ import click
 import pytest
 
 import spadmnist
-from spadmnist import schema, signatures
+from spadmnist import errors, schema, signatures, testing
 from spadmnist.cli import cli
 from spadmnist.effects import Effect
+from spadmnist.inference import results
+from spadmnist.library.answers import Fit
 from spadmnist.plugins import parameter
 from spadmnist.reconstruct import Method
 from spadmnist.statistics import Statistic
@@ -23,7 +25,7 @@ from spadmnist.statistics.checks import Check
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 
 import _pages
-from _pages import curves, formats, gallery, keys, markdown, pictures, reference, verbs
+from _pages import answers, curves, formats, gallery, keys, markdown, modules, pictures, reference, verbs
 
 
 @pytest.fixture
@@ -186,6 +188,65 @@ def test_every_method_and_public_name_has_a_section() -> None:
     page = reference.library()
     for name in spadmnist.__all__:
         assert section(page, f"sp.{name}")
+    for error in (errors.ConfigError, errors.InputError):
+        assert f"`spadmnist.errors.{error.__name__}`" in section(page, "sp.SpadError")
+
+
+def test_what_the_library_returns_has_a_section_in_which_all_is_explained() -> None:
+    page = answers.page()
+    for name in ("Comparison", "Check", "Nuisance", "Diagnosis", "Step", "Value", "Fit", "Data", "Image", "Field"):
+        assert section(page, name)
+    assert "from `sp.fit`" in section(page, "Fit") and "from `Diagnosis.steps`, `Fit.steps`" in section(page, "Step")
+    for cls in answers.classes():
+        text = section(page, cls.__name__)
+        assert "See the class." not in text, f"{cls.__name__}: a member has no docstring"
+        assert "**Attributes**" in text or "\n: " in text or cls.__name__ == "Field", f"{cls.__name__} explains nothing"
+
+
+def test_a_new_answer_appears(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Planted:
+        """A new one.
+
+        Attributes:
+            size: of it, m.
+        """
+
+        size: float
+
+    def planted(self: Fit) -> Any:
+        """What is new."""
+
+    Planted.__module__, planted.__module__ = results.__name__, Fit.__module__
+    planted.__annotations__["return"] = "list[results.Planted]"
+    monkeypatch.setattr(results, "Planted", Planted, raising=False)
+    monkeypatch.setattr(Fit, "planted", property(planted), raising=False)
+    page = answers.page()
+    assert "`.planted`\n: What is new." in section(page, "Fit")
+    assert "from `Fit.planted`" in section(page, "Planted") and "- size: of it, m." in section(page, "Planted")
+
+
+def test_every_module_that_readers_import_has_a_section() -> None:
+    page = modules.page()
+    for name in ("torch", "testing", "statistics", "grids", "cluster"):
+        assert section(page, f"spadmnist.{name}")
+    for name in (*testing.__all__, "Fluxes", "Simulated", "stream", "shipped", "srgb_to_light"):
+        assert re.search(rf"^### {name}$", page, re.MULTILINE), f"{name} is missing"
+    assert "0x" not in page, "an address of an object is another one at each build"
+
+
+def test_a_module_is_read_without_the_package_that_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nobody who imports it later takes the stand-in for the package."""
+    (tmp_path / "planted.py").write_text(
+        "from no_such_package.deep import Base, one\n\n\n"
+        'class Mine(Base[int]):\n    """Of that package."""\n\n'
+        "    def __init__(self, size):\n        self.size = size\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    found = modules.imported("planted")
+    assert found.Mine.__doc__ == "Of that package." and found.Mine(3).size == 3
+    assert not {"planted", "no_such_package", "no_such_package.deep"} & sys.modules.keys()
+    with pytest.raises(ImportError, match="no_such_package"):
+        import planted  # type: ignore[import-not-found]  # noqa: F401
 
 
 def test_every_key_of_a_json_answer_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,4 +290,12 @@ def test_text_of_docstrings_is_no_markup() -> None:
     assert markdown.paragraphs("Args:\n    a: one\n        more\n    b: two\nbehind") == [
         "**Args**\n\n- a: one more\n- b: two",
         "behind",
+    ]
+    assert markdown.paragraphs("Returns:\n    One thing\n    on two lines.") == [
+        "**Returns**\n\n- One thing on two lines."
+    ]
+    assert markdown.paragraphs("So:\n\n    import one\n\n    two()\n\nend") == [
+        "So:",
+        "```text\nimport one\n\ntwo()\n```",
+        "end",
     ]

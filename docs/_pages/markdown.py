@@ -25,13 +25,11 @@ def paragraphs(doc: str | None) -> list[str]:
     Indented lines, as those of a program, stay a block; `Args:` and its like become a list.
     """
     found: list[str] = []
-    for block in re.split(r"\n\s*\n", (doc or "").strip("\n")):
+    for block in _blocks((doc or "").strip("\n")):
         lines = block.split("\n")
-        if not block.strip():
-            continue
         if re.fullmatch(r"(Args|Returns|Raises|Attributes|Yields):", lines[0].strip()):
             found += _section(lines)
-        elif all(line.startswith("    ") for line in lines if line):
+        elif _indented(block):
             found.append("```text\n" + "\n".join(line[4:] for line in lines) + "\n```")
         elif lines[0].startswith("|"):
             found.append("\n".join(lines))
@@ -43,13 +41,28 @@ def paragraphs(doc: str | None) -> list[str]:
     return [one for one in found if one]
 
 
+def _blocks(text: str) -> list[str]:
+    """What empty lines separate; an indented block goes on behind an empty line."""
+    found: list[str] = []
+    for block in (one for one in re.split(r"\n\s*\n", text) if one.strip()):
+        if found and _indented(found[-1]) and _indented(block):
+            found[-1] += f"\n\n{block}"
+        else:
+            found.append(block)
+    return found
+
+
+def _indented(block: str) -> bool:
+    return all(line.startswith("    ") for line in block.split("\n") if line)
+
+
 def _section(lines: Sequence[str]) -> list[str]:
     """A section of a docstring, `Args:`, with an entry for each name; then what stands behind it."""
     title = lines[0].strip().removesuffix(":")
     after = next((i for i, line in enumerate(lines[1:], 1) if not line.startswith("    ")), len(lines))
     entries: list[str] = []
     for line in lines[1:after]:
-        if line.startswith("        ") and entries:
+        if entries and (line.startswith("        ") or title in ("Returns", "Yields")):
             entries[-1] += f" {line.strip()}"
         else:
             entries.append(line.strip())

@@ -1,12 +1,15 @@
-"""The reference: verbs, keys of the files, formats, statistics, methods and the library, made from the classes."""
+"""The reference, made from the classes: verbs, keys of the files, formats, statistics, methods, the library.
+
+What the library returns has the page `answers`, what is imported by itself the page `modules`.
+"""
 
 from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import spadmnist
 from spadmnist import schema
@@ -15,7 +18,7 @@ from spadmnist.reference import all_statistics
 from spadmnist.statistics import Statistic
 from spadmnist.statistics.checks import Check
 
-from . import formats, keys, verbs
+from . import answers, formats, keys, modules, objects, verbs
 from . import markdown as md
 
 
@@ -24,6 +27,7 @@ def pages(folder: Path) -> dict[str, str | bytes]:
     made: dict[str, Callable[[], str]] = {"verbs": verbs.page}
     made |= {kind: lambda kind=kind: keys.page(kind) for kind in schema.kinds()}
     made |= {"formats": formats.page, "statistics": statistics, "methods": methods, "library": library}
+    made |= {"answers": answers.page, "modules": modules.page}
     written: dict[str, str | bytes] = {f"{name}.md": page() for name, page in made.items()}
     others = sorted(file.stem for file in folder.glob("*.md") if not file.read_text("utf-8").startswith(md.MARK))
     names = [*made, *(name for name in others if name != "index")]
@@ -87,51 +91,18 @@ def library() -> str:
     for name in spadmnist.__all__:
         found = getattr(spadmnist, name)
         if inspect.ismodule(found):
-            blocks += [f"## sp.{name}", md.prose(inspect.getdoc(found).partition("\n\n")[0])]
+            blocks += [f"## sp.{name}", md.prose(inspect.getdoc(found))]
             continue
-        blocks += [f"## sp.{name}", md.code(f"sp.{name}{_signature(found)}", "python"), md.prose(_doc(found))]
-        if inspect.isclass(found):
-            blocks += [_member(found, key) for key in _public(found)]
+        blocks += [f"## sp.{name}", *objects.described(found, f"sp.{name}")]
+        if inspect.isclass(found) and issubclass(found, Exception):
+            blocks += [_kind(one) for one in vars(sys.modules[found.__module__]).values() if _is_kind(one, found)]
     return md.page("The library", *blocks)
 
 
-def _public(cls: type[Any]) -> list[str]:
-    """The public methods and properties that a class of the package defines and explains."""
-    found = []
-    for key in dir(cls):
-        owner = next((one for one in cls.__mro__ if key in vars(one)), object)
-        value = inspect.getattr_static(cls, key)
-        described = (
-            callable(value) or isinstance(value, property | classmethod | staticmethod) or hasattr(value, "func")
-        )
-        if not key.startswith("_") and owner.__module__.startswith("spadmnist") and described:
-            found.append(key)
-    return found
+def _is_kind(one: object, of: type[Exception]) -> bool:
+    return inspect.isclass(one) and issubclass(one, of) and one is not of
 
 
-def _member(cls: type[Any], key: str) -> str:
-    value = inspect.getattr_static(cls, key)
-    plain = value.fget if isinstance(value, property) else getattr(value, "func", getattr(value, "__func__", value))
-    doc = " ".join((inspect.getdoc(plain) or "").split("\n\n")[0].split())
-    call = "" if isinstance(value, property) or hasattr(value, "func") else _signature(plain, bound=True)
-    return f"`.{key}{call}`\n: {md.plain(doc) or 'See the class.'}"
-
-
-def _signature(found: Any, bound: bool = False) -> str:
-    """As it is called, without types: (sensor, measurement, *, seed=0)."""
-    try:
-        known = inspect.signature(found)
-    except (TypeError, ValueError):
-        return ""
-    given = list(known.parameters.values())
-    if bound and given and given[0].name in ("self", "cls"):
-        given = given[1:]
-    plain = [one.replace(annotation=inspect.Parameter.empty) for one in given if not one.name.startswith("_")]
-    text = str(known.replace(parameters=plain, return_annotation=inspect.Signature.empty))
-    return re.sub(r"<[^<>]*>", "...", text)
-
-
-def _doc(found: Any) -> str:
-    """Its docstring, with each of its sections (Args, Returns, Raises) as a paragraph of its own."""
-    doc = inspect.getdoc(found) or ""
-    return re.sub(r"^(Args|Returns|Raises|Attributes|Yields):\s*$", r"\n\1:", doc, flags=re.MULTILINE)
+def _kind(error: type[Exception]) -> str:
+    """An error that is of a kind of its own, as an entry of a list of definitions."""
+    return f"`{error.__module__}.{error.__name__}`\n: {md.plain((inspect.getdoc(error) or '').partition(chr(10))[0])}"

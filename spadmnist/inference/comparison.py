@@ -45,18 +45,19 @@ _ENOUGH = 20.0
 
 @dataclass(frozen=True)
 class Check:
-    """One check: a statistic of one capture, or the totals.
+    """One check of a model: a statistic of one capture, the total of detections, or the light level.
 
     Attributes:
-        capture: None where it is of all captures.
-        misfit: mean squared residual relative to that of the model's replicates, 1 if the model is right.
-        where, size: words for the worst cell and its deviation.
-        relative: that deviation, relative.
-        significant: it lies outside the model's scatter, after Holm's correction.
-        material: it is significant and exceeds the tolerance, so that it fails.
-        excess: excess chi square (`deviations.excess`).
-        summary, judgement: the measured summary and the model's expectation, for pictures; None for totals.
-        tests: the number of tests of which `p_value` is the smallest.
+        statistic: its name; "rate" for a total, "light" for the common light level, "wavelength_ratio" for the ratio of
+            the pixels' counts between two wavelengths.
+        capture: the name of the capture; None where it is of all captures.
+        misfit: mean squared standardised residual, relative to that of the model's replicates; 1 for a right model.
+        p_value: before the correction for the number of checks.
+        passes: the model passes: the deviation is not significant, or within the tolerance.
+        significant: the p-value is significant after Holm's correction.
+        material: it is significant and exceeds the tolerance, so that the model fails.
+        where, size: the cell with the largest residual, and the deviation there, in words and physical units.
+        relative: that deviation as a share of the detections or of the rate.
     """
 
     statistic: str
@@ -69,10 +70,11 @@ class Check:
     passes: bool = True
     material: bool = False
     significant: bool = False
-    excess: float = 0.0
+    excess: float = 0.0  # excess chi square (`deviations.excess`)
+    # the measured summary and the model's expectation, for pictures; None for totals
     summary: Summary | None = field(default=None, repr=False)
     judgement: Judgement | None = field(default=None, repr=False)
-    tests: int = field(default=1, repr=False)
+    tests: int = field(default=1, repr=False)  # the number of tests of which `p_value` is the smallest
 
 
 @dataclass(frozen=True)
@@ -105,12 +107,15 @@ class Comparison:
 
     @property
     def failing(self) -> list[Check]:
-        """The failing checks, by p-value."""
+        """The failing checks, each a `Check`, the one with the smallest p-value first."""
         return sorted((c for c in self.checks if not c.passes), key=lambda c: (c.p_value, -c.misfit))
 
     @property
     def deviations(self) -> list[list[Check]]:
-        """The failing checks in groups that show one deviation each, the check that names it first (`deviations`)."""
+        """The failing checks in groups, the clearest group first.
+
+        All checks of a group show the same deviation. Its first check is the one that says most of it.
+        """
         failing = self.failing
         passing = {(c.capture, c.statistic) for c in self.checks if c.passes}
         return [[failing[i] for i in members] for members in deviations([_deviation(c) for c in failing], passing)]
@@ -122,7 +127,7 @@ class Comparison:
         return groups[0][0] if groups else min(self.checks, key=lambda c: (c.p_value, -c.misfit))
 
     def as_data(self) -> dict[str, Any]:
-        """The result as JSON data: `formats`, spadmnist-comparison/1."""
+        """The answer as the data of its JSON, format `spadmnist-comparison/1`."""
         return {
             "format": "spadmnist-comparison/1",
             "verdict": self.verdict,

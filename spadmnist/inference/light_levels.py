@@ -347,13 +347,14 @@ def rising_until(expected: Callable[[float], float], low: float, high: float) ->
 
 @dataclass(frozen=True)
 class Nuisance:
-    """The estimate of a nuisance parameter.
+    """The estimate of a nuisance parameter, the light level.
 
     Attributes:
-        capture: None for a parameter that all captures share.
-        value: relative to the stated value; low, high: its 95 % interval.
-        pull: deviation from the stated value, in standard deviations.
-        stated: relative standard deviation that the measurement states.
+        capture: the name of the capture; None for the factor that all lit captures share.
+        name: "light".
+        value: the estimate, relative to the stated level; low, high: the ends of its 95 % confidence interval.
+        pull: deviation from the stated level, in standard deviations.
+        stated: relative standard uncertainty of the level, as the measurement states it.
     """
 
     capture: str | None

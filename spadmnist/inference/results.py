@@ -56,11 +56,14 @@ def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class Value:
-    """A fitted value with its 95 % interval, SI.
+    """A fitted value with its 95 % confidence interval, in SI units.
 
     Attributes:
-        low, high: None where there is no interval.
-        method: of the fit, where it was a choice.
+        value: the estimate.
+        low, high: the ends of the interval; None where there is none.
+        unit: of all three, such as "s" or "Hz"; "" for a pure number.
+        method: of a fit, how it was estimated: "likelihood" (exact), "simulation", "counts" or "intervals" (of maps),
+            or the name of the statistic that informs a map; "" in a diagnosis.
     """
 
     value: float
@@ -79,19 +82,19 @@ class Value:
 
 @dataclass
 class Step:
-    """An accepted change of the model.
+    """A change of the model that was accepted, with its fitted values.
 
     Attributes:
-        misfit: of the model with it, on held-out captures; 1 if the model is right.
-        significance: standard deviations.
-        material: the change of the mean rate, as text.
-        phased: it has a phase in each capture.
-        chips: it affects random pixels, which differ from replicate to replicate.
-        fluctuates: its totals scatter far more than those of the model without it.
-        intervals: 95 % intervals of coordinates that the fit does not hold, by (effect, parameter), SI.
-        template: (cells,) its expected residuals under the model before it, by block.
-        before: (cells,) residuals of the data under the model before it, by block.
-        on_rough_fit: it was added to a model whose numbers were not all fitted together.
+        values: the fitted values by name, each a `Value`. The names are those of the parameters. Of a map they are
+            statistics of its values over the pixels: `sigma` (relative spread of the bulk), `low_fraction` and
+            `high_fraction` (shares of pixels far below and far above it), `low_ratio` (mean of the low ones, relative
+            to the middle of all).
+        misfit: of the model with this step, on held-out captures: mean squared standardised residual, 1 for a right
+            model.
+        significance: of the improvement, in standard deviations.
+        material: the change of the mean rate, in words.
+        alternatives: other changes that explain the same residuals. Each has `change`, `effect`, `parameter` and
+            `misfit`; `effect` is None where no effect describes it, and `what` says what it is.
     """
 
     candidate: Candidate
@@ -101,17 +104,34 @@ class Step:
     material: str
     alternatives: list[dict[str, Any]] = field(default_factory=list)
     coordinates: tuple[Coordinate, ...] = ()
-    phased: bool = False
-    chips: bool = False
-    fluctuates: bool = False
+    phased: bool = False  # it has a phase in each capture
+    chips: bool = False  # it affects random pixels, which differ from replicate to replicate
+    fluctuates: bool = False  # its totals scatter far more than those of the model without it
+    # 95 % intervals of coordinates that the fit does not hold, by (effect, parameter), SI
     intervals: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    # (cells,) by block, under the model before it: its expected residuals, and the residuals of the data
     template: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     before: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     # (cells, coordinates) by block, where the effect is faint
     jacobian: dict[Cell, np.ndarray] = field(default_factory=dict, repr=False)
     map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
     hit: np.ndarray | None = field(default=None, repr=False)  # (pixels,) bool: which ones an effect has hit at random
-    on_rough_fit: bool = False
+    on_rough_fit: bool = False  # it was added to a model whose numbers were not all fitted together
+
+    @property
+    def change(self) -> str:
+        """What kind of change: "add" (an effect that the model lacks), "set" (another value) or "per_pixel" (a map)."""
+        return self.candidate.kind
+
+    @property
+    def effect(self) -> str:
+        """The name of the effect."""
+        return self.candidate.effect
+
+    @property
+    def parameter(self) -> str | None:
+        """The name of the parameter that has another value or a map; None where an effect is added."""
+        return self.candidate.parameter
 
     @property
     def where(self) -> str:
@@ -125,11 +145,11 @@ class Step:
         return f"<{title(self.candidate)}: {numbers}>" if numbers else f"<{title(self.candidate)}>"
 
     def as_data(self) -> dict[str, Any]:
-        kind = "per_pixel" if self.candidate.kind == "per_pixel" else self.candidate.kind
+        """The step as an entry of `steps` in the JSON data."""
         return {
-            "change": kind,
-            "effect": self.candidate.effect,
-            "parameter": self.candidate.parameter,
+            "change": self.change,
+            "effect": self.effect,
+            "parameter": self.parameter,
             "values": {name: v.as_data() for name, v in self.values.items()},
             "misfit": plain(self.misfit),
             "significance": plain(self.significance),

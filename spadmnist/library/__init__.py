@@ -62,6 +62,9 @@ def simulate(
         folder: where they are written, one after the other; None: they stay in memory.
         crop, plugins, progress: as of `compare`.
 
+    Returns:
+        Measurement: the simulated captures; `["flat"]` is the data of one.
+
     Raises:
         InputError: where the light level of a capture is free, or sensor and plan do not belong together.
         SpadError: where something else lies in the folder, or it cannot be written.
@@ -98,6 +101,9 @@ def compare(
             not depend on it.
         plugins: files with effects and statistics of your own; they are run as programs.
         progress: called with a line about what is being done.
+
+    Returns:
+        Comparison: verdict, misfit, and every check with its p-value.
 
     Raises:
         InputError: where sensor and measurement do not belong together.
@@ -148,6 +154,9 @@ def diagnose(
             the same answer. The diagnosis so far is saved to it after each step, and the answer at the end.
         on_step: called with the diagnosis so far after each step; nothing is then saved to `keep` by itself, and what
             is simulated is kept until the report of the answer is written there.
+
+    Returns:
+        Diagnosis: verdict, steps with their fitted values, the sensor with them, what remains unexplained, limits.
 
     Raises:
         InputError: where sensor and measurement do not belong together.
@@ -221,6 +230,9 @@ def fit(
         add: effects that are added and fitted, `"crosstalk"`. free: numbers that are fitted, `"dead_time.duration"`.
         per_pixel: maps that are fitted, `"dark_counts.rate"`.
         sensor, measurement, seed, crop, jobs, plugins, progress: as of `compare`.
+
+    Returns:
+        Fit: the fitted values with their intervals and covariance, and the sensor with them.
 
     Raises:
         InputError: for an effect or parameter that there is not, or that cannot be fitted.

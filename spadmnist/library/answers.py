@@ -104,8 +104,19 @@ def check_answer(file: PathLike, name: str = "") -> None:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(comparison.Comparison):
-    """The result of `compare`. verdict: `"adequate"` or `"fails"`; misfit: the mean squared standardised residual, 1
-    for a right model; checks, failing: of every statistic and capture, the clearest first in `failing`.
+    """The answer of `compare`: the goodness of fit of a sensor model to a measurement.
+
+    Attributes:
+        sensor, measurement: the names of the model and of the measurement.
+        verdict: "adequate" where the model passes all checks, otherwise "fails".
+        misfit: mean over statistics and captures of the mean squared standardised residual; 1 for a right model.
+        misfit_null_95: 95 % quantile of the misfit of a right model.
+        checks: every check, a `Check` each: of every statistic of every capture, of the totals, of the light level.
+        nuisances: the fitted light levels, a `Nuisance` each.
+        replicates: number of simulations of each capture.
+        tolerance: relative deviation up to which a significant check passes; None: none.
+        false_alarm_rate: probability that a right model fails any check.
+        crop: rows and columns of the measured part of the sensor, as text; None for all pixels.
     """
 
     origin: Origin = field(default=Origin(), compare=False)
@@ -116,15 +127,25 @@ class Comparison(comparison.Comparison):
         return self.misfit
 
     def to_frame(self) -> Any:
-        """A pandas DataFrame, a row a check. Raises InputError where pandas is not installed."""
+        """The checks as a table.
+
+        Returns:
+            pandas.DataFrame, a row a check: statistic, capture, misfit, p_value, passes, material, where, size.
+
+        Raises:
+            InputError: where pandas is not installed.
+        """
         return _frame(self.as_data()["checks"])
 
     def figure(self, i: int | str = 0) -> Figure:
-        """A matplotlib figure of the page.
+        """A figure of the report.
 
         Args:
-            i: the i-th check with cells, the failing ones first: measured, model, residuals. Or "light": the light
-                level of each capture, as a factor on what is stated.
+            i: the i-th check with cells, counted from 0, the failing ones first: measured, model, residuals. Or
+                "light": the light level of each capture, as a factor on what is stated.
+
+        Returns:
+            matplotlib.figure.Figure.
 
         Raises:
             InputError: where there is no such figure.
@@ -135,10 +156,13 @@ class Comparison(comparison.Comparison):
         return pages.check_figure(_nth(drawn, i, "checks with cells"))
 
     def save(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
-        """Write the report, one HTML page, into a folder; the page.
+        """Write the report, one HTML page, into a folder.
 
         Args:
             command: what made it, for the page. then: the next step, for the page.
+
+        Returns:
+            The path of the page.
 
         Raises:
             SpadError: where something else lies there, or it cannot be written.
@@ -171,40 +195,60 @@ class _Found:
 
     @property
     def verdict(self) -> str:
-        """`"adequate"`, `"setup"`, `"explained"`, `"confused"`, `"partly_explained"` or `"unexplained"`."""
+        """The verdict on the model with all steps.
+
+        `"adequate"`: the given model fails no check. `"setup"`: a light level, an exposure or a wavelength that is not
+        as stated, or a light leak, explains what fails. `"explained"`: with the steps, no check fails. `"confused"`:
+        another explanation is as good. `"partly_explained"`: with the steps, some checks still fail. `"unexplained"`:
+        no change explains what fails. A fit is `"adequate"`, `"explained"` or `"partly_explained"`.
+        """
         return self.found.verdict
 
     @property
     def steps(self) -> list[results.Step]:
-        """The accepted changes, in order: `change`, `values`, `misfit`, `significance`, `alternatives`."""
+        """The accepted changes of the model, in order, each a `Step`."""
         return self.found.steps
 
     @property
     def misfit(self) -> dict[str, float]:
-        """Held out: `before` and `after` the steps."""
+        """The misfit on held-out captures, `before` and `after` the steps.
+
+        It is the mean over statistics and captures of the mean squared standardised residual; 1 for a right model.
+        """
         return {"before": self.found.before, "after": self.found.after}
 
     @property
     def misfit_in_sample(self) -> float | None:
-        """The misfit of the model with all steps over all captures; None where it was not simulated."""
+        """The misfit of the model with all steps, fitted to all captures; None where it was not simulated."""
         return None if self.found.in_sample is None else self.found.in_sample.misfit
 
     @property
     def path(self) -> list[dict[str, Any]]:
-        """The ladder of models: `model`, `misfit`, `errors` of each, the first one the model that was given."""
+        """The ladder of models, the given one first.
+
+        Each row has the name of its `model`, its `misfit` on held-out captures, its relative `errors` by name
+        (`mean_rate`, `map`, ...), and whether it is the `placebo`, an effect that was not needed.
+        """
         return [dict(row) for row in self.found.ladder]
 
     @property
     def model(self) -> Sensor:
-        """The sensor with what was found; the one that was given where nothing was."""
+        """The `Sensor` with the fitted values of all steps; the one that was given where there are none."""
         return candidates.with_values(self.start, self.found.values)
 
     def as_data(self) -> dict[str, Any]:
-        """The answer as JSON has it."""
+        """The answer as the data of its JSON, format `spadmnist-diagnosis/1` or `spadmnist-fit/1`."""
         return self.found.as_data()
 
     def to_frame(self) -> Any:
-        """A pandas DataFrame, a row a fitted value. Raises InputError where pandas is not installed."""
+        """The fitted values as a table.
+
+        Returns:
+            pandas.DataFrame, a row a value: change, effect, parameter, value, low, high, unit, significance.
+
+        Raises:
+            InputError: where pandas is not installed.
+        """
         rows = [
             {"change": s.candidate.kind, "effect": s.candidate.effect, "parameter": name, "value": v.value}
             | {"low": v.low, "high": v.high, "unit": v.unit, "significance": s.significance}
@@ -214,11 +258,15 @@ class _Found:
         return _frame(rows)
 
     def figure(self, i: int | str = 0) -> Figure:
-        """A matplotlib figure of the page.
+        """A figure of the report.
 
         Args:
-            i: the i-th trace: measured, the model before and after, residuals. Or "ladder": the misfit of each model;
-                or the name of a step that is a map, "detection.pdp per pixel".
+            i: the i-th check that the given model fails, counted from 0: measured, the model before and after,
+                residuals. Or "ladder": the misfit of each model; or the name of a step that is a map, such as
+                "detection.pdp per pixel".
+
+        Returns:
+            matplotlib.figure.Figure.
 
         Raises:
             InputError: where there is no such figure.
@@ -229,7 +277,7 @@ class _Found:
 
     @property
     def file(self) -> Path | None:
-        """The next sensor file, once it is written."""
+        """The path of the next sensor file; None until it is written."""
         return None if self.found.file is None else Path(self.found.file)
 
     @property
@@ -238,10 +286,13 @@ class _Found:
         return self.found.unwritten
 
     def save(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
-        """Write the report, the next `sensor.yaml` with its maps and `answer.json` into a folder; the folder.
+        """Write the report, the next `sensor.yaml` with its maps and `answer.json` into a folder.
 
         Args:
             command: what made it, for the page. then: the next step, for the page.
+
+        Returns:
+            The path of the folder.
 
         Raises:
             SpadError: where something else lies there, or it cannot be written. Where the sensor file cannot, the
@@ -263,7 +314,7 @@ class _Found:
         says why, and the answer is kept.
 
         Returns:
-            The file; None where it cannot be written.
+            The path of the file; None where it cannot be written.
         """
         out, notes, origin = Path(file), results.notes(self.found), self.origin
         self.found.file, self.found.unwritten = None, ""
@@ -285,7 +336,10 @@ class _Found:
         return made
 
     def write_answer(self, file: PathLike) -> Path:
-        """Write the answer as JSON; the file.
+        """Write the answer as JSON.
+
+        Returns:
+            The path of the file.
 
         Raises:
             SpadError: where something else lies there, or it cannot be written.
@@ -296,9 +350,12 @@ class _Found:
         return Path(file)
 
     def write_report(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
-        """Write the report, one HTML page, into a folder; the page. command, then: as of `save`.
+        """Write the report, one HTML page, into a folder. command, then: as of `save`.
 
         What a finished diagnosis keeps in that folder to go on from is then removed.
+
+        Returns:
+            The path of the page.
 
         Raises:
             SpadError: where something else lies there, or it cannot be written.
@@ -324,7 +381,10 @@ class _Found:
 
 
 class Diagnosis(_Found):
-    """The result of `diagnose`."""
+    """The answer of `diagnose`: the changes that explain how a measurement deviates from a model, and what is left.
+
+    `diagnose` shows the answer so far to `on_step` as an object of this class as well; `finished` is then False.
+    """
 
     @property
     def finished(self) -> bool:
@@ -333,22 +393,32 @@ class Diagnosis(_Found):
 
     @property
     def not_tried(self) -> list[dict[str, Any]]:
-        """The candidates that could not be simulated, with why."""
+        """The candidates that were not tried: `change`, `effect`, `parameter`, `where` and `why` of each.
+
+        Where the budget ended the search, an entry without an effect says `where` it ended.
+        """
         return self.found.untried
 
     @property
     def alternatives(self) -> list[dict[str, Any]]:
-        """What looks alike, of all steps."""
+        """The other changes that explain the same residuals, of all steps, with the keys of `Step.alternatives`."""
         return [dict(other) for step in self.steps for other in step.alternatives]
 
     @property
     def upper_limits(self) -> dict[str, float]:
-        """`effect.parameter` -> 95 % upper limit (SI) of effects that would have been seen."""
+        """The 95 % upper limits of the effects that were not found, SI, by `effect.parameter`.
+
+        They come with the verdict `"adequate"`, and with `"explained"` of a search that is not quick; otherwise there
+        are none.
+        """
         return self._limits(False)
 
     @property
     def lower_limits(self) -> dict[str, float]:
-        """`effect.parameter` -> 95 % lower limit (SI) of what would have been seen, were it less: of a share of 1."""
+        """The 95 % lower limits of parameters at whose upper end the effect vanishes, SI, by `effect.parameter`.
+
+        They come with the same verdicts as `upper_limits`.
+        """
         return self._limits(True)
 
     def _limits(self, lower: bool) -> dict[str, float]:
@@ -357,31 +427,50 @@ class Diagnosis(_Found):
 
     @property
     def advice(self) -> list[dict[str, Any]]:
-        """The captures that would tell apart what is confused."""
+        """The captures that would separate explanations that are confused.
+
+        Each has the `capture` in words, what it `separates`, and with what significance, in standard deviations, now
+        (`significance_now`) and with that capture (`significance_then`).
+        """
         return self.found.advice
 
     @property
     def unexplained(self) -> list[dict[str, Any]]:
-        """The checks that still fail: statistic, capture, significance, where."""
+        """The checks that fail with all steps, those of one `deviation` together, the clearest first.
+
+        Each has `statistic`, `capture` (None: all captures), `significance` in standard deviations, `where` and `size`
+        in words, and the number of its `deviation`. The first may have `alternatives`: the changes that are nearest,
+        and explain too little.
+        """
         return self.found.unexplained
 
     @property
     def setup(self) -> list[dict[str, Any]]:
-        """What is wrong in the set-up: capture, quantity, factor."""
+        """The errors of the set-up: light levels, exposures, wavelengths or light leaks that are not as stated.
+
+        Each has the `capture` (None: all captures), the `quantity`, its `factor` on what is stated (`value`, and `low`
+        and `high`, the ends of the 95 % confidence interval), and whether it is `confused` with another one.
+        """
         return self.found.setup
 
 
 class Fit(_Found):
-    """The result of `fit`."""
+    """The answer of `fit`: the fitted values of named parameters, with their 95 % confidence intervals.
+
+    Its `steps` are what was named. `steps[i].values` tells of each value by which method it was fitted.
+    """
 
     @property
     def values(self) -> dict[str, float | np.ndarray]:
-        """`effect.parameter` -> fitted value, SI; of a map (pixels,)."""
+        """The fitted values by `effect.parameter`, SI: a number, or (pixels,) of a map."""
         return {f"{effect}.{name}": value for (effect, name), value in self.found.values.items()}
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """`effect.parameter` -> 95 % interval, SI; of a map the statistics of its spread, `effect.parameter.sigma`."""
+        """The 95 % confidence intervals (low, high) by `effect.parameter`, SI.
+
+        Of a map they are those of the statistics of its pixels, `effect.parameter.sigma`. What has none is not here.
+        """
         out = {}
         for step in self.steps:
             for name, value in step.values.items():
@@ -392,7 +481,11 @@ class Fit(_Found):
 
     @property
     def covariance(self) -> tuple[list[str], np.ndarray]:
-        """(names, (n, n) covariance of the numbers in SI, linearised); of a fit by maps alone it is empty."""
+        """The covariance matrix of the fitted numbers: (names `effect.parameter`, (n, n) array in SI).
+
+        It is that of the linearised model; its diagonal is that of the confidence intervals, taken as symmetric. Maps
+        are not in it.
+        """
         return self.found.covariance
 
 

@@ -174,20 +174,22 @@ def _wrong(id: object, text: str, word: str = "", known: Sequence[str] = ()) -> 
 
 @dataclass(frozen=True, repr=False)
 class Data:
-    """What one capture recorded.
+    """What one capture recorded: `events` of TR, `frames` of QIS, STR and counts.
 
-    recording: the same as the statistics see it, its QIS frames packed.
+    Attributes:
+        recording: the same as the statistics see it, its QIS frames packed.
     """
 
     recording: Recording
 
     @property
     def capture(self) -> recordings.Capture:
+        """How it was made: modality, light, conditions."""
         return self.recording.capture
 
     @property
     def events(self) -> Events:
-        """TR: the detections, a row a pixel. Raises InputError for frames."""
+        """TR: the detections, `spadmnist.Events` with a row a pixel and times in s. Raises InputError for frames."""
         if self.recording.events is None:
             raise InputError(f"{self.capture.id}: holds frames, not events; read .frames")
         return self.recording.events

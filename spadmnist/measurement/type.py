@@ -23,11 +23,15 @@ from .entries import FILE
 
 @dataclass(repr=False, eq=False)
 class Measurement:
-    """Captures of one array of pixels.
+    """Captures of one array of pixels. `measurement["flat"]` is the data of one; iteration gives their names.
 
-    layout: rows, columns and places of the pixels; their area is the sensor's to say, and not a number here. captures:
-    in the file's order; source: the file or folder, for messages; folder, file: where it was read from, file is None
-    for a dataset; notes: by capture, what was found odd in its data as they were read.
+    Attributes:
+        name: of the measurement.
+        layout: rows, columns and places of the pixels; their area is the sensor's to say, and not a number here.
+        captures: how each was made, in the file's order.
+        source: the file or folder, for messages.
+        folder, file: where it was read from; file is None for a dataset.
+        notes: by capture, what was found odd in its data as they were read.
     """
 
     name: str
@@ -101,10 +105,12 @@ class Measurement:
 
     @property
     def rows(self) -> int:
+        """Rows of pixels."""
         return self.layout.rows
 
     @property
     def columns(self) -> int:
+        """Columns of pixels."""
         return self.layout.columns
 
     @property
