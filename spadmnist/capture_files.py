@@ -324,13 +324,6 @@ def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Foun
     check_number(path, len(time), stamps_type(path, capture.conditions.exposure, tick))
     check_stored(time, "time", path)
     check_stored(pixel, "pixel", path)
-    # a pixel has a stamp in each tick at most, and in the one that the exposure's end cuts
-    most = pixels * (no_detection(capture.conditions.exposure, tick) + 1)
-    if len(time) > most:
-        raise InputError(
-            f"{path}: declares {len(time):,} detections; in {units.show(capture.conditions.exposure, 's')} of ticks of "
-            f"{units.show(tick, 's')} {pixels:,} pixels can have {most:,}: correct the tick, the exposure or the file"
-        )
     return _Found(capture, tick)
 
 

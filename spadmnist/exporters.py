@@ -72,9 +72,17 @@ def export(
     Raises SpadError with a sentence.
     """
     target = Target.every[format]
-    chosen = [measurement.capture(id) for id in ids] or [c for c in measurement.captures if c.mean is None]
+    chosen = [measurement.capture(id) for id in dict.fromkeys(ids)] or [
+        c for c in measurement.captures if c.mean is None
+    ]
     if not chosen:
         raise SpadError(f"{measurement.source}: of its captures only means are known; there are no data to export")
+    ends = {other.suffix: name for name, other in Target.every.items() if other.suffix != target.suffix}
+    if out.suffix.lower() in ends:
+        raise SpadError(
+            f"{out} ends as files of the format {ends[out.suffix.lower()]} do; those of {format} end with "
+            f"{target.suffix}: name such a file, a folder, or another --format"
+        )
     paths = [out]
     if out.suffix.lower() != target.suffix:
         names: list[str] = []

@@ -327,13 +327,18 @@ class Sensor:
             raise _wrong(effect, "apply returns a rate that is negative or not finite")
         return after
 
-    def expected(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
-        """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`."""
+    def expected(
+        self, photons: np.ndarray, conditions: Conditions, stamped: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`.
+
+        stamped: time stamps are recorded, of which a readout may lose some; otherwise each pixel counts for itself.
+        """
         photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             if self._apart is not None:
-                return self._apart.expected(photons, conditions)
-            there = self.chip.expected(self.window.spread(photons), conditions)
+                return self._apart.expected(photons, conditions, stamped)
+            there = self.chip.expected(self.window.spread(photons), conditions, stamped)
             return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate, light = self.rates(photons, conditions)
         dark = rate - light
@@ -347,7 +352,7 @@ class Sensor:
             for effect in self.at(stage):
                 rate = self._call(effect, "expected_rate", rate, conditions)
         candidates = rate
-        for stage in ("dead_time", "timing", "readout"):
+        for stage in ("dead_time", "timing", "readout") if stamped else ("dead_time",):
             for effect in self.at(stage):
                 rate = self._call(effect, "expected_rate", rate, conditions)
         return candidates * conditions.exposure, rate * conditions.exposure
@@ -571,12 +576,13 @@ class Sensor:
         candidates, parents = self._family(events, conditions, streams, causes)
         tr, frames, tally = None, None, None
         counter = "counts" in readouts and conditions.counting == "counter"
-        if "tr" in readouts or counter:
+        if counter:
+            asleep = self._asleep(candidates.times, conditions)
+            counted = self._fired(candidates, parents, conditions, streams, frames=False, asleep=asleep)
+            tally = self._counted(seen(counted), conditions, window)
+        if "tr" in readouts:
             detected = self._fired(candidates, parents, conditions, streams, frames=False)
             detected.end = conditions.exposure
-        if counter:
-            tally = self._counted(seen(detected), conditions, window)
-        if "tr" in readouts:
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
                     if hasattr(effect, "apply"):
@@ -825,10 +831,27 @@ class Sensor:
             out.parent = linked
         return out, linked if cascade else _NOBODY
 
+    def _asleep(self, times: np.ndarray, conditions: Conditions) -> np.ndarray:
+        """(events,) bool: do they fall between the frames of a counter, where nothing fires; empty where none does."""
+        if self.rules == "paper" or conditions.frame_period <= conditions.frame_time:
+            return _NONE
+        return times - np.floor(times / conditions.frame_period) * conditions.frame_period >= conditions.frame_time
+
     def _fired(
-        self, events: Events, parents: np.ndarray, conditions: Conditions, streams: Streams, frames: bool
+        self,
+        events: Events,
+        parents: np.ndarray,
+        conditions: Conditions,
+        streams: Streams,
+        frames: bool,
+        asleep: np.ndarray = _NONE,
     ) -> Events:
-        """Those of the candidates that happen: the parent did, and the pixel was not blind."""
+        """Those of the candidates that happen: the parent did, and the pixel was neither blind nor asleep.
+
+        asleep: (events,) bool; empty where none is.
+        """
+        if len(asleep) and not len(parents):
+            events, asleep = events.keep(~asleep), _NONE
         carried = self._carried
         if self.rules == "paper" and frames and carried == 0:
             return events
@@ -839,6 +862,8 @@ class Sensor:
                 kept = kernels.non_paralyzable(events.times, events.offsets, self.dead_times)
                 return Events(events.times[kept], kernels.take(events.offsets, kept), events.pixels)
         needed = _NONE if frames else self._needed(events, streams)
+        if len(asleep):
+            needed = np.where(asleep, np.inf, needed if len(needed) else 0.0)
         period = conditions.frame_period if frames else 0.0
         times, offsets = events.times, events.offsets
         fired = kernels.avalanches(

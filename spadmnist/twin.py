@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import bit_planes, light, recording, standing
+from . import bit_planes, light, recording, standing, units
 from .errors import InputError
 from .events import Layout
 from .measurement import Measurement, write
@@ -64,6 +64,13 @@ def model_recordings(
     flux = np.broadcast_to(flux[:, None] if flux.ndim == 1 else flux, (wanted, pixels))
     if capture.modality == "str" and not sensor.tick:
         raise InputError(f"{capture.id}: STR stamps are whole ticks, and the sensor has no converter; add tdc to it")
+    divided = {"str": capture.conditions.frame_time, "tr": capture.conditions.exposure}.get(capture.modality)
+    if divided is not None and sensor.tick > divided * (1 + 1e-9):
+        raise InputError(
+            f"{capture.id}: the ticks of the sensor, {units.show(sensor.tick, 's')}, are longer than the "
+            f"{units.show(divided, 's')} that they divide; shorten tdc.resolution, or make the "
+            f"{'frame time' if capture.modality == 'str' else 'exposure'} longer"
+        )
     if not wanted:
         return []
     brightest = flux[[int(np.argmax(flux.mean(axis=1)))]]

@@ -128,14 +128,6 @@ def test_the_size_of_what_lzf_packs_is_counted(some: bytes, times: int, summed: 
         assert capture_files._unpacked(raw[: len(raw) - 4 * summed], 32000, data.size) == data.size
 
 
-def test_a_pixel_has_one_stamp_in_a_tick(tmp_path: Path) -> None:
-    """4 pixels, 200 ns of 1 ns: no more than 804 detections."""
-    with pytest.raises(
-        InputError, match=r"declares 1,000 detections; in 200 ns of ticks of 1 ns 4 pixels can have 804"
-    ):
-        measurement.open(bomb(tmp_path / "lab", CHUNK * 4, "200 ns")).recording("dark")
-
-
 # --- memory ---------------------------------------------------------------------------------------------------------
 
 STAMPS = 1 << 20  # detections, of 4 bytes each where they lie in memory

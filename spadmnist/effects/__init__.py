@@ -39,6 +39,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -311,17 +312,28 @@ class Effect(Plugin, abstract=True):
 
 def in_order(effects: list[Effect]) -> list[Effect]:
     """By stage; within a stage first what is `of_scene`, then by name, each behind the one it names in `after`, and at
-    the end what is `last`.
+    the end what is `last`. Where that one is absent, behind the one that it names in its turn.
     """
     stages = list(STAGES)
+    present = {e.name for e in effects}
+    behind = {e.name: _behind(e, present) for e in effects}
     waiting = sorted(effects, key=lambda e: (stages.index(e.stage), e.last, e.name))
     ordered: list[Effect] = []
     while waiting:
         names = {e.name for e in waiting}
-        ready = [e for e in waiting if e.after not in names - {e.name}] or waiting
+        ready = [e for e in waiting if behind[e.name] not in names - {e.name}] or waiting
         ordered.append(ready[0])
         waiting.remove(ready[0])
     return sorted(ordered, key=lambda e: (stages.index(e.stage), not e.of_scene, e.last))
+
+
+def _behind(effect: Effect, present: Collection[str]) -> str | None:
+    """The name of the nearest effect of a sensor behind which this one stands, by its chain of `after`."""
+    name, passed = effect.after, {effect.name}
+    while name and name not in present and name not in passed and name in Effect.registry:
+        passed.add(name)
+        name = Effect.registry.find(name).after
+    return name
 
 
 def __getattr__(name: str) -> Any:

@@ -13,8 +13,8 @@ class DeadTime(Effect, stage="dead_time"):
     """A pixel is blind after a detection, while it is quenched and recharged.
 
     Non-paralyzable: a lost event does not extend the dead time. Paralyzable (passive quenching): a lost event starts
-    the dead time anew. Dead time acts on TR streams. In frames the paper applies none (its Table 2). Under `rules:
-    device` a pixel fires once a frame, and its afterpulses are delayed by the dead time.
+    the dead time anew. Dead time acts on TR streams and counters. In binary frames the paper applies none (its Table
+    2). Under `rules: device` a pixel fires once a frame, and its afterpulses are delayed by the dead time.
     Source: Suonsivu et al., Alg. 1 lines 24-29; typical 1-100 ns (Table 1). Paralyzable: r = lambda exp(-lambda tau_d),
     Knoll, Radiation Detection and Measurement, ch. 4.
     """

@@ -8,7 +8,8 @@ from . import Effect, parameter
 class FrameCarryOver(Effect, stage="dead_time"):
     """A pixel enters the next frame with a share of its remaining dead time.
 
-    The effect acts in frames (STR, QIS, counts) under both rules. A pixel with dead time tau_d that fired at t is live
+    The effect acts in binary frames (STR, QIS and their sums) under both rules. A counter is not begun anew by a frame:
+    all of its dead time reaches into the next one. A pixel with dead time tau_d that fired at t is live
     again at start + share * (t + tau_d - start), where start is the start of the next frame. Under `rules: paper`
     frames have no other dead time. TR streams have no frames.
     Source: no published number; a dead time is 0.1-1 % of a frame, and the frame's reset may or may not end it.

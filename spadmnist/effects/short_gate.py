@@ -13,7 +13,8 @@ class ShortGate(Effect, stage="gate"):
 
     It is live while offset <= t < offset + fraction * frame time, where t is the time since the frame began. The part
     of the gate beyond the end of the frame is lost. The gate acts under both rules and on TR streams as well, whose
-    clock has the same frames; without frames the exposure is one frame. All rates, dark count rates included, are
+    clock has the same frames; without frames the exposure is one frame. With fraction 1 and offset 0 there is no gate:
+    TR streams are live between frames as well. All rates, dark count rates included, are
     multiplied by the live share.
     Source: gates open and close late, 0.25-0.34 ns from pixel to pixel in SwissSPAD2 (Ulku et al. 2019), shortest gate
     5.75 ns; for a fixed error, 0.2-20 ns a frame by experience, no published number.

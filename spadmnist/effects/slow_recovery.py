@@ -14,10 +14,10 @@ class SlowRecovery(Effect, stage="dead_time"):
     """After the dead time the sensitivity of a pixel recovers as 1 - exp(-u / time constant).
 
     u is the time since the end of the dead time. A photon, a dark count, an afterpulse or crosstalk fires the pixel
-    with the sensitivity at its time; otherwise it is lost without a trace. The effect acts on TR streams. A pixel is
-    fully recharged at the start of every frame. With a = lambda tau_r the mean interval is tau_d + tau_r e^a a^-a
-    gamma(a, a) (lower incomplete gamma function). The closed form below does not know tau_d. It is of first order in
-    rate x time constant: each interval is longer by tau_r, which is the upper bound.
+    with the sensitivity at its time; otherwise it is lost without a trace. The effect acts on TR streams and counters.
+    In binary frames a pixel is fully recharged at the start of each. With a = lambda tau_r the mean interval is tau_d +
+    tau_r e^a a^-a gamma(a, a) (lower incomplete gamma function). The closed form below does not know tau_d. It is of
+    first order in rate x time constant: each interval is longer by tau_r, which is the upper bound.
     Source: Krause and Walenta, arXiv 2507.10361; typical 1-50 ns.
     """
 

@@ -10,7 +10,7 @@ import decimal
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..sensor import Sensor
 from .laws import poisson_scores
 from .models import InTheDark
 from .reduction import ReducedCapture
-from .replicates import Replicates
+from .replicates import Replicates, simulated
 
 if TYPE_CHECKING:
     from .evaluation import Evaluation
@@ -45,6 +45,9 @@ _LEAST_TOTAL, _NEVER = 5.0, 0.5
 _SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
 _FEW_COUNTS = 30.0  # expected detections of a lit capture: the logarithm of fewer is not normal, they have a score
 _COARSE, _FLAT = 37, 1e-6  # levels among which the largest total is looked for; relative: a fall that is none
+# events of each of so many recordings of frames, by which the closed form of their mean is corrected: together they
+# have the noise of 1e6 counts, 0.1 %, in some tenths of a second
+_SHORT, _RECORDINGS = 1.25e5, 8
 _FAINT = 1e-6  # of the stated light: as good as none, for the total in the dark
 
 
@@ -218,8 +221,8 @@ def most_detections(capture: Capture, pixels: int) -> float:
 def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
     """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
 
-    It is by the closed forms of the effects, without a simulation. Its scatter is that of the counts, of the last
-    digit of the mean, and of the closed forms.
+    It is by the closed forms of the effects. Its scatter is that of the counts, of the last digit of the mean, and of
+    the closed forms. What rates that fluctuate do to the mean of frames no closed form says: a short recording does.
 
     Args:
         total: detections of the whole array.
@@ -233,13 +236,33 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
     digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
     rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
-    # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one
-    caused = 0.0 if capture.counts_events else sum(sensor.caused().values())
-    scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2)
+    # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one; where all are
+    # counted, what is caused by what was caused is missing in it
+    caused = sum(sensor.caused().values())
+    caused = caused**2 if capture.counts_events else caused
+    apart, unsure = (
+        (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_short(sensor, capture, level)
+    )
+    scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2 + unsure**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
-    totals = mean * np.exp(scatter * normal[order])
-    return CaptureNull(level, stated, totals, expected, (0.0, 1.0), scatter), np.ones(replicates)
+    totals = mean * np.exp(apart + scatter * normal[order])
+    return CaptureNull(level, stated, totals, expected, (apart, 1.0), scatter), np.ones(replicates)
+
+
+def _of_short(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
+    """(log of the total of simulated frames over that of the closed form, its standard error), of a short capture."""
+    c = capture.conditions
+    sensor = InTheDark.of(sensor) if capture.light.dark else sensor
+    events = float(sensor.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
+    whole = c.largest_count if capture.modality == "counts" else 1  # binary frames of a count frame
+    frames = max(math.ceil(c.frames * min(_SHORT / max(events, 1.0), 1.0) / whole), 1) * whole
+    short = replace(capture, mean=None, conditions=replace(c, frames=frames, exposure=frames * c.frame_period))
+    numbers = np.arange(_RECORDINGS, dtype=np.uint64)
+    made = simulated(sensor, short, np.full(_RECORDINGS, level), numbers, 0)
+    logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])
+    apart = float(logs.mean()) - math.log(closed_form(sensor, short)(level))
+    return apart, float(np.std(logs, ddof=1)) / math.sqrt(_RECORDINGS)
 
 
 def last_digit(value: float) -> float:
@@ -268,7 +291,7 @@ def pixel_counts(sensor: Sensor, capture: Capture) -> Callable[[float], np.ndarr
     def counts(level: float) -> np.ndarray:
         light = np.full((1, sensor.layout.pixels), level)
         if capture.counts_events:
-            made = sensor.expected(light, conditions.without_gaps)[1][0]
+            made = sensor.expected(light, conditions.without_gaps, capture.modality == "tr")[1][0]
         else:
             made = conditions.frames * in_frames(sensor, light, conditions)[0]
         if full is not None:
