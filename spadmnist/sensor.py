@@ -271,6 +271,11 @@ class Sensor:
         told = [self._call(e, "converter") for e in self.at("timing") if hasattr(e, "converter")]
         return told[-1] if told else None
 
+    @property
+    def origin(self) -> float:
+        """Where a converter's tick 0 begins, s: minus half a tick where times are rounded to the nearest one."""
+        return 0.0 if self._converter is None else self._converter[1] * self._converter[0]
+
     @cached_property
     def tick(self) -> float:
         """Length of a converter's tick, s; 0 without one.
@@ -355,7 +360,7 @@ class Sensor:
         for stage in ("dead_time", "timing", "readout") if stamped else ("dead_time",):
             for effect in self.at(stage):
                 rate = self._call(effect, "expected_rate", rate, conditions)
-        return candidates * conditions.exposure, rate * conditions.exposure
+        return candidates * conditions.live_time, rate * conditions.live_time
 
     def caused(self) -> dict[str, float]:
         """Events that come directly of one event, averaged over the array, by the effect that makes them."""

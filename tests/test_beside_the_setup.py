@@ -14,6 +14,7 @@ from tinylab import bench_of, labs
 
 import spadmnist as sp
 from spadmnist.inference.conclusion import Notes, left_over
+from spadmnist.inference.evaluation import as_compared
 from spadmnist.inference.levels import HALF_95
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose, is_as_stated, is_freed, take_setup_again
@@ -64,6 +65,10 @@ def test_a_set_up_fault_stays_unless_the_steps_explain_the_totals(factor: float,
     assert len(path.evaluation.residuals[TOTALS]) == (2 if as_stated else 1)
     path.back_to(kept)
     assert path.replicates.unstated == frozenset() and path.evaluation is stated
+    assert as_compared(path.replicates, stated) is stated
+    path.replicates.unstated = frozenset({"flat"})  # a model without steps is compared without this total as well
+    assert len(as_compared(path.replicates, stated).residuals[TOTALS]) == 1
+    path.back_to(kept)
     take_setup_again(path, notes)  # the step is gone
     assert notes.explained is not as_stated and notes.setup == ([short] if as_stated else [entry, short])
 

@@ -39,6 +39,7 @@ from importfiles import (
     t2,
 )
 
+import spadmnist as sp
 from spadmnist import cli, exporters, image_exporters, importers, measurement
 from spadmnist.cli import _terminal
 from spadmnist.effects import Conditions
@@ -826,6 +827,30 @@ def test_what_is_exported_is_plain(tmp_path: Path) -> None:
     assert np.array_equal(archive["frames"], array) and archive["frame_time"] == 1.1e-5
     with h5py.File(tmp_path / "a" / "one.h5") as file:
         assert np.array_equal(file["frames"], array) and file.attrs["frame_time"] == 1.1e-5
+
+
+def test_an_export_has_each_capture_once_and_ends_as_its_format_does(tmp_path: Path) -> None:
+    layout = sp.Layout(2, 2, 25e-12, 1.0)
+    sensor = sp.Sensor(layout, [sp.effects.DarkCounts(rate=1e4), sp.effects.Tdc(resolution=1e-9)])
+    data = sp.simulate(sensor, [sp.Capture("dark", "tr", dark=True, exposure=1e-3)], seed=1)
+    assert [path.name for path in exporters.export(data, tmp_path / "out", "npz", ("dark", "dark"))] == ["dark.npz"]
+    with pytest.raises(
+        SpadError, match=r"x\.hdf5 ends as files of the format photon-hdf5 do; those of hdf5 end with \.h5"
+    ):
+        exporters.export(data, tmp_path / "x.hdf5", "hdf5")
+    coarse = sp.Sensor(layout, [sp.effects.DarkCounts(rate=2e7), sp.effects.Tdc(resolution=100e-9)])
+    many = sp.simulate(coarse, [sp.Capture("dark", "tr", dark=True, exposure=1e-3)], seed=1)
+    # several detections of a pixel in a tick, as where a tick is longer than the dead time: the file is read again
+    assert len(many["dark"].events) > 4 * 10_000  # more than ticks
+    many.save(tmp_path / "lab")
+    again = measurement.open(tmp_path / "lab")
+    assert np.array_equal(again.recording("dark").totals, many.recording("dark").totals)
+    for capture in (
+        sp.Capture("f", "str", dark=True, frames=10, frame_time=10e-9),
+        sp.Capture("f", "tr", dark=True, exposure=10e-9),
+    ):
+        with pytest.raises(SpadError, match=r"f: the ticks of the sensor, 100 ns, are longer than the 10 ns that they"):
+            sp.simulate(coarse, [capture], seed=1)
 
 
 def test_what_cannot_be_exported(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_stamps_tell_a_map_where_nearly_every_frame_has_one(tmp_path: Path) -> N
     wanted = measurements.open(tmp_path / "plan.yaml", planned=True)
     data = measurements.open(twin.simulate(truth, wanted, tmp_path / "lab", 5))
     replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
-    share = replicates.seen["flat"].total / SIDE**2 / 1500
+    share = replicates.seen["flat"].detections / SIDE**2 / 1500
     assert 0.97 < share < 0.99
     candidate = next(c for c in candidates(sensor) if c.name == "per_pixel detection.pdp")
     levels = light_levels_of(replicates, evaluate(replicates, {}))

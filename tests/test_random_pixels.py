@@ -13,16 +13,21 @@ from tinylab import bench_of, change_of, quiet
 import spadmnist
 from spadmnist import config, measurement, twin
 from spadmnist.errors import UNABLE, SpadError
-from spadmnist.inference import random_pixels
+from spadmnist.inference import hit_pixels, random_pixels
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.comparison import comparison_with
+from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import block_checks, evaluate, failing
 from spadmnist.inference.intervals import fit_where_hit
+from spadmnist.inference.map_models import models_with_maps
 from spadmnist.inference.model_path import ModelPath, accept
 from spadmnist.inference.models import Model
+from spadmnist.inference.pixel_maps import summary
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
 from spadmnist.sensor import Sensor
+from spadmnist.workers import Serial
 
 SENSOR = """sensor:
   name: camera
@@ -67,9 +72,9 @@ def test_an_effect_says_how_it_is_in_given_pixels(tmp_path: Path) -> None:
     """One that does not keeps the pixels that are drawn."""
     (tmp_path / "sensor.yaml").write_text(SENSOR + BLINKS)
     sensor, hit = config.read_sensor(tmp_path / "sensor.yaml"), np.arange(256) % 9 == 0
-    own = with_values(sensor, random_pixels.of_pixels(sensor, NAME, hit))
+    own = with_values(sensor, hit_pixels.of_pixels(sensor, NAME, hit))
     assert np.array_equal(own.resolved().effect(NAME).added(None) > 0, hit)
-    assert random_pixels.of_pixels(sensor, "dark_counts", hit) == {}
+    assert hit_pixels.of_pixels(sensor, "dark_counts", hit) == {}
 
 
 @pytest.mark.parametrize("brighter", [1.0, 1.05])
@@ -78,12 +83,12 @@ def test_the_pixels_that_are_hit_are_known_whatever_the_light(tmp_path: Path, br
     replicates = bench_of(camera(tmp_path, brighter=brighter), 4)
     values = {(NAME, name): value for name, value in TRUTH.items()}
     evaluation = evaluate(replicates, {}, Model.same(replicates.start).changed(values, chips=True))
-    seen = random_pixels.pixels_hit(replicates, evaluation, values, NAME)
+    seen = hit_pixels.pixels_hit(replicates, light_levels_of(replicates, evaluation), values, NAME)
     assert seen is not None and np.array_equal(seen.hit, hit_in_truth(tmp_path))
     # 20 Hz in many of the pixels are seen in all of them together, and in no one of them
     faint = {**values, (NAME, "amplitude"): 20.0, (NAME, "fraction"): 0.4}
-    assert random_pixels.pixels_hit(replicates, evaluation, faint, NAME) is None
-    assert random_pixels.pixels_hit(replicates, evaluation, values, "dark_counts") is None
+    assert hit_pixels.pixels_hit(replicates, light_levels_of(replicates, evaluation), faint, NAME) is None
+    assert hit_pixels.pixels_hit(replicates, light_levels_of(replicates, evaluation), values, "dark_counts") is None
 
 
 @pytest.mark.parametrize(
@@ -104,7 +109,7 @@ def test_pixels_that_cannot_be_are_refused(
     sensor = config.read_sensor(tmp_path / "sensor.yaml")
     monkeypatch.setattr(type(sensor.effect(NAME)), "of_pixels", lambda self, hit: said)
     with pytest.raises(UNABLE, match=wrong):
-        random_pixels.of_pixels(sensor, NAME, np.zeros(256, bool))
+        hit_pixels.of_pixels(sensor, NAME, np.zeros(256, bool))
 
 
 @pytest.mark.slow
@@ -131,7 +136,7 @@ def test_what_blinks_is_fitted_by_its_own_scatter(tmp_path: Path, monkeypatch: p
         true = TRUTH[coordinate.parameter]
         assert abs(coordinate.coordinate(value) - coordinate.coordinate(true)) < 5 * error < 2.5, coordinate
     # the sensor of the data has it in the pixels that its counts show, which are those of the chip
-    seen = random_pixels.pixels_hit(replicates, found.evaluation, found.values, NAME)
+    seen = hit_pixels.pixels_hit(replicates, light_levels_of(replicates, found.evaluation), found.values, NAME)
     assert seen is not None and np.array_equal(seen.hit, hit_in_truth(tmp_path))
     assert comparison_with(replicates, {**found.values, **seen.values}).verdict == "adequate"
     assert comparison_with(replicates, found.values).verdict == "fails"  # other pixels blink
@@ -161,6 +166,37 @@ def test_what_blinks_is_fitted_by_its_own_scatter(tmp_path: Path, monkeypatch: p
     # five standard errors
     assert abs(math.log(step.values["amplitude"].value / 5000)) < 5 / 3.92 * widths[1] < 5 / 3.92 * 0.9 * widths[0]
     assert not failing(block_checks(replicates, path.evaluation, path.evaluation.residuals))
+
+
+def test_a_map_beside_what_blinks_leaves_the_pixels_of_another_chip_alone() -> None:
+    """A model has drawn other pixels. A map took the effect away there: 0 to 0.1 Hz of 70 to 180."""
+    rates = 100 * np.exp(0.3 * np.random.default_rng(5).standard_normal(256))
+    blinks = spadmnist.effects.BlinkingDarkCounts(amplitude=1000.0, rate_on=10.0, rate_off=10.0, fraction=0.05)
+    model, truth = (
+        spadmnist.Sensor(
+            spadmnist.Layout(16, 16, 25e-12, 1.0),
+            [spadmnist.effects.Detection(pdp=0.5), spadmnist.effects.DarkCounts(rate=rate), *more],
+            rules="device",
+            chip_seed=chip,
+        )
+        for rate, more, chip in ((100.0, [], 0), (rates, [blinks], 99))
+    )
+    dark = spadmnist.Capture("dark", "tr", dark=True, exposure=10.0, tick=1e-9)
+    replicates = Replicates(model, spadmnist.simulate(truth, [dark], seed=3), 0, Execution(Serial()), 8)
+    values = {(NAME, name): getattr(blinks, name) for name in ("amplitude", "rate_on", "rate_off", "fraction")}
+    assert hit_pixels.drawn_effects(replicates, {}) == [] and hit_pixels.drawn_effects(replicates, values) == [NAME]
+    (one,) = (c for c in replicates.candidates(replicates.start) if c.name == "per_pixel dark_counts.rate")
+    _, maps, final = models_with_maps(replicates, values, [one], {"dark": 1.0})
+    map_ = maps[one.carrier]  # type: ignore[index]
+    hit = np.asarray(truth.resolved().effect(NAME).added(None) > 0)  # type: ignore[union-attr, arg-type]
+    drawn = np.asarray(with_values(replicates.start, values).resolved().effect(NAME).added(None) > 0)  # type: ignore[union-attr, arg-type]
+    apart = np.log(map_.values() / rates)[drawn & ~hit]
+    assert np.abs(apart).max() < 5 / math.sqrt(10 * rates.min())
+    assert summary(map_)["sigma"] == pytest.approx(0.3, rel=0.2)
+    seen = hit_pixels.pixels_hit(replicates, {"dark": 1.0}, final, NAME)
+    assert seen is not None and not (seen.hit & drawn & ~hit).any() and (seen.hit & hit).sum() >= hit.sum() - 1
+    own = hit_pixels.of_pixels(with_values(replicates.start, values), NAME, hit)  # which were hit is known
+    assert hit_pixels.drawn_effects(replicates, {**values, **own}) == []
 
 
 @pytest.mark.slow

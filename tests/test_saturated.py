@@ -17,11 +17,14 @@ from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
 from spadmnist.inference.light_levels import closed_form, in_counters, last_digit, level_for, rising_until
+from spadmnist.inference.map_models import information
 from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.reduction import ReducedCapture, early_ticks, reduce_with, total_of
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
 from spadmnist.statistics import Statistic, Summary
+from spadmnist.workers import Serial
 
 PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
 PIXEL = 25e-12  # m^2
@@ -79,6 +82,23 @@ RIGHT: dict[str, tuple[sp.Sensor, list[Capture]]] = {
 }
 
 
+LATE = {"frames": 400, "frame_time": FRAME, "wavelength": 500e-9, "relative_uncertainty": 0.05}
+RIGHT |= {
+    "a gate of half of frames that are full": (
+        sensor(sp.effects.ShortGate(fraction=0.5), side=8),
+        [sp.Capture("f", "str", irradiance=irradiance(8e5), **LATE)],
+    ),
+    "full frames of 10 ticks": (
+        sp.Sensor(Layout(8, 8, PIXEL, 1.0), [sp.effects.Detection(pdp=0.3), sp.effects.Tdc(resolution=1e-6)]),
+        [sp.Capture("f", "str", irradiance=irradiance(6e5), **LATE)],
+    ),
+    "flicker in frames with gaps": (
+        sensor(sp.effects.Flicker(amplitude=0.3, frequency=100.0, phase=1.0), side=8, ticks=False),
+        [sp.Capture("f", "qis", irradiance=irradiance(5e4), frame_period=3 * FRAME, **LATE)],
+    ),
+}
+
+
 @pytest.mark.parametrize("which", RIGHT)
 def test_a_right_model_is_adequate(which: str) -> None:
     """Two measurements of each; all of these models had failed with p below 1e-4. False alarms: 1 % of comparisons."""
@@ -133,7 +153,7 @@ def test_early_stamps_are_counted_where_nearly_every_frame_has_one() -> None:
     share = total_of(full, early) / (1000 * 16)
     assert 0.75 <= share < 0.76
     seen = ReducedCapture.of(full, reduced=False)
-    assert seen.counted.conditions.frame_time == pytest.approx(early * 1e-10)
+    assert seen.counted.conditions.live == pytest.approx(early * 1e-10)
     assert seen.total == share * 16000 and seen.detections == full.totals.sum()
     assert early_ticks(full.on_ticks(FRAME / 2)) is None  # 0.99 of them within the first tick
 
@@ -195,6 +215,39 @@ def test_the_closed_form_counts_nothing_in_the_gaps_between_frames(modality: str
     assert np.mean(totals) == pytest.approx(expected, abs=4.9 * math.sqrt(expected / 20))  # 5 sigma: 1e-6
     dense = closed_form(model.resolved(), lit("f", modality, 1e4, **{**frames, "frame_period": FRAME}))(level)
     assert expected == pytest.approx(dense, rel=1e-9)
+
+
+def test_nothing_fires_between_the_frames_of_a_counter() -> None:
+    """Half the frame's traps release in the gap, and what would fall into the gap fills none (physics, `device`)."""
+    traps = sp.effects.SlowAfterpulsing(probability=0.05, lifetime=2 * FRAME)
+    bare = sp.Sensor(Layout(8, 8, PIXEL, 1.0), [sp.effects.DarkCounts(rate=2e4), traps], rules="device")
+    clock = {"frames": 80_000, "frame_time": FRAME, "bits": 8, "counting": "counter", "dark": True}
+    totals = [
+        int(
+            sp.simulate(bare, [sp.Capture("f", "counts", frame_period=period, **clock)], seed=2)
+            .recording("f")
+            .totals.sum()
+        )
+        for period in (FRAME, 100 * FRAME)
+    ]
+    light = 2e4 * FRAME * 80_000 * 64
+    inside = 1 - 2 * (1 - math.exp(-0.5))  # of the releases, those in the frame of their parent
+    laws.poisson_mean(totals[1], light / (1 - 0.05 * inside))
+    assert totals[0] > totals[1] * 1.03
+    frames = Conditions(80_000 * 100 * FRAME, 80_000, FRAME, 100 * FRAME, None, 8, "counter")
+    assert frames.within_frames.live_time == pytest.approx(0.8) and frames.within_frames.within_frames.live == FRAME
+
+
+@pytest.mark.parametrize("number", [20.0, 40.0, 80.0])
+def test_first_stamps_inform_a_map_however_bright_the_light(number: float) -> None:
+    """A pixel's rate is known to 1 / sqrt(stamps), and no share of frames says it."""
+    capture = lit("s", "str", number / FRAME, frames=100, frame_time=FRAME)
+    data = sp.simulate(sensor(side=8), [capture], seed=1)
+    replicates = Replicates(sensor(side=8), data, 0, Execution(Serial()), 8, reduced=False)
+    level = number / FRAME / 0.3
+    (one,) = (c for c in replicates.candidates(replicates.start) if c.name == "per_pixel detection.pdp")
+    known = information(replicates, {}, one, {"s": level})["s"]
+    assert known.mean() > 100
 
 
 def test_a_capture_whose_counters_are_full_tells_nothing_of_the_pixels() -> None:

@@ -156,6 +156,7 @@ def test_where_it_lies_between_two_bins() -> None:
     ("strength", "frequency"),
     [
         (560.0, 307.0),
+        (1e6, 307.0),  # its error is a hundredth of the distance of the places that are tried first
         *(pytest.param(s, f, marks=pytest.mark.slow) for s in (60.0, 5000.0) for f in (294.0, 300.0, 307.0, 310.0)),
     ],
 )

@@ -81,7 +81,8 @@ class Conditions:
     exposure, frame_time, frame_period: s; frames: their number; wavelength: m, None where no light falls on the sensor.
     scene: the image that the light follows, where it is not the same on all pixels; photons/s are then those of white.
     bits: of the readout `counts`, 0 without it; counting: what a count is, the sum of 2^bits - 1 binary `frames`, or a
-    `counter` in each frame, which stops at 2^bits - 1.
+    `counter` in each frame, which stops at 2^bits - 1. live: s from the start of each frame in which detections are
+    recorded, for expectations (`within_frames`); None: all of the exposure.
     """
 
     exposure: float
@@ -92,6 +93,7 @@ class Conditions:
     bits: int = 0
     counting: str = "frames"
     scene: Scene | None = None
+    live: float | None = None
 
     def lit(self, photons: np.ndarray) -> tuple[np.ndarray, Conditions]:
         """(photons/s on each pixel, the same conditions without a scene) of (images, pixels) photons/s of white."""
@@ -110,11 +112,23 @@ class Conditions:
         return self.frames if self.counting == "counter" else self.frames // max(1, self.largest_count)
 
     @property
-    def without_gaps(self) -> Conditions:
-        """The same frames without gaps between them: the exposure is the time in which something is recorded."""
-        if self.frame_period == self.frame_time:
-            return self
-        return replace(self, frame_period=self.frame_time, exposure=self.frames * self.frame_time)
+    def within_frames(self) -> Conditions:
+        """The same, of what is recorded within the frames: nothing in the gaps between them."""
+        whole = self.live is not None or self.frame_period == self.frame_time
+        return self if whole else replace(self, live=self.frame_time)
+
+    @property
+    def live_time(self) -> float:
+        """The time in which detections are recorded, s."""
+        return self.exposure if self.live is None else self.frames * self.live
+
+    def moments(self, number: int) -> np.ndarray:
+        """(number,) even moments of the time in which detections are recorded, s since the start."""
+        share = np.modf((np.arange(number) + 0.5) * _GOLDEN)[0]
+        if self.live is None:
+            return self.exposure * share
+        within, frame = np.modf(share * self.frames)
+        return frame * self.frame_period + within * self.live
 
     @property
     def dark(self) -> bool:
@@ -230,12 +244,13 @@ class Effect(Plugin, abstract=True):
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """Mean rate behind this effect (1/s) from that before it; for planning, and for the light of a capture.
 
-        Default: times the mean of `factor`, or of `open`, over the exposure; unchanged where there is neither.
+        Default: times the mean of `factor`, or of `open`, over the exposure (of `conditions.live`, over that part of
+        the frames); unchanged where there is neither.
         """
         if not self.has_mean:
             return rate
         hook = "factor" if self.stage == "arrival" else "open"
-        times = conditions.exposure * np.modf((np.arange(_TIMES) + 0.5) * _GOLDEN)[0]
+        times = conditions.moments(_TIMES)
         mean = float(np.mean(getattr(self, hook)(times, conditions)))
         # what is no mean is refused where the effect acts; a mean of 1 keeps every digit
         return rate if not 0 <= mean < math.inf or abs(mean - 1) < _NO_CHANGE else rate * mean

@@ -66,10 +66,12 @@ class ShortGate(Effect, stage="gate"):
         return min(self.offset + self.fraction * conditions.frame_time, conditions.frame_time)
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        """rate * live time of a frame / frame period."""
+        """rate * live time of a frame / frame period (of `conditions.live`, the share of that part of a frame)."""
         if self.fraction == 1 and self.offset == 0:
             return rate
-        return rate * (max(self._end(conditions) - self.offset, 0.0) / conditions.frame_period)
+        whole = conditions.frame_period if conditions.live is None else conditions.live
+        end = self._end(conditions) if conditions.live is None else min(self._end(conditions), conditions.live)
+        return rate * (max(end - self.offset, 0.0) / whole)
 
 
 @kernels.jit

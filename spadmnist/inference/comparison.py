@@ -344,7 +344,7 @@ def _level_checks(
     mean = made.total_at(made.stated)
     light = math.hypot(capture.light.relative_uncertainty, capture.light.own_uncertainty)
     z = made.score(total, light if lost else 0.0)
-    per = sensor.layout.pixels * capture.conditions.without_gaps.exposure
+    per = sensor.layout.pixels * capture.conditions.within_frames.live_time
     size = f"{total / per:.4g} /s in a pixel, {mean / per:.4g} /s expected"
     relative = (total - mean) / max(mean, 1.0)
     p = float(2 * stats.norm.sf(abs(z)))

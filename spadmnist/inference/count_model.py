@@ -11,7 +11,7 @@ from scipy import stats
 from ..sensor import Sensor
 from .candidates import with_values
 from .coordinates import Key
-from .light_levels import in_frames, pixel_counts
+from .light_levels import events_in_frames, pixel_counts
 from .models import InTheDark
 from .replicates import Replicates
 
@@ -40,8 +40,8 @@ class CountModel:
             sensor = InTheDark.of(sensor)
         if self.waited is None:
             return np.maximum(pixel_counts(sensor, self.seen.capture)(self.level), 1e-9)
-        share = in_frames(sensor, np.full((1, sensor.layout.pixels), self.level), self.conditions)[0]
-        return np.asarray(np.maximum(self.waited * -np.log1p(-np.minimum(share, 1 - 1e-15)), 1e-9))
+        events = events_in_frames(sensor, np.full((1, sensor.layout.pixels), self.level), self.conditions)[0]
+        return np.asarray(np.maximum(self.waited * events, 1e-9))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
         """The log-likelihood of the measured counts, (pixels,), up to a constant.
@@ -90,7 +90,7 @@ class CountModel:
             return np.maximum(n, least)
         if self.frames:
             return np.maximum(n * (1 - np.minimum(n / self.conditions.frames, 1 - 1e-4)), least)
-        live = self.conditions.without_gaps.exposure
+        live = self.conditions.within_frames.live_time
         return np.maximum(n * (1 - np.minimum(n * dead / live, 0.99)) ** 2, least)
 
 

@@ -9,7 +9,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import SpadError
-from .evaluation import Evaluation, block_checks, failing, log_likelihood_ratio, mean_misfit, square, stacked
+from .evaluation import (
+    Evaluation,
+    as_compared,
+    block_checks,
+    failing,
+    log_likelihood_ratio,
+    mean_misfit,
+    square,
+    stacked,
+)
 from .gauss_newton import Effort, Fit, column_of, gauss_newton
 from .joint_fit import LOST, RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
 from .levels import CLEARLY, LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
@@ -236,7 +245,7 @@ def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:
             fit_all(path)
             path.rung("without steps that explain too little")
         else:
-            path.evaluation, path.fit = start, None
+            path.evaluation, path.fit = as_compared(path.replicates, start), None
 
 
 def no_step_explains(path: ModelPath, totals: bool) -> bool:

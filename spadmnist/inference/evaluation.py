@@ -254,6 +254,11 @@ def with_totals_anew(replicates: Replicates, evaluation: Evaluation) -> Evaluati
     return again
 
 
+def as_compared(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
+    """The evaluation without the totals of captures whose level is free now."""
+    return with_totals_anew(replicates, evaluation) if replicates.unstated else evaluation
+
+
 _Centre = tuple[float, float | None, Callable[[float], float], float]  # see `central_level`
 
 

@@ -32,6 +32,7 @@ _RECORDINGS = 16  # replicates of a capture that was not taken yet
 _MOST_EVENTS = 6e5  # detections of a longer capture, at most; a brighter one may have twice as many
 _LONG = 100.0  # s of a long dark capture
 _LONGER = 10.0  # factor on the exposure of a lit capture that is taken again, at most
+_LEAST_COUNTS = 0.5  # detections: fewer expected ones are as many, where captures are compared
 _MOST_FRAMES = 4.0  # the same for frames, which cost time even where they are empty
 
 
@@ -168,8 +169,9 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
             closed_form(InTheDark.of(s) if capture.light.dark else s, capture)(level)
             for s in (sensor, other.sensors.mean_sensor(model.id))
         )
-        apart = abs(math.log(changed / plain_) - expected)
-        z = apart / math.sqrt(1 / plain_ + capture.light.own_uncertainty**2 + 1e-6)
+        some, more = max(plain_, _LEAST_COUNTS), max(changed, _LEAST_COUNTS)
+        apart = abs(math.log(more / some) - expected)
+        z = apart / math.sqrt(1 / max(some, more) + capture.light.own_uncertainty**2 + 1e-6)
         if best is None or z > best[0]:
             best = z, words
     assert best is not None

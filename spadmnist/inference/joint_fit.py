@@ -387,7 +387,9 @@ def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
         values = {**path.values, **path.where(path.values)}
         return Model.same(replicates.start).changed(values, scan.phases, chips), {}
     levels = count_model.light_levels_of(replicates, path.evaluation)
-    sensors, maps, path.values = map_models.models_with_maps(replicates, path.values, held, levels)
+    where = path.where(path.values)
+    sensors, maps, values = map_models.models_with_maps(replicates, {**path.values, **where}, held, levels)
+    path.values = {key: path.values[key] if key in where else x for key, x in values.items()}
     return sensors.changed({}, scan.phases, chips), maps
 
 

@@ -291,7 +291,7 @@ def pixel_counts(sensor: Sensor, capture: Capture) -> Callable[[float], np.ndarr
     def counts(level: float) -> np.ndarray:
         light = np.full((1, sensor.layout.pixels), level)
         if capture.counts_events:
-            made = sensor.expected(light, conditions.without_gaps, capture.modality == "tr")[1][0]
+            made = sensor.expected(light, conditions.within_frames, capture.modality == "tr")[1][0]
         else:
             made = conditions.frames * in_frames(sensor, light, conditions)[0]
         if full is not None:
@@ -334,8 +334,20 @@ def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.n
     Args:
         light: (images, pixels) photons/s.
     """
-    candidates, _ = sensor.expected(light, conditions.without_gaps)
-    return np.asarray(-np.expm1(-candidates / conditions.frames))
+    return np.asarray(-np.expm1(-events_in_frames(sensor, light, conditions)))
+
+
+def events_in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The expected events in a frame, of which the first is detected, (images, pixels).
+
+    Args:
+        light: (images, pixels) photons/s.
+        conditions: of so many ticks of each frame, these begin where the sensor's converter counts them from.
+    """
+    within = conditions.within_frames
+    if conditions.live is not None:
+        within = replace(conditions, live=max(conditions.live + sensor.origin, 0.0))
+    return np.asarray(sensor.expected(light, within)[0] / conditions.frames)
 
 
 def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:

@@ -22,6 +22,7 @@ from . import blind_times
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
 from .count_model import CountModel
+from .hit_pixels import beside_maps
 from .levels import LEAST_P
 from .pixel_maps import (
     CODES,
@@ -274,6 +275,7 @@ def fit_maps(
     wanted = [c for c in wanted if by_counts(c)]
     if not wanted:
         return out
+    values = beside_maps(replicates, values, {c.carrier for c in wanted if c.carrier is not None}, levels)
     start = with_values(replicates.start, {k: v for k, v in values.items() if k not in {c.carrier for c in wanted}})
     lines = [
         CountModel(replicates, id, levels[id])

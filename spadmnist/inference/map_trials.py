@@ -17,6 +17,7 @@ from .candidates import Candidate, with_values
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
 from .evidence import evidence_of
+from .hit_pixels import drawn_effects
 from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
@@ -77,7 +78,7 @@ def map_trials_of(
         spread = float(np.mean((map_.estimate / np.maximum(map_.error, 1e-9)) ** 2))
         if spread < _LEAST_SPREAD:
             continue
-        sensors = sensors.changed({}, scan.phases)
+        sensors = sensors.changed({}, scan.phases, chips=bool(drawn_effects(scan.replicates, values)))
         p = min(p_of_map(scan.replicates, evaluation, c, values, levels) for c in group)
         if p > least:
             continue

@@ -12,14 +12,15 @@ import numpy as np
 from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key
+from .count_model import light_levels_of
 from .error_budget import HeldMaps, Rung, physical_errors
 from .evaluation import BlockCheck, Evaluation, block_checks, failing, mean_misfit
 from .evidence import evaluation_of
 from .gauss_newton import Fit
+from .hit_pixels import PixelsHit, of_pixels, pixels_hit
 from .joint_fit import fit_all
 from .models import Model
 from .phases import evaluate_start
-from .random_pixels import PixelsHit, of_pixels, pixels_hit
 from .replicates import TOTALS, Cell, Replicates
 from .results import Step, title
 from .scan import Scan
@@ -176,7 +177,8 @@ class ModelPath:
 
         def made() -> np.ndarray | None:
             with self.scan.if_possible(step.candidate, "the pixels that it has hit", wholly=False):
-                found = pixels_hit(self.replicates, self.evaluation, self.values, effect)
+                levels = light_levels_of(self.replicates, self.evaluation)
+                found = pixels_hit(self.replicates, levels, self.values, effect)
                 return None if found is None else found.hit
             return None
 

@@ -25,7 +25,7 @@ from .comparison import Comparison, comparison_of, comparison_with, nothing_to_c
 from .conclusion import Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
-from .evaluation import Evaluation, block_checks, failing, misfit_null_95, with_totals_anew
+from .evaluation import Evaluation, as_compared, block_checks, failing, misfit_null_95, with_totals_anew
 from .findings import mimicked
 from .forward_step import (
     added_from,
@@ -157,7 +157,7 @@ def _diagnosed(
         _renew_setup(path, notes)
     verdict = verdict_of(path, left_over(path, notes), notes)
     if not path.steps:
-        path.evaluation, path.fit, path.values = start, None, {}
+        path.evaluation, path.fit, path.values = as_compared(replicates, start), None, {}
         path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
     rungs = [path.ladder[0], *([notes.placebo] if notes.placebo else []), *path.ladder[1:]]
     null_95 = _measured(path, rungs)
@@ -183,7 +183,7 @@ def _diagnosed(
     in_sample: Comparison | None = None
     with or_as_before(path, "the last comparison"):
         replicates.say("the comparison of the model with its steps")
-        own = None if path.steps else path.evaluation
+        own = None if path.steps else start
         in_sample = (
             comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values, path.scan.phases)
         )

@@ -250,7 +250,7 @@ def summary(map_: PixelMap) -> dict[str, float]:
 def _spread(map_: PixelMap) -> tuple[int, float, float]:
     """(number, variance, part of it that is noise) of the values that are not odd; one value has no variance."""
     low, high = odd_pixels(map_)
-    rest = ~(low | high) & map_.informed
+    rest = ~(low | high) & map_.informed & (map_.raw_error < NOTHING)  # a hit hides what a pixel has by itself
     number = int(rest.sum())
     if number < 2:
         return number, 0.0, 0.0

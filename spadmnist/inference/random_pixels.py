@@ -1,4 +1,4 @@
-"""Effects that hit pixels at random: fits by the likelihood with their own scatter, and which pixels were hit.
+"""Effects that hit pixels at random: fits by the likelihood with their own scatter.
 
 Such an effect hits pixels at random. In units of the scatter of the model without it, the pixels that it has hit in the
 data have by far the largest residuals, whatever its strength and time constant. Their squares do not inform these two.
@@ -11,17 +11,11 @@ Source: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 9.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from .. import plugins
 from ..errors import SpadError
-from ..sensor import Sensor
-from . import count_model
 from .budget import OutOfBudget
-from .candidates import with_values
 from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
 from .gauss_newton import Fit, JacobianBy, gauss_newton_step
@@ -36,12 +30,6 @@ _TURNS = 6  # steps at most; from the nearest of the shapes four were enough for
 _VAIN = 2  # steps in a row without a larger likelihood, after which the rest is noise and the fit ends
 # in chi square, for each coordinate: a smaller promised fall is the noise of a Jacobian, and the fit ends
 _PROMISED = 5.0
-# expected number of pixels in the array that are taken as hit although they are not: less than one. It is the level of
-# the test of each pixel; where a typical hit would not pass it, the counts identify no pixel
-_FALSE_HITS = 0.5
-_ENOUGH = 0.1  # of what a hit adds in the mean: the least excess of a pixel that is taken as hit
-_MOST = 0.4  # share of the pixels: with more of them hit, the median of all is no longer that of the others
-_LEVEL = 10.0  # detections of most pixels, from which on their median gives the level and their scatter
 
 
 def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Trial) -> Trial:
@@ -128,75 +116,3 @@ def _of_the_best_shape(one: Trial, ratio: Callable[[Values], float]) -> dict[Key
         if likeliest is None or found > likeliest[0]:
             likeliest = found, values
     return None if likeliest is None or likeliest[1] == one.values else likeliest[1]
-
-
-@dataclass(frozen=True)
-class PixelsHit:
-    """The pixels that an effect has hit.
-
-    Attributes:
-        hit: (pixels,) bool.
-        values: the parameters under which the effect is in exactly these, SI.
-    """
-
-    hit: np.ndarray
-    values: dict[Key, Any]
-
-
-def pixels_hit(replicates: Replicates, evaluation: Evaluation, values: Values, effect: str) -> PixelsHit | None:
-    """The pixels whose counts show an effect that hits pixels at random; None where the counts do not identify them.
-
-    The median of the pixels gives the level of a capture: pixels that are hit at random hardly move it.
-
-    Args:
-        evaluation: of the model with the effect.
-        values: of that model, SI.
-    Raises:
-        SpadError: where a user's effect says something else.
-    """
-    pixels = replicates.start.layout.pixels
-    counted = [id for id, seen in replicates.seen.items() if seen.counts is not None]
-    sensor = with_values(replicates.start, values)
-    if not counted or not of_pixels(sensor, effect, np.zeros(pixels, bool)):
-        return None
-    without, throughout = (
-        with_values(replicates.start, {**values, **of_pixels(sensor, effect, np.full(pixels, hit))})
-        for hit in (False, True)
-    )
-    levels = count_model.light_levels_of(replicates, evaluation)
-    p, of_a_hit = np.ones(pixels), np.ones(pixels)  # p-values of each pixel, and of one that is hit
-    for id in counted:
-        line = count_model.CountModel(replicates, id, levels[id])
-        counts, low, high = replicates.seen[id].counts, line.expected(without), line.expected(throughout)
-        assert counts is not None
-        wider = 1.0
-        if (median := float(np.median(counts))) >= _LEVEL:
-            scale = median / float(np.median(low))
-            low, high = low * scale, high * scale
-            scatter = 1.4826 * float(np.median(np.abs(counts - low)))
-            wider = max(scatter**2 / float(np.median(line.variance(low, 0.0))), 1.0)
-        more = counts - low > _ENOUGH * (high - low)
-        p = np.minimum(p, np.where(more, len(counted) * line.p_of_more(counts, low, wider), 1.0))
-        of_a_hit = np.minimum(of_a_hit, len(counted) * line.p_of_more(high, low, wider))
-    hit = p < _FALSE_HITS / pixels
-    if float(np.median(of_a_hit)) > _FALSE_HITS / pixels or not 0 < float(np.mean(hit)) < _MOST:
-        return None
-    return PixelsHit(hit, of_pixels(sensor, effect, hit))
-
-
-def of_pixels(sensor: Sensor, effect: str, hit: np.ndarray) -> dict[Key, Any]:
-    """The values under which an effect of the sensor is in exactly these pixels, SI; none where it does not say them.
-
-    Args:
-        hit: (pixels,) bool.
-    Raises:
-        EffectError: where a user's effect fails, or says what it cannot be.
-    """
-    own = sensor.effect(effect)
-    assert own is not None
-    with plugins.blaming(type(own)):
-        said = own.of_pixels(hit)
-        if not isinstance(said, dict) or not said.keys() <= own.parameters.keys():
-            raise ValueError(f"of_pixels must be a dict of parameters, {', '.join(own.parameters)}; not {said!r:.80}")
-        plugins.check_values(type(own)(**{**{name: getattr(own, name) for name in own.parameters}, **said}))
-    return {(effect, name): value for name, value in said.items()}

@@ -60,7 +60,7 @@ class ReducedCapture:
 
     @property
     def counted(self) -> Capture:
-        """The capture whose detections are the total: with shorter frames where only early stamps are counted."""
+        """The capture whose detections are the total: of a part of its frames where only early stamps are counted."""
         return counted_of(self.capture, self.early)
 
     @property
@@ -124,11 +124,11 @@ def total_of(recording: Recording, early: int | None) -> float:
 
 
 def counted_of(capture: Capture, early: int | None) -> Capture:
-    """The capture whose frames end after so many ticks."""
+    """The capture of which so many ticks of each frame are counted."""
     if early is None:
         return capture
     assert capture.tick is not None
-    return replace(capture, conditions=replace(capture.conditions, frame_time=early * capture.tick))
+    return replace(capture, conditions=replace(capture.conditions, live=early * capture.tick))
 
 
 def statistics_for(capture: Capture) -> list[Statistic]:

@@ -106,9 +106,15 @@ def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupEx
     waves = sorted({captures[i].light.wavelength or 0.0 for i in lit})
     for wave in waves if len(waves) > 1 else []:
         shared.append(Factor("light", tuple(i for i in lit if captures[i].light.wavelength == wave), True))
-    clocks = sorted({captures[i].conditions.frame_time for i in ids if captures[i].modality != "tr"})
+    # of early stamps no longer frame has more
+    timed = {
+        i: captures[i].conditions.frame_time
+        for i in ids
+        if captures[i].modality != "tr" and replicates.seen[i].early is None
+    }
+    clocks = sorted(set(timed.values()))
     for clock in clocks if len(clocks) > 1 else []:
-        shared.append(Factor("exposure", tuple(i for i in ids if captures[i].conditions.frame_time == clock), True))
+        shared.append(Factor("exposure", tuple(i for i in timed if timed[i] == clock), True))
     shared = [factor for factor in shared if len(factor.captures) > 1]
     tries: list[tuple[Factor, ...]] = [(one,) for one in [*shared, *single]]
     tries += [pair for pair in itertools.combinations([*shared, *single], 2) if not _overlap(pair)]
@@ -145,9 +151,8 @@ def brightest(replicates: Replicates, one: SetupExplanation) -> str | None:
     named = {id for factor in one.factors for id in factor.captures}
     rates = {}
     for id, seen in replicates.seen.items():
-        c = seen.counted.conditions
         if not seen.capture.light.dark:  # frames may have gaps between them
-            rates[id] = seen.total / (c.exposure if seen.capture.modality == "tr" else c.frames * c.frame_time)
+            rates[id] = seen.total / seen.counted.conditions.within_frames.live_time
     most = max(rates, key=lambda id: rates[id], default=None)
     return most if named == {most} and len(rates) > 2 else None
 
@@ -187,7 +192,7 @@ def exposure_factor(
     Args:
         log, error: of the factor on the level, with its standard error.
     """
-    capture, sensor = replicates.seen[id].counted, evaluation.sensors.mean_sensor(id)
+    capture, sensor = replicates.seen[id].capture, evaluation.sensors.mean_sensor(id)
     level = float(evaluation.rates[id].stated or evaluation.rates[id].level)
     clock = capture.conditions
 
@@ -236,7 +241,7 @@ def _names(
         ratio = there * sensor.nominal_pdp(wave) / (own * sensor.nominal_pdp(capture.light.wavelength))
         if abs(math.log(ratio) - log) < 3 * math.hypot(error, 0.01 + capture.light.relative_uncertainty):
             return ["wavelength"]
-    return ["light", "exposure"]
+    return ["light", "exposure"] if replicates.seen[id].early is None else ["light"]
 
 
 def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:

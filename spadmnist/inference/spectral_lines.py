@@ -28,6 +28,10 @@ _AROUND = [d for d in range(-_NEIGHBOURS, _NEIGHBOURS + 1) if abs(d) > _NEXT]
 _OTHERS = 2  # the largest neighbouring bins, which may be another line, are left out
 # bins to both sides within which the frequency is fitted; grid points, 200 to a bin
 _WITHIN, _PLACES = 1.2, 481
+# grid points within a standard deviation of the frequency, at least: with 3 the width of a normal law on the grid is
+# right within 1e-6. A sharper line has a finer grid, of so many standard deviations and points to both sides
+_WITHIN_ERROR, _TO_SIDES, _FINER = 3.0, 6.0, 60
+_ZOOMS = 8  # finer grids at most: each is 10 times as fine or more, far beyond the digits of a frequency
 _STRENGTHS = np.linspace(0.7, 1.1, 17)  # factors on the amplitude in the data, a part of which is noise
 # the least number of periods in the longest capture; with fewer it is a drift, whose powers are those of a line near 0:
 # a drift of Z 12.7 had been explained as a flicker of 0.6 periods
@@ -176,18 +180,24 @@ def _in(group: Sequence[CaptureSpectrum], groups: int) -> list[Line]:
 def fitted_line(group: Sequence[CaptureSpectrum], about: float, log_p: float) -> Line:
     """The line at a frequency, fitted by the likelihood of the powers about it in all spectra that show it."""
     step = min(s.step for s in group)
-    grid = about + step * np.linspace(-_WITHIN, _WITHIN, _PLACES)
-    grid = grid[grid > 0]
-    total, shown = np.zeros(grid.size), False
-    for s in group:
-        cell = int(s.bins(np.array([about]))[0])
-        if cell >= 0 and s.z[cell] >= _SIGN:
-            total, shown = total + _likelihood(s.power, cell, grid / s.step), True
-    if not shown:
+    cells = [(s, int(s.bins(np.array([about]))[0])) for s in group]
+    cells = [(s, cell) for s, cell in cells if cell >= 0 and s.z[cell] >= _SIGN]
+    if not cells:
         return Line(about, step, log_p)
-    weights = np.exp(total - total.max())
-    mean = float(np.average(grid, weights=weights))
-    return Line(mean, float(np.sqrt(np.average((grid - mean) ** 2, weights=weights))), log_p)
+    grid = about + step * np.linspace(-_WITHIN, _WITHIN, _PLACES)
+    mean = error = 0.0
+    for _ in range(_ZOOMS):
+        grid = grid[grid > 0]
+        total = sum(_likelihood(s.power, cell, grid / s.step) for s, cell in cells)
+        weights = np.exp(total - np.max(total))
+        mean = float(np.average(grid, weights=weights))
+        error = float(np.sqrt(np.average((grid - mean) ** 2, weights=weights)))
+        apart = float(grid[1] - grid[0])
+        if error > _WITHIN_ERROR * apart:
+            break
+        half = _TO_SIDES * max(error, apart)
+        grid = grid[int(np.argmax(weights))] + half * np.linspace(-1.0, 1.0, 2 * _FINER + 1)
+    return Line(mean, error, log_p)
 
 
 def _likelihood(power: np.ndarray, cell: int, places: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ the law of the values together, as for dead times (`blind_times.width_of`); each
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -81,7 +82,8 @@ def information(
     prior = float(np.var(grid))
     out = {id: np.zeros(replicates.start.layout.pixels) for id in replicates.seen}
     for id, logs in of_captures.items():
-        out[id] = np.maximum(1 / mean_of(_relative(logs), grid)[1] ** 2 - 1 / prior, 0.0)
+        error = np.maximum(mean_of(_relative(logs), grid)[1], float(grid[1] - grid[0]) / math.sqrt(12))
+        out[id] = np.maximum(1 / error**2 - 1 / prior, 0.0)
     return out
 
 
@@ -130,7 +132,8 @@ def _likelihoods(
     informed = error < _INFORMED * float(np.std(wide))
     if informed.sum() < 2:
         raise SpadError(f"the statistic {statistic.name} informs {carrier[1]} of fewer than two pixels")
-    ends = (middle - _BEYOND * error)[informed].min(), (middle + _BEYOND * error)[informed].max()
+    wider = _BEYOND * np.maximum(error, float(wide[1] - wide[0]))  # a sharper value lies between two of the grid
+    ends = (middle - wider)[informed].min(), (middle + wider)[informed].max()
     grid = np.linspace(max(ends[0], wide[0]), min(ends[1], wide[-1]), _FINE)
     return grid, at(grid)
 

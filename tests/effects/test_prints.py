@@ -115,6 +115,10 @@ def test_the_print_comes_before_the_sensor() -> None:
     effects: list[Effect] = [ColumnPattern(gain=gains), *PRINTS]
     names = [effect.name for effect in in_order(effects)]
     assert names == ["print_contrast", "print_tilt", "print_blur", "column_pattern"]
+    assert [e.name for e in in_order([PRINTS[0], PRINTS[1]])] == [
+        "print_contrast",
+        "print_blur",
+    ]  # without what stands between
     sensor = Sensor(Layout(4, 6, 25e-12, 1.0), effects).resolved()
     assert np.allclose(sensor.rates(np.full((1, 24), 10.0), LIT)[0].reshape(4, 6), 10 * gains)
 
