@@ -326,8 +326,17 @@ BLURRED = "jitter: {sigma: 1 ns, tail: 0 s}", "add jitter", {("jitter", "sigma")
             "early_intervals",
             ["dead_time"],
         ),
-        ("jitter: {sigma: 1 ns, tail: 0 s}", "add jitter", {("jitter", "sigma"): 1e-9}, "", []),
-        ("crosstalk: {probability: 2 %}", "add crosstalk", {CROSSTALK: 0.02}, "", []),
+        pytest.param(
+            "jitter: {sigma: 1 ns, tail: 0 s}",
+            "add jitter",
+            {("jitter", "sigma"): 1e-9},
+            "",
+            [],
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            "crosstalk: {probability: 2 %}", "add crosstalk", {CROSSTALK: 0.02}, "", [], marks=pytest.mark.long
+        ),
     ],
 )
 def test_pixels_whose_dead_time_differs_unseen_are_a_look_alike_of_jitter(lab, truth, name, values, unseen, alike):

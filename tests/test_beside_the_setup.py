@@ -118,6 +118,7 @@ def test_the_next_step_beside_a_fault_of_the_set_up_corrects_the_measurement() -
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_noisy_lamp_is_found_beside_a_wrong_light_level() -> None:
     """No check fails but a total. A scan that ended there would miss the lamp."""
     effects = [

@@ -110,15 +110,17 @@ def test_a_right_model_is_adequate_whatever_the_power_meter_says(modality: str) 
 
 
 @pytest.mark.slow
-def test_false_alarms_are_as_rare_as_they_are_said_to_be() -> None:
-    """99 measurements of three sensors, made by the model itself with the light wrong by its stated 1.5 %.
+@pytest.mark.parametrize(("each", "most"), [(14, 4), pytest.param(33, 5, marks=pytest.mark.long)])
+def test_false_alarms_are_as_rare_as_they_are_said_to_be(each: int, most: int) -> None:
+    """Measurements of three sensors, made by the model itself with the light wrong by its stated 1.5 %.
 
-    At most 5 may fail; with the stated 1 % there is 1, and more than 5 come with probability 0.05 %. Were 10 % of them
-    to fail, 5 or fewer would come with probability 6 %.
+    Of 99 at most 5 may fail; with the stated 1 % there is 1, and more than 5 come with probability 0.05 %. Were 10 % of
+    them to fail, 5 or fewer would come with probability 6 %. Of 42 at most 4: more come with 0.006 %, and were 20 % to
+    fail, 4 or fewer would come with 6 %.
     """
     failed = []
     rng = np.random.default_rng(3)
-    cases = [(modality, k) for modality in ("tr", "qis", "str") for k in range(33)]
+    cases = [(modality, k) for modality in ("tr", "qis", "str") for k in range(each)]
     smallest = []
     for modality, number in cases:
         light = math.exp(0.015 * rng.standard_normal())
@@ -128,7 +130,7 @@ def test_false_alarms_are_as_rare_as_they_are_said_to_be() -> None:
         if found.verdict != "adequate":
             failed.append((modality, number, [(c.statistic, c.capture, c.p_value) for c in found.failing]))
     print(f"{len(failed)} of {len(cases)} fail; the smallest p times checks: {np.sort(smallest)[:8].round(4)}")
-    assert len(failed) <= 5, failed
+    assert len(failed) <= most, failed
 
 
 # --- a wrong one is told where it fails ---

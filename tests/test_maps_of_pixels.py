@@ -199,6 +199,7 @@ def test_a_map_of_another_chip_is_a_candidate_until_it_is_fitted(tmp_path: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_camera_has_another_chip_than_the_model(tmp_path: Path) -> None:
     """The dark counts of its pixels are found and fitted; where the model is of that very chip nothing is missing."""
     (tmp_path / "plan.yaml").write_text(ANOTHER)

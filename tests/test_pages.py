@@ -508,6 +508,7 @@ def test_twelve_large_maps_are_still_a_small_page() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_thousand_captures_are_still_a_page(tmp_path: Path) -> None:
     checks = [
         Check(f"statistic_{s}", f"image-{k:05d}", 1.0, 0.001 + 0.5 * ((17 * k + s) % 100) / 100, "row 3", "1 %", 0.01)
