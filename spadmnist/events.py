@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,6 +30,26 @@ class Layout:
     pixel_area: float
     fill_factor: float
     positions: np.ndarray | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "columns"):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise InputError(f"{name} is {value!r}; it is a whole number of pixels, 1 or more")
+        # a measurement does not know its area: nan
+        number = isinstance(self.pixel_area, int | float | np.number) and isinstance(
+            self.fill_factor, int | float | np.number
+        )
+        if not number or self.pixel_area <= 0 or math.isinf(self.pixel_area):
+            raise InputError(f"pixel_area is {self.pixel_area!r}; it is in m^2 and more than 0, 25e-12 for 25 um^2")
+        if not (math.isnan(self.fill_factor) or 0 < self.fill_factor <= 1):
+            raise InputError(
+                f"fill_factor is {self.fill_factor!r}; it is a share, more than 0 and at most 1, 0.45 for 45 %"
+            )
+        if self.positions is not None and np.shape(self.positions) != (self.pixels, 2):
+            raise InputError(
+                f"positions have shape {np.shape(self.positions)}; they are (pixels, 2) in m, here ({self.pixels}, 2)"
+            )
 
     @property
     def pixels(self) -> int:

@@ -68,7 +68,8 @@ def export(
 ) -> list[Path]:
     """Write captures (`ids`; all that have data, without them) to a file, or to files in a folder; their paths.
 
-    `out` is a file where it ends as such files do, otherwise a folder. What is there already is not written over.
+    `out` is a file where it ends as such files do, otherwise a folder; as files of another format end, no new folder
+    does. What is there already is not written over.
     Raises SpadError with a sentence.
     """
     target = Target.every[format]
@@ -78,7 +79,7 @@ def export(
     if not chosen:
         raise SpadError(f"{measurement.source}: of its captures only means are known; there are no data to export")
     ends = {other.suffix: name for name, other in Target.every.items() if other.suffix != target.suffix}
-    if out.suffix.lower() in ends:
+    if out.suffix.lower() in ends and not out.is_dir():
         raise SpadError(
             f"{out} ends as files of the format {ends[out.suffix.lower()]} do; those of {format} end with "
             f"{target.suffix}: name such a file, a folder, or another --format"

@@ -841,7 +841,7 @@ _OPEN, _LOST, _FIRED = np.uint8(0), np.uint8(1), np.uint8(2)  # what is known of
 
 
 @_jit
-def _fire_until(times, parents, i, goal, state, blind, needed, extends, before):
+def _fire_until(times, parents, i, goal, state, blind, needed, extends, asleep, before):
     """Decide a row's candidates from `i` to `goal` (TR), up to the first whose parent is not decided yet.
 
     before: when the pixel's blindness began. Returns (where it stopped, before).
@@ -849,6 +849,10 @@ def _fire_until(times, parents, i, goal, state, blind, needed, extends, before):
     i = np.uint64(i)
     goal = np.uint64(goal)
     while i < goal:
+        if asleep.size and asleep[i]:
+            state[i] = _LOST
+            i += np.uint64(1)
+            continue
         if parents.size:
             parent = parents[i]
             if parent >= 0:
@@ -903,7 +907,7 @@ def _fire_in_frames(times, parents, i, goal, state, blind, frame_period, frame_t
 
 
 @_jit
-def avalanches(times, offsets, parents, blind, needed, extends, frame_period, frame_time, carried):
+def avalanches(times, offsets, parents, blind, needed, extends, frame_period, frame_time, carried, asleep):
     """What fires: an event whose parent fired, or that has none, and that does not find its pixel blind.
 
     times, offsets: candidates, in order within a row; of equally late ones a parent stands before its child.
@@ -911,7 +915,8 @@ def avalanches(times, offsets, parents, blind, needed, extends, frame_period, fr
     blind: (pixels,) s after a detection; needed: (events,) s that the pixel must have been awake again for this one
     (empty: none needs any). extends: what finds its pixel blind makes it blind anew (paralyzable).
     With `frame_period` > 0 a pixel fires at most once in a frame, the rest of which it is blind, and nothing fires
-    between frames; into the next frame it carries a share `carried` of what is left of its blind time.
+    between frames; into the next frame it carries a share `carried` of what is left of its blind time. Otherwise
+    asleep: (events,) bool, those that find the pixel switched off, and leave no trace (empty: none does).
 
     A row is gone through in time order. Where a parent lies in another row that is not that far yet, that row comes
     first, up to the parent; since causes come before their effects, this ends.
@@ -939,7 +944,7 @@ def avalanches(times, offsets, parents, blind, needed, extends, frame_period, fr
                     times, parents, i, goal, state, dead, frame_period, frame_time, carried, last[row], awake[row]
                 )
             else:
-                i, last[row] = _fire_until(times, parents, i, goal, state, dead, needed, extends, last[row])
+                i, last[row] = _fire_until(times, parents, i, goal, state, dead, needed, extends, asleep, last[row])
             reached[row] = i
             depth -= 1
             if i < goal:

@@ -371,12 +371,12 @@ def resolve(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...]
     if isinstance(value, MapFile):
         values = _read_map(declared, value.path, shapes)
         return values.ravel() if declared.per_pixel else values
-    if declared.per_pixel and np.ndim(value):
+    if declared.per and np.ndim(value):
         values = np.asarray(value, np.float64)
         if not _fits(values.shape, shapes):
-            wanted = f"it needs one number for each pixel: {_words(shapes)}"
+            wanted = f"it needs one number for each {declared.per}: {_words(shapes)}"
             raise InputError(f"{declared.name} is an array of shape {values.shape}; {wanted}")
-        return values.ravel()
+        return values.ravel() if declared.per_pixel else value
     return value
 
 

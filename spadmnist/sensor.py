@@ -35,6 +35,8 @@ _EVENTS_OF_A_PART = 4e6  # expected events of an image from which on it is simul
 _GENERATIONS = 10_000
 _CHILDREN = 200  # times the events that they come from: more is a cascade without end
 _NONE = np.zeros(0)
+_NO_EVENT = np.zeros(0, bool)
+RULES = "paper", "device"  # what an event may cause: as in the paper, or as in a real pixel
 _NOBODY = np.zeros(0, np.int64)
 _HOPS = 2  # from pixel to pixel, in a cascade: what comes into a window by more of them is left out
 
@@ -65,8 +67,26 @@ class Sensor:
     window: Window | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.layout, Layout):
+            raise InputError(
+                f"layout is {self.layout!r:.80}; it is a spadmnist.Layout(rows, columns, area, fill factor)"
+            )
+        if self.rules not in RULES:
+            known = " or ".join(map(repr, RULES))
+            raise InputError(f"rules is {self.rules!r}; it is {known}.{did_you_mean(str(self.rules), RULES)}")
+        whole = isinstance(self.chip_seed, int | np.integer) and not isinstance(self.chip_seed, bool)
+        if not whole or self.chip_seed < 0:
+            raise InputError(f"chip_seed is {self.chip_seed!r}; it is a whole number from 0 on")
+        if not isinstance(self.effects, list | tuple):
+            raise InputError(
+                f"effects is {self.effects!r:.80}; it is a list of effects, [effects.DarkCounts(rate=100)]"
+            )
+        names: set[str] = set()
         for effect in self.effects:
             _check_effect(effect)
+            if effect.name in names:
+                raise InputError(f"the sensor lists {effect.name} twice; an effect is listed once")
+            names.add(effect.name)
 
     def __getstate__(self) -> dict[str, Any]:
         """Its fields, without what was computed of them: a worker gets no maps that it does not ask for."""
@@ -581,12 +601,14 @@ class Sensor:
         candidates, parents = self._family(events, conditions, streams, causes)
         tr, frames, tally = None, None, None
         counter = "counts" in readouts and conditions.counting == "counter"
+        if "tr" in readouts or counter:
+            needed = self._needed(candidates, streams)
         if counter:
             asleep = self._asleep(candidates.times, conditions)
-            counted = self._fired(candidates, parents, conditions, streams, frames=False, asleep=asleep)
+            counted = self._fired(candidates, parents, needed, asleep)
             tally = self._counted(seen(counted), conditions, window)
         if "tr" in readouts:
-            detected = self._fired(candidates, parents, conditions, streams, frames=False)
+            detected = self._fired(candidates, parents, needed)
             detected.end = conditions.exposure
             for stage in ("timing", "readout"):
                 for effect in self.at(stage):
@@ -594,7 +616,7 @@ class Sensor:
                         detected = self._apply(effect, detected, streams)
             tr = self._narrow(seen(detected), conditions.exposure, "TR stamps")
         if {"str", "qis"} & set(readouts) or ("counts" in readouts and not counter):
-            detected = self._fired(candidates, parents, conditions, streams, frames=True)
+            detected = self._fired_in_frames(candidates, parents, conditions)
             frames = self._frames(seen(detected), conditions, streams, "str" in readouts, window)
             if "counts" in readouts and not counter:
                 tally = self._summed(frames.bits, conditions, window)
@@ -839,42 +861,30 @@ class Sensor:
     def _asleep(self, times: np.ndarray, conditions: Conditions) -> np.ndarray:
         """(events,) bool: do they fall between the frames of a counter, where nothing fires; empty where none does."""
         if self.rules == "paper" or conditions.frame_period <= conditions.frame_time:
-            return _NONE
+            return _NO_EVENT
         return times - np.floor(times / conditions.frame_period) * conditions.frame_period >= conditions.frame_time
 
-    def _fired(
-        self,
-        events: Events,
-        parents: np.ndarray,
-        conditions: Conditions,
-        streams: Streams,
-        frames: bool,
-        asleep: np.ndarray = _NONE,
-    ) -> Events:
+    def _fired(self, events: Events, parents: np.ndarray, needed: np.ndarray, asleep: np.ndarray = _NO_EVENT) -> Events:
         """Those of the candidates that happen: the parent did, and the pixel was neither blind nor asleep.
 
-        asleep: (events,) bool; empty where none is.
+        needed: see `_needed`; asleep: (events,) bool, empty where none is.
         """
-        if len(asleep) and not len(parents):
-            events, asleep = events.keep(~asleep), _NONE
-        carried = self._carried
-        if self.rules == "paper" and frames and carried == 0:
-            return events
-        if not (frames or self.soft or self._extends or len(parents)):
+        if not (self.soft or self._extends or len(parents) or len(asleep)):
             if not self.dead_times.any():
                 return events
             if events.cause is None:
                 kept = kernels.non_paralyzable(events.times, events.offsets, self.dead_times)
                 return Events(events.times[kept], kernels.take(events.offsets, kept), events.pixels)
-        needed = _NONE if frames else self._needed(events, streams)
-        if len(asleep):
-            needed = np.where(asleep, np.inf, needed if len(needed) else 0.0)
-        period = conditions.frame_period if frames else 0.0
-        times, offsets = events.times, events.offsets
-        fired = kernels.avalanches(
-            times, offsets, parents, self.dead_times, needed, self._extends, period, conditions.frame_time, carried
-        )
-        return events.keep(fired)
+        own = events.times, events.offsets, parents, self.dead_times, needed, self._extends
+        return events.keep(kernels.avalanches(*own, 0.0, 0.0, 0.0, asleep))
+
+    def _fired_in_frames(self, events: Events, parents: np.ndarray, conditions: Conditions) -> Events:
+        """Those of the candidates that happen in binary frames, each of which begins anew."""
+        if self.rules == "paper" and self._carried == 0:
+            return events
+        own = events.times, events.offsets, parents, self.dead_times, _NONE, self._extends
+        clock = conditions.frame_period, conditions.frame_time, self._carried
+        return events.keep(kernels.avalanches(*own, *clock, _NO_EVENT))
 
     @cached_property
     def soft(self) -> list[Effect]:

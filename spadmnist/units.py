@@ -58,6 +58,7 @@ _LONGEST = 60  # characters of a quantity
 
 # SI units: what a time or a level that a file declares may be; beyond it the number is damaged
 SHORTEST, LONGEST = 1e-18, 1e18
+WAVELENGTHS = 10e-9, 100e-6  # m, of light: what is beyond is another unit, mistaken
 
 
 class Quantity(float):

@@ -28,28 +28,35 @@ def written(unit: str, signed: bool = True) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Amount:
-    """For `Annotated`: a quantity whose SI unit is `unit`, more than 0 or, with `zero`, at least 0; at most `most`."""
+    """For `Annotated`: a quantity whose SI unit is `unit`, more than 0 or, with `zero`, at least 0; at most `most`.
+
+    within: the range of a quantity of which others are one in another unit, mistaken.
+    """
 
     unit: str
     zero: bool = False
     most: float = math.inf
+    within: tuple[float, float] | None = None
 
-    def _read(self, raw: object) -> units.Quantity:
+    def read(self, raw: object) -> units.Quantity:
         value = units.parse(raw, self.unit)
         if value < 0 or (value == 0 and not self.zero) or value > self.most:
             upper = "" if self.most == math.inf else f" and at most {self.most:g} ({100 * self.most:g} %)"
             raise ValueError(f"{value} is not possible; it must be {'at least' if self.zero else 'more than'} 0{upper}")
+        if self.within is not None and not self.within[0] <= value <= self.within[1]:
+            low, high = (units.show(end, self.unit) for end in self.within)
+            raise ValueError(f"{value} is no light; its wavelength is {low} to {high}, 500 nm for example")
         return value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return core_schema.no_info_plain_validator_function(self._read)
+        return core_schema.no_info_plain_validator_function(self.read)
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         return written(self.unit, signed=False)
 
 
 Time = Annotated[units.Quantity, Amount("s")]
-Length = Annotated[units.Quantity, Amount("m")]
+Wavelength = Annotated[units.Quantity, Amount("m", within=units.WAVELENGTHS)]
 Area = Annotated[units.Quantity, Amount("m^2")]
 Lux = Annotated[units.Quantity, Amount("lux")]
 Irradiance = Annotated[units.Quantity, Amount("W/m^2")]

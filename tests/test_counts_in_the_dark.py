@@ -186,3 +186,18 @@ def test_what_all_pixels_have_in_common_is_seen_in_the_total(rate: float, verdic
 def test_no_detection_where_none_is_expected_is_no_error_of_the_rate(tmp_path: Path) -> None:
     found = fit(*lab(tmp_path, TR.replace("20 ms", "1 ns"), dark_counts__rate=1e-3))
     assert found.verdict == "adequate" and found.ladder[0]["errors"]["mean_rate"] == 0
+
+
+@pytest.mark.parametrize(("captures", "probability"), [(TR, 0.05), (QIS, 0.01)])
+def test_afterpulses_that_the_closed_form_miscounts_are_no_other_rate(
+    captures: str, probability: float, tmp_path: Path
+) -> None:
+    """The sensor that made the data; without the allowance 3.4 and 5.9 sigma."""
+    (tmp_path / "sensor.yaml").write_text(
+        SENSOR.replace("DEAD", "200") + f"    afterpulsing: {{probability: {probability}, lifetime: 30 ns}}\n"
+    )
+    (tmp_path / "plan.yaml").write_text(PLAN + captures)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
+    plan = measurement.open(tmp_path / "plan.yaml", planned=True)
+    found = fit(sensor, measurement.open(twin.simulate(sensor, plan, tmp_path / "lab", 3)))
+    assert found.verdict == "adequate"

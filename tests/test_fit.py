@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import spadmnist as sp
 from spadmnist import config
 from spadmnist import measurement as measurements
 from spadmnist.cli import cli
@@ -456,3 +457,36 @@ def test_what_cannot_be_fitted_is_told_with_what_can(made):
         named_candidate(*known, "add", "dead_time", None)
     with pytest.raises(InputError, match=r"--free crosstalk\.probability: .* --add crosstalk adds it"):
         named_candidate(*known, "set", "crosstalk", "probability")
+
+
+@pytest.mark.parametrize(
+    ("name", "hidden", "stated", "exposure"),
+    [
+        ("dark_counts.rate", 0.2, 5.0, 500.0),
+        ("dark_counts.rate", 1e6, 1e3, 2e-3),
+        ("dark_counts.rate", 0.0, 1e3, 1e-4),  # no detection: the data do not say how far below 1 Hz it is
+        ("dead_time.duration", 5e-6, 0.5e-6, 1.0),
+    ],
+)
+def test_the_range_of_a_search_does_not_bound_a_named_fit(
+    name: str, hidden: float, stated: float, exposure: float
+) -> None:
+    """A rate is looked for from 1 Hz to 100 kHz, a dead time up to 1 us. Five standard errors, false alarms 6e-7."""
+
+    def sensor(value: float) -> sp.Sensor:
+        listed = {"dark_counts.rate": 1e4, "dead_time.duration": 50e-9, name: value}
+        effects = [
+            sp.effects.Detection(pdp=0.3),
+            sp.effects.DarkCounts(rate=listed["dark_counts.rate"]),
+            sp.effects.DeadTime(duration=listed["dead_time.duration"]),
+            sp.effects.Tdc(resolution=1e-10),
+        ]
+        return sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), effects, rules="device")
+
+    data = sp.simulate(sensor(hidden), [sp.Capture("dark", "tr", dark=True, exposure=exposure)], seed=1)
+    ((found,),) = (step.values.values() for step in sp.fit(sensor(stated), data, free=[name], jobs=1).steps)
+    assert found.low is not None and found.high is not None
+    if hidden:
+        assert abs(found.value - hidden) < 5 / 3.92 * (found.high - found.low) and found.low < found.value < found.high
+    else:
+        assert 0.9 < found.value <= 1.0 and found.high > 1e3

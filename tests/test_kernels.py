@@ -440,10 +440,13 @@ def test_avalanches_against_a_plain_loop(data: tuple[np.ndarray, np.ndarray], dr
     carried = draw.draw(st.sampled_from([0.0, 0.5, 1.0]))
     needed = np.array([draw.draw(st.sampled_from([0.0, 0.05, 0.3])) for _ in range(n)])
     fired = np.zeros(n, bool)
+    asleep = np.array(
+        [draw.draw(st.booleans()) for _ in range(n)] if not period and draw.draw(st.booleans()) else [], bool
+    )
     since = dict.fromkeys(range(rows), -math.inf)  # TR: when the blindness began; frames: the last frame that fired
     awake = dict.fromkeys(range(rows), -math.inf)
     for i in order:
-        if parents[i] >= 0 and not fired[parents[i]]:
+        if (len(asleep) and asleep[i]) or (parents[i] >= 0 and not fired[parents[i]]):
             continue
         time, row = float(times[i]), int(row_of[i])
         if period:
@@ -458,10 +461,11 @@ def test_avalanches_against_a_plain_loop(data: tuple[np.ndarray, np.ndarray], dr
         elif time - since[row] - dead[row] >= needed[i]:
             fired[i] = True
             since[row] = time
-    got = kernels.avalanches(times, offsets, parents, dead, needed, extends, period, live, carried)
+    got = kernels.avalanches(times, offsets, parents, dead, needed, extends, period, live, carried, asleep)
     assert got.tolist() == fired.tolist()
     if not np.any(parents >= 0) and not needed.any():
-        none = kernels.avalanches(times, offsets, parents[:0], dead, needed[:0], extends, period, live, carried)
+        rest = extends, period, live, carried, asleep
+        none = kernels.avalanches(times, offsets, parents[:0], dead, needed[:0], *rest)
         assert none.tolist() == fired.tolist()
 
 
@@ -475,7 +479,9 @@ def test_a_chain_of_causes_may_run_through_all_rows() -> None:
         for row in range(rows):
             if 0 <= row + step < rows:
                 parents[2 * row + 1] = 2 * (row + step) + 1
-        fired = kernels.avalanches(times, offsets, parents, np.zeros(rows), np.zeros(0), False, 0.0, 1.0, 0.0)
+        fired = kernels.avalanches(
+            times, offsets, parents, np.zeros(rows), np.zeros(0), False, 0.0, 1.0, 0.0, np.zeros(0, bool)
+        )
         assert fired.all()
         parents[1 if step == -1 else 2 * rows - 1] = -1
 

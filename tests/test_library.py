@@ -451,3 +451,53 @@ def test_an_answer_whose_sensor_cannot_be_written_stays(tmp_path: Path, monkeypa
     monkeypatch.undo()
     found.save(tmp_path / "next")
     assert found.unwritten == "" and (tmp_path / "next" / "sensor.yaml").exists()
+
+
+GRID = sp.Layout(4, 8, 25e-12, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: sp.Layout(0, 8, 25e-12, 0.5), "rows is 0; it is a whole number of pixels"),
+        (lambda: sp.Layout(4, 8.0, 25e-12, 0.5), "columns is 8.0"),  # type: ignore[arg-type]
+        (lambda: sp.Layout(4, 8, -1.0, 0.5), "pixel_area is -1.0; it is in m"),
+        (lambda: sp.Layout(4, 8, "25 um^2", 0.5), "pixel_area is '25 um"),  # type: ignore[arg-type]
+        (lambda: sp.Layout(4, 8, 25e-12, 45.0), "fill_factor is 45.0; it is a share"),
+        (lambda: sp.Layout(1, 8, 25e-12, 0.5, np.zeros((5, 2))), r"positions have shape \(5, 2\)"),
+        (lambda: sp.Sensor(GRID, [], rules="Device"), "rules is 'Device'; .* Did you mean device"),
+        (lambda: sp.Sensor(GRID, [], chip_seed=-1), "chip_seed is -1"),
+        (lambda: sp.Sensor(GRID, [], chip_seed=1.5), "chip_seed is 1.5"),  # type: ignore[arg-type]
+        (lambda: sp.Sensor((4, 8), []), r"layout is \(4, 8\); it is a spadmnist.Layout"),  # type: ignore[arg-type]
+        (lambda: sp.Sensor(GRID, sp.effects.DarkCounts()), "effects is .*; it is a list of effects"),  # type: ignore[arg-type]
+        (lambda: sp.Sensor(GRID, [sp.effects.DarkCounts()] * 2), "lists dark_counts twice"),
+        (
+            lambda: sp.Sensor(GRID, [sp.effects.RowPattern(gain=np.ones(8))]).resolved(),
+            r"gain is an array of shape \(8,\); it needs one number for each row: \(4,\)",
+        ),
+        (
+            lambda: sp.Sensor(GRID, [sp.effects.TdcNonlinearity(widths=np.ones((5, 3)))]).resolved(),
+            r"widths is an array of shape \(5, 3\); it needs one number for each code",
+        ),
+        (lambda: sp.Capture("a", "tr", exposure=1.0, wavelength=500.0, lux=1.0), "wavelength is 500.0 m"),
+        (
+            lambda: sp.fit(sp.Sensor(GRID, []), "lab", free={"dark_counts.rate": 5.0}),
+            "free is a dictionary; it is a list of names",
+        ),
+    ],
+)
+def test_what_no_sensor_can_be_is_said_before_anything_is_simulated(make: Any, said: str) -> None:
+    with pytest.raises(SpadError, match=said):
+        make()
+
+
+def test_times_in_single_precision_are_taken_where_they_are_known_well_enough() -> None:
+    """At 1 s a float has steps of 60 ns: a dead time would vanish."""
+    times, pixels = np.array([0.9, 0.95, 0.99], np.float32), np.zeros(3, int)
+    for tick in (None, 1e-9):
+        capture = sp.Capture("a", "tr", dark=True, exposure=1.0, tick=tick)
+        with pytest.raises(SpadError, match=r"times are float32, which says no less than 60 ns apart; give float64"):
+            sp.Measurement.from_arrays(GRID, {capture: (times, pixels)})
+    short = sp.Capture("a", "tr", dark=True, exposure=1e-6)
+    made = sp.Measurement.from_arrays(GRID, {short: (times * np.float32(1e-6), pixels)})
+    assert len(made["a"].events) == 3

@@ -22,7 +22,7 @@ from measured import (
     tree,
 )
 
-from spadmnist import measurement
+from spadmnist import measurement, twin
 from spadmnist.effects import Conditions
 from spadmnist.effects.dark_counts import DarkCounts
 from spadmnist.effects.detection import Detection
@@ -346,3 +346,20 @@ def test_a_file_that_took_another_ones_place_is_refused(tmp_path: Path) -> None:
     assert measurement.open(root).recording("one").totals.sum() > 0
     first.write_bytes(before)
     assert measurement.open(root).recording("one").totals.sum() > 0
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_plan_that_is_simulated_into_its_own_folder_stays_a_plan(named: bool, tmp_path: Path) -> None:
+    """The simulation is refused; its files would have stood for the data of the laboratory."""
+    file = "file: dark.h5, " if named else ""
+    plan = (
+        "format: spadmnist-measurement/1\nname: lab\nlayout: {rows: 2, columns: 2}\ncaptures:\n"
+        f"  - {{id: dark, {file}modality: qis, light: {{kind: dark}}, frames: 10, frame_time: 10 us}}\n"
+    )
+    (tmp_path / "measurement.yaml").write_text(plan)
+    sensor = Sensor(Layout(2, 2, 25e-12, 1.0), [DarkCounts(rate=1e4)])
+    opened = measurement.open(tmp_path, planned=True)
+    with pytest.raises(SpadError, match=r"measurement\.yaml: belongs to another .*; choose another folder with -o$"):
+        twin.simulate(sensor, opened, tmp_path, 1)
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == ["measurement.yaml"]
+    assert (tmp_path / "measurement.yaml").read_text() == plan

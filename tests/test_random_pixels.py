@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,12 @@ def test_a_map_beside_what_blinks_leaves_the_pixels_of_another_chip_alone() -> N
     assert summary(map_)["sigma"] == pytest.approx(0.3, rel=0.2)
     seen = hit_pixels.pixels_hit(replicates, {"dark": 1.0}, final, NAME)
     assert seen is not None and not (seen.hit & drawn & ~hit).any() and (seen.hit & hit).sum() >= hit.sum() - 1
+    # where the pixels differ so much that the hottest resemble those that are hit, none is taken as hit
+    hot = np.exp(1.0 * np.random.default_rng(5).standard_normal(256)) * 100
+    counts = np.random.default_rng(6).poisson(10 * hot).astype(float)
+    replicates.seen["dark"] = replace(replicates.seen["dark"], counts=counts)
+    assert hit_pixels.pixels_hit(replicates, {"dark": 1.0}, values, NAME) is not None
+    assert hit_pixels.pixels_hit(replicates, {"dark": 1.0}, values, NAME, differ=True) is None
     own = hit_pixels.of_pixels(with_values(replicates.start, values), NAME, hit)  # which were hit is known
     assert hit_pixels.drawn_effects(replicates, {**values, **own}) == []
 

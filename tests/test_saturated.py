@@ -24,6 +24,7 @@ from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
 from spadmnist.statistics import Statistic, Summary
+from spadmnist.streams import Streams
 from spadmnist.workers import Serial
 
 PHOTON = 6.62607015e-34 * 299792458.0 / 500e-9  # J
@@ -135,12 +136,18 @@ def test_first_stamps_of_every_frame_give_a_free_light_level(number: float) -> N
         assert comparison.compare(late, data, 0, None, 1, 48).verdict == "fails"
 
 
-@pytest.mark.parametrize(("id", "full"), [("every bit is 1", True), ("counters of 15 with 12", False)])
+@pytest.mark.parametrize(
+    ("id", "full"), [("every bit is 1", True), ("counters of 15 with 12", False), ("no frame", False)]
+)
 def test_a_full_capture_is_said_to_test_hardly_anything(id: str, full: bool) -> None:
     """An adequate model of full frames says nothing of the sensor."""
     model, captures = RIGHT[id]
     found = comparison.compare(model, sp.simulate(model, captures, seed=1), 0, None, 1, 16)
     assert found.verdict == "adequate" and found.full == (("f",) if full else ())
+    small = ReducedCapture(
+        sp.Capture("s", "qis", dark=True, frames=7, frame_time=FRAME), 3.0, np.array([1.0, 1, 1, 0]), {}
+    )
+    assert not small.is_full(sensor(side=2))
     assert after_comparison(found).startswith("take f with less light" if full else "spadmnist diagnose")
 
 
@@ -155,6 +162,8 @@ def test_early_stamps_are_counted_where_nearly_every_frame_has_one() -> None:
     seen = ReducedCapture.of(full, reduced=False)
     assert seen.counted.conditions.live == pytest.approx(early * 1e-10)
     assert seen.total == share * 16000 and seen.detections == full.totals.sum()
+    fine = early_ticks(full.on_ticks(FRAME / 1e9))  # a billion ticks in a frame take no gigabytes
+    assert fine is not None and fine * FRAME / 1e9 == pytest.approx(early * 1e-10, rel=1e-3)
     assert early_ticks(full.on_ticks(FRAME / 2)) is None  # 0.99 of them within the first tick
 
 
@@ -217,6 +226,19 @@ def test_the_closed_form_counts_nothing_in_the_gaps_between_frames(modality: str
     assert expected == pytest.approx(dense, rel=1e-9)
 
 
+def test_stamps_beside_a_counter_are_those_that_are_recorded_alone() -> None:
+    soft = sensor(sp.effects.SlowRecovery(time_constant=50e-9))
+    clock = Conditions(400 * FRAME, 100, FRAME, 4 * FRAME, 500e-9, 8, "counter")
+    images = np.arange(3, dtype=np.uint64)
+    light = np.full((3, 16), 2e7)
+    alone, both = (
+        soft.resolved().expose(light, clock, Streams(1, "a", "train", images), readouts)
+        for readouts in (("tr",), ("tr", "counts"))
+    )
+    assert np.array_equal(alone.tr.stamps[0], both.tr.stamps[0])
+    assert np.array_equal(alone.tr.offsets, both.tr.offsets)
+
+
 def test_nothing_fires_between_the_frames_of_a_counter() -> None:
     """Half the frame's traps release in the gap, and what would fall into the gap fills none (physics, `device`)."""
     traps = sp.effects.SlowAfterpulsing(probability=0.05, lifetime=2 * FRAME)
@@ -234,6 +256,19 @@ def test_nothing_fires_between_the_frames_of_a_counter() -> None:
     inside = 1 - 2 * (1 - math.exp(-0.5))  # of the releases, those in the frame of their parent
     laws.poisson_mean(totals[1], light / (1 - 0.05 * inside))
     assert totals[0] > totals[1] * 1.03
+    # few events: the first one of a pixel sleeps like the others. And what sleeps blinds no paralyzable pixel
+    few = {"frames": 10, "frame_time": 1e-4, "bits": 8, "counting": "counter", "dark": True}
+    rare = sp.Sensor(
+        Layout(64, 64, PIXEL, 1.0),
+        [sp.effects.DarkCounts(rate=20.0), sp.effects.SlowAfterpulsing(probability=0.3, lifetime=1e-4)],
+        rules="device",
+    )
+    counted = [
+        sp.simulate(rare, [sp.Capture("f", "counts", frame_period=1e-3, **few)], seed=seed).recording("f").totals.sum()
+        for seed in range(40)
+    ]
+    inside = math.exp(-1)  # of the releases, those in the frame of their parent; with the next frame 1e-4 more
+    laws.poisson_mean(int(np.sum(counted)), 40 * 4096 * 20.0 * 1e-3 * (1 + 0.3 * inside + 0.3**2 * 0.09))
     frames = Conditions(80_000 * 100 * FRAME, 80_000, FRAME, 100 * FRAME, None, 8, "counter")
     assert frames.within_frames.live_time == pytest.approx(0.8) and frames.within_frames.within_frames.live == FRAME
 
@@ -436,6 +471,14 @@ MEANS: dict[str, tuple[sp.effects.Effect, Capture]] = {
     "blinking": (
         sp.effects.BlinkingDarkCounts(fraction=1.0, amplitude=1e5, rate_on=1e3, rate_off=1e3),
         lit("f", "qis", 5e4, frames=50_000, frame_time=FRAME),
+    ),
+    "a slow swing": (
+        sp.effects.Flicker(amplitude=0.5, frequency=100.0, phase=1.0),
+        lit("f", "qis", 1.5e5, frames=20_000, frame_time=FRAME),
+    ),
+    "a drift and noise": (
+        sp.effects.SourceDrift(slope=0.8),
+        lit("f", "qis", 1.5e5, frames=20_000, frame_time=FRAME),
     ),
     "cascades": (sp.effects.Afterpulsing(probability=0.05, lifetime=25e-9), lit("f", "tr", 1e5, exposure=1.0)),
     "a counter beside a bus": (BUS, lit("f", "counts", 1e5, frames=2000, frame_time=FRAME, bits=8, counting="counter")),

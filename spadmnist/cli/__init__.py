@@ -84,7 +84,10 @@ def _failed(error: Exception) -> int:
         # the reader has gone; there is nobody left to tell
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    if isinstance(error, click.ClickException):
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        for line in error.format_message().split("\n"):
+            terminal.say(line)
+    elif isinstance(error, click.ClickException):
         shown, words = io.StringIO(), error.format_message()
         error.show(shown)
         for line in shown.getvalue().replace(words, visible(words)).rstrip("\n").split("\n"):

@@ -96,6 +96,8 @@ def generate(
     from ..workers import executor
 
     one = None if part is None else factory.Part.parse(part)
+    if dry_run and one is not None:
+        raise SpadError("--dry-run: estimates the whole dataset; leave out --part, and divide by the number of parts")
     options.load_plugins(plugin_files)
     experiment = configs.read(config, seed, format_, levels, limit, causes)
     for note in experiment.notes:

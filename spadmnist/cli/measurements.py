@@ -303,10 +303,15 @@ def _check_captures(source: Path, format_: str, choice: Any) -> None:
     """Refuse what only images of a dataset have."""
     from ..errors import SpadError
     from ..exporters import Target
+    from ..measurement import is_measurement
 
     if format_ not in Target.every:
         others = ", ".join(Target.every)
         raise SpadError(f"--format {format_}: holds images of a dataset, and {source} is none; take one of {others}")
+    if choice.readouts and is_measurement(source):
+        raise SpadError(
+            f"--readout: chooses one of a dataset, and {source} is a measurement; choose captures with --capture"
+        )
     if choice.named or len(choice.readouts) > 1:
         raise SpadError(
             f"--lux, --split, --limit, --method and several --readout: choose images of a dataset, and as {format_} "

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, PlainValidator, WithJsonSchema, model_va
 from .. import units
 from ..images import ImageSource
 from ..section import LATER, Section
-from ..validated import Area, Irradiance, Lux, Share, Time, brief, written
+from ..validated import Amount, Area, Irradiance, Lux, Share, Time, brief, written
 
 _CHANNELS = ("red", "green", "blue")  # of colour images, in their order
 
@@ -29,11 +29,7 @@ def _of_light(raw: object) -> units.Quantity | list[units.Quantity]:
     return [_one_length(one) for one in raw]
 
 
-def _one_length(raw: object) -> units.Quantity:
-    value = units.parse(raw, "m")
-    if not value > 0:
-        raise ValueError(f"{value} is not possible; it must be more than 0")
-    return value
+_one_length = Amount("m", within=units.WAVELENGTHS).read
 
 
 _LENGTH = written("m", signed=False)

@@ -71,6 +71,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 # frames comes out within 2e-3; the light of a capture is rarely known to 1e-2
 _TIMES = 1 << 14
 _GOLDEN = (math.sqrt(5) - 1) / 2  # of the exposure, the distance of two such times: they are even, and fit no period
+_OTHER = math.sqrt(2) - 1  # of a frame, the same within it, independent of the first
 _NO_CHANGE = 1e-3  # relative: a default mean nearer to 1 is taken as 1, for the mean of smooth factors has this error
 
 
@@ -127,8 +128,8 @@ class Conditions:
         share = np.modf((np.arange(number) + 0.5) * _GOLDEN)[0]
         if self.live is None:
             return self.exposure * share
-        within, frame = np.modf(share * self.frames)
-        return frame * self.frame_period + within * self.live
+        within = np.modf((np.arange(number) + 0.5) * _OTHER)[0]
+        return np.floor(share * self.frames) * self.frame_period + within * self.live
 
     @property
     def dark(self) -> bool:

@@ -27,7 +27,7 @@ from ..errors import InputError
 from ..foreign import quoted
 from ..import_options import Said, ask
 from ..recording import MODALITIES
-from ..units import LONGEST, SHORTEST
+from ..units import LONGEST, SHORTEST, WAVELENGTHS
 from .lights import light
 
 if TYPE_CHECKING:
@@ -63,10 +63,13 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
         value = get(name)
         if value is None:
             continue
-        low, high = (0, 1) if name in _SHARES else (SHORTEST, LONGEST)
+        low, high = (0, 1) if name in _SHARES else WAVELENGTHS if name == "wavelength" else (SHORTEST, LONGEST)
         fine = not isinstance(value, str) and low <= value <= high
         if not fine or (name in _WHOLE and value != int(value)):
-            raise InputError(f"{path}: says that its {name} is {_shown(value)}, which is not possible; correct it")
+            unit = "; it is in m, 500e-9 for 500 nm" if name == "wavelength" else ""
+            raise InputError(
+                f"{path}: says that its {name} is {_shown(value)}, which is not possible{unit}; correct it"
+            )
         found[name] = int(value) if name in _WHOLE else float(value)
     return found
 

@@ -15,7 +15,6 @@ from ..recording import Light
 _LIGHT = 'dark, free, "500 nm free", "500 nm 75.67 nW/cm^2", "500 nm 5 mlux" or image:FILE.npy before one of these'
 _IMAGE = "image:"
 PLAIN_COLOUR = 555e-9  # m, where only lux are given, or nothing
-_SHORTEST_WAVE, _LONGEST_WAVE = 10e-9, 100e-6  # m: what is beyond is another unit, mistaken
 
 
 def light(text: str, relative_uncertainty: float | None = None) -> Light:
@@ -49,10 +48,11 @@ def light(text: str, relative_uncertainty: float | None = None) -> Light:
                 break
         else:
             raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
-    if not _SHORTEST_WAVE <= found.get("m", PLAIN_COLOUR) <= _LONGEST_WAVE:
+    shortest, longest = units.WAVELENGTHS
+    if not shortest <= found.get("m", PLAIN_COLOUR) <= longest:
         raise SpadError(
-            f"--light: {text!r} has a wavelength that is none of light, which is {units.show(_SHORTEST_WAVE, 'm')} to "
-            f"{units.show(_LONGEST_WAVE, 'm')}; write {_LIGHT}"
+            f"--light: {text!r} has a wavelength that is none of light, which is {units.show(shortest, 'm')} to "
+            f"{units.show(longest, 'm')}; write {_LIGHT}"
         )
     levels = found.keys() - {"m"}
     unsaid = "W/m^2" in found and "m" not in found and shown is None

@@ -151,7 +151,8 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
         total, mean_total = float(counts.sum()), float(expected.sum())
         # a map of other counts has the errors of their total, and the closed forms theirs
         known = max(float(np.sum((errors * expected) ** 2)), mean_total) if np.any(errors) else 0.0
-        wider = (float(own.sum()) + known + (CLOSED * mean_total) ** 2) / max(mean_total, 1e-300)
+        unsure = CLOSED**2 + line.unsure(sensor) ** 2
+        wider = (float(own.sum()) + known + unsure * mean_total**2) / max(mean_total, 1e-300)
         score = float(poisson_scores(np.array([total]), np.array([mean_total]))[0])
         scores.append(score / math.sqrt(max(wider, 1.0)))
         totals.append(abs(math.log(max(total, 0.5) / mean_total)) if abs(score) > 1 else 0.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,6 @@ from .levels import FALL_95
 from .light_levels import closed_form, level_for
 from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
-from .reduction import counted_of, early_ticks, total_of
 
 # fall of twice the log-likelihood at the ends of a 95 % interval, of an edge sharper than the intervals are dense: its
 # law is exponential, not normal, and this is that quantile of chi square with two degrees of freedom
@@ -113,9 +112,8 @@ class Likelihood:
             light = capture.light
             stated = twin.photons_at(capture, sensor.layout)
             if stated is None:
-                early = early_ticks(data[i])
-                counted = counted_of(replace(capture, tick=data[i].tick), early)
-                stated = level_for(closed_form(sensor, counted), total_of(data[i], early), None)
+                total = float(data[i].totals.sum())
+                stated = level_for(closed_form(sensor, capture), total, None)
                 columns.append(np.eye(len(data))[i])
                 precision.append(1e-9)
             elif not light.dark:

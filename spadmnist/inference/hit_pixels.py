@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from .. import plugins
 from ..sensor import Sensor
@@ -41,12 +42,15 @@ class PixelsHit:
     values: dict[Key, Any]
 
 
-def pixels_hit(replicates: Replicates, levels: Mapping[str, float], values: Values, effect: str) -> PixelsHit | None:
+def pixels_hit(
+    replicates: Replicates, levels: Mapping[str, float], values: Values, effect: str, differ: bool = False
+) -> PixelsHit | None:
     """The pixels whose counts show an effect that hits pixels at random; None where the counts do not identify them.
 
     The median of the pixels gives the level of a capture: pixels that are hit at random hardly move it.
 
     Args:
+        differ: the pixels differ by themselves as well, by a lognormal law: a hit is beyond it.
         levels: light level by capture.
         values: of the model with the effect, SI.
     Raises:
@@ -73,8 +77,15 @@ def pixels_hit(replicates: Replicates, levels: Mapping[str, float], values: Valu
             scatter = 1.4826 * float(np.median(np.abs(counts - low)))
             wider = max(scatter**2 / float(np.median(line.variance(low, 0.0))), 1.0)
         more = counts - low > _ENOUGH * (high - low)
-        p = np.minimum(p, np.where(more, len(counted) * line.p_of_more(counts, low, wider), 1.0))
-        of_a_hit = np.minimum(of_a_hit, len(counted) * line.p_of_more(high, low, wider))
+        p_here, p_of_hit = line.p_of_more(counts, low, wider), line.p_of_more(high, low, wider)
+        if differ and median >= _LEVEL:
+            logs = np.log(np.maximum(counts, 0.5) / low)
+            width = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+            beyond, of_hit = logs - np.median(logs), np.log(high / low)
+            p_here = np.maximum(p_here, special.ndtr(-beyond / max(width, 1e-9)))
+            p_of_hit = np.maximum(p_of_hit, special.ndtr(-of_hit / max(width, 1e-9)))
+        p = np.minimum(p, np.where(more, len(counted) * p_here, 1.0))
+        of_a_hit = np.minimum(of_a_hit, len(counted) * p_of_hit)
     hit = p < _FALSE_HITS / pixels
     if float(np.median(of_a_hit)) > _FALSE_HITS / pixels or not 0 < float(np.mean(hit)) < _MOST:
         return None
@@ -130,6 +141,6 @@ def beside_maps(
     none = np.zeros(replicates.start.layout.pixels, bool)
     out = dict(values)
     for effect in drawn_effects(replicates, without):
-        hit = pixels_hit(replicates, levels, without, effect)
+        hit = pixels_hit(replicates, levels, without, effect, differ=True)
         out |= of_pixels(with_values(replicates.start, without), effect, none) if hit is None else hit.values
     return out

@@ -80,7 +80,7 @@ def fit_where_hit(path: ModelPath) -> bool:
 
     Replicates of other chips have the effect in other pixels. Their scatter hides what the pixels of this chip show. A
     coordinate that changes nothing here, the share of the pixels, keeps its value and its interval. A model with a map
-    of pixels is left as it is: the map has taken up the excess of these pixels. The fit is not taken where a check
+    of pixels is left as it is: the map is fitted beside the pixels that were hit. The fit is not taken where a check
     fails that passed before, or fails more clearly.
 
     Returns:

@@ -389,7 +389,7 @@ def model_of(path: ModelPath) -> tuple[Model, dict[Key, pixel_maps.PixelMap]]:
     levels = count_model.light_levels_of(replicates, path.evaluation)
     where = path.where(path.values)
     sensors, maps, values = map_models.models_with_maps(replicates, {**path.values, **where}, held, levels)
-    path.values = {key: path.values[key] if key in where else x for key, x in values.items()}
+    path.values = {key: path.values.get(key, x) if key in where else x for key, x in values.items()}
     return sensors.changed({}, scan.phases, chips), maps
 
 

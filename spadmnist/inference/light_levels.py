@@ -17,7 +17,7 @@ import numpy as np
 from scipy import optimize, special, stats
 
 from .. import twin
-from ..effects import Conditions
+from ..effects import Conditions, Effect
 from ..recording import Capture
 from ..sensor import Sensor
 from .laws import poisson_scores
@@ -48,6 +48,7 @@ _COARSE, _FLAT = 37, 1e-6  # levels among which the largest total is looked for;
 # events of each of so many recordings of frames, by which the closed form of their mean is corrected: together they
 # have the noise of 1e6 counts, 0.1 %, in some tenths of a second
 _SHORT, _RECORDINGS = 1.25e5, 8
+_MOMENTS, _PIXELS = 1024, 1024  # moments and pixels over which a curve of the rate is averaged, at most
 _FAINT = 1e-6  # of the stated light: as good as none, for the total in the dark
 
 
@@ -222,7 +223,8 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
 
     It is by the closed forms of the effects. Its scatter is that of the counts, of the last digit of the mean, and of
-    the closed forms. What rates that fluctuate do to the mean of frames no closed form says: a short recording does.
+    the closed forms. What rates that
+    fluctuate do to the mean of frames is no part of them.
 
     Args:
         total: detections of the whole array.
@@ -241,7 +243,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     caused = sum(sensor.caused().values())
     caused = caused**2 if capture.counts_events else caused
     apart, unsure = (
-        (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_short(sensor, capture, level)
+        (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_fluctuations(sensor, capture, level)
     )
     scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2 + unsure**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
@@ -250,19 +252,46 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     return CaptureNull(level, stated, totals, expected, (apart, 1.0), scatter), np.ones(replicates)
 
 
-def _of_short(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
-    """(log of the total of simulated frames over that of the closed form, its standard error), of a short capture."""
-    c = capture.conditions
+def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
+    """(log of the share of frames with a detection over that of a steady rate, its standard error).
+
+    Of a rate that follows a curve it is the mean over the exposure; of one that is drawn, that of short recordings.
+    """
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    events = float(sensor.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
-    whole = c.largest_count if capture.modality == "counts" else 1  # binary frames of a count frame
-    frames = max(math.ceil(c.frames * min(_SHORT / max(events, 1.0), 1.0) / whole), 1) * whole
-    short = replace(capture, mean=None, conditions=replace(c, frames=frames, exposure=frames * c.frame_period))
+    curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
+    drawn = [effect for effect in sensor.at("arrival") if not hasattr(effect, "factor")]
+    apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
+    if not drawn:
+        return apart, 0.0
+    steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
+    steady = InTheDark.of(steady) if capture.light.dark else steady
+    events = float(steady.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
+    frames = max(math.ceil(c.frames * min(_SHORT / max(events, 1.0), 1.0)), 1)
+    clock = replace(c, frames=frames, exposure=frames * c.frame_period, bits=0)
+    short = replace(capture, modality="qis", mean=None, conditions=clock)  # a sum of frames has as many
     numbers = np.arange(_RECORDINGS, dtype=np.uint64)
-    made = simulated(sensor, short, np.full(_RECORDINGS, level), numbers, 0)
+    made = simulated(steady, short, np.full(_RECORDINGS, level), numbers, 0)
     logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])
-    apart = float(logs.mean()) - math.log(closed_form(sensor, short)(level))
+    apart += float(logs.mean()) - math.log(closed_form(steady, short)(level))
     return apart, float(np.std(logs, ddof=1)) / math.sqrt(_RECORDINGS)
+
+
+def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level: float) -> float:
+    """The log of the share of frames with a detection over that of the mean rate, where the rate follows curves."""
+    if not curves:
+        return 0.0
+    light: np.ndarray = np.full((1, sensor.layout.pixels), level)
+    some = slice(None, None, -(-sensor.layout.pixels // _PIXELS))
+    rate, lit = (part[0, some] for part in sensor.rates(light, capture.conditions))
+    events = events_in_frames(sensor, light, capture.conditions)[0, some]
+    times = capture.conditions.within_frames.moments(_MOMENTS)
+    swing = np.zeros((_MOMENTS, 1))
+    for effect in curves:
+        factor: np.ndarray = np.ravel(effect.factor(times, capture.conditions))[:, None]  # type: ignore[attr-defined]
+        share = lit / np.maximum(rate, 1e-300) if effect.acts_on == "light" else 1.0
+        swing = swing + share * (factor / factor.mean() - 1)
+    there = -np.expm1(-events * np.maximum(1 + swing, 0.0))
+    return math.log(float(there.mean(axis=0).sum()) / float(-np.expm1(-events).sum()))
 
 
 def last_digit(value: float) -> float:

@@ -27,7 +27,7 @@ from .findings import nuisances, remainder, traces
 from .gauss_newton import JacobianBy, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
 from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
-from .levels import HALF_95, LEAST_P
+from .levels import FALL_95, HALF_95, LEAST_P
 from .model_path import ModelPath, accept, begin, material
 from .replicates import FEW, REPLICATES, CannotSimulate, Execution, Replicates
 from .results import Diagnosis, Step, Value, title
@@ -35,6 +35,10 @@ from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of
 from .trial import Trial, of_other_shapes
 from .trial_fits import fit_trial
+
+# how often the search range of a value at its end is made wider, each time by so much; and the factor within which a
+# value is at the end. They reach beyond any range by 1e4; rules of thumb
+_WIDENINGS, _FURTHER, _AT_END = 4, 10.0, 1.01
 
 
 def fit_named(
@@ -90,7 +94,7 @@ def fit_named(
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))
         exact: MaximumLikelihood | None = None
         try:
-            exact = _maximum_likelihood(measurement, replicates, wanted)
+            wanted, exact = _maximum_likelihood(measurement, replicates, wanted)
         except NoLikelihood as error:  # it holds the recordings, whose memory the replicates need
             say(f"by simulation, for there is no likelihood of {error}")
         if exact is None:
@@ -128,13 +132,45 @@ def fit_named(
 
 
 def _maximum_likelihood(
-    measurement: Measurement, replicates: Replicates, wanted: Sequence[Candidate]
-) -> MaximumLikelihood:
-    """The maximum-likelihood fit of the wanted changes to all captures; raises NoLikelihood where there is none."""
+    measurement: Measurement, replicates: Replicates, wanted: list[Candidate]
+) -> tuple[list[Candidate], MaximumLikelihood]:
+    """(the wanted changes, their maximum-likelihood fit to all captures); raises NoLikelihood where there is none.
+
+    The search range of a parameter is where a diagnosis looks for it, and no bound: a value at its end has a wider one.
+    """
     if any(capture.mean is not None for capture in measurement.captures):
         raise NoLikelihood("a mean alone")
     totals = {id: seen.detections for id, seen in replicates.seen.items()}
-    return maximise(replicates.start, recordings(measurement, replicates.start, totals), wanted)
+    data = recordings(measurement, replicates.start, totals)
+    found = maximise(replicates.start, data, wanted)
+    for _ in range(_WIDENINGS):
+        wider = [_further(candidate, found) for candidate in wanted]
+        if wider == wanted:
+            break
+        again = maximise(replicates.start, data, wider)
+        at_end = [_further(candidate, again) for candidate in wider] != wider
+        if at_end and sum(again.likelihood_ratios) < sum(found.likelihood_ratios) + FALL_95:
+            break  # as good as before: the data do not say how far beyond it lies
+        wanted, found = wider, again
+    return wanted, found
+
+
+def _further(candidate: Candidate, found: MaximumLikelihood) -> Candidate:
+    """The candidate with wider search ranges of the parameters whose value lies at the end of theirs."""
+
+    def wider(coordinate: Coordinate) -> Coordinate:
+        if not coordinate.log or coordinate.lacks or coordinate.key not in found.values:
+            return coordinate
+        value, (least, most) = found.values[coordinate.key], coordinate.bounds
+        low, high = coordinate.low, coordinate.high
+        if value <= low * _AT_END:
+            low = max(low / _FURTHER, 0.0 if least is None else least)
+        if value >= high / _AT_END:
+            high = min(high * _FURTHER, math.inf if most is None else most)
+        return replace(coordinate, low=low if low > 0 else coordinate.low, high=high)
+
+    strengths, shapes = (tuple(map(wider, some)) for some in (candidate.strengths, candidate.shapes))
+    return replace(candidate, strengths=strengths, shapes=shapes)
 
 
 def _covariance(path: ModelPath, exact: MaximumLikelihood | None) -> tuple[list[str], np.ndarray]:

@@ -21,6 +21,7 @@ _EMPTY_END = 10.0
 # share that is early. For c events in a frame, the number of frames with a detection has the information
 # c^2 exp(-c) / (1 - exp(-c)) on log c: 0.47 a frame at 0.95 (c = 3) and falling, 0.64 at 0.75; at most 0.65, at 0.80
 _FULL, _EARLY = 0.95, 0.75
+_BINS = 1 << 16  # parts of a frame among which the early ones end: fine enough for any light, and half a megabyte
 _FREE = 30.0  # detections for which there is room left: fewer of them test hardly anything; a rule of thumb
 _TOO_COARSE = 0.9  # share of frames within one tick: of more the ticks are too long for that; a rule of thumb
 
@@ -76,7 +77,7 @@ class ReducedCapture:
         room = c.frames * float(sensor.layout.pixels)
         if self.capture.modality == "counts":
             room = c.count_frames * float(sensor.full_counts(c).sum())
-        return room - self.detections < _FREE
+        return room - self.detections < min(_FREE, room / 2)
 
     @classmethod
     def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
@@ -109,11 +110,12 @@ def early_ticks(recording: Recording) -> int | None:
     slots = recording.n_frames * recording.pixels
     if recording.modality != "str" or recording.totals.sum() <= _FULL * slots:
         return None
-    numbers = np.zeros(recording.none, np.int64)
+    each = max(recording.none // _BINS, 1)  # ticks
+    numbers = np.zeros(-(-recording.none // each), np.int64)
     for _, found in recording.stamped():
-        numbers += np.bincount(found.stamps, minlength=len(numbers))
-    ticks = int(np.searchsorted(np.cumsum(numbers), _EARLY * slots)) + 1
-    return ticks if numbers[:ticks].sum() < _TOO_COARSE * slots else None
+        numbers += np.bincount(found.stamps // each, minlength=len(numbers))
+    bins = int(np.searchsorted(np.cumsum(numbers), _EARLY * slots)) + 1
+    return bins * each if numbers[:bins].sum() < _TOO_COARSE * slots else None
 
 
 def total_of(recording: Recording, early: int | None) -> float:

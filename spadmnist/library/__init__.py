@@ -16,7 +16,7 @@ is imported by them: `simulate` needs no statistics.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -289,6 +289,8 @@ def _names(name: str, given: Iterable[str]) -> tuple[str, ...]:
     """The names in a list. Raises InputError where it is none, or holds anything else."""
     if isinstance(given, str):
         raise InputError(f"{name} is {given!r}; it is a list of names: {name}=[{given!r}]")
+    if isinstance(given, Mapping):
+        raise InputError(f"{name} is a dictionary; it is a list of names, and their values are fitted: {list(given)!r}")
     names = tuple(given) if isinstance(given, Iterable) else (given,)
     for one in names:
         if not isinstance(one, str):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .type import Measurement
 
 _LUX_WAVELENGTH = 555e-9  # m, of light in lux where no wavelength is stated
-_WAVELENGTHS = 100e-9, 20e-6  # m; others are a wavelength in another unit
+_FINE = 1e-12  # s: times in single precision that are known so well are taken where no tick is stated
 _WHOLE = 0.01  # ticks by which a time may miss a whole one: what is lost in a double, with room
 _MOST_BITS = 16  # of a count
 
@@ -90,7 +90,7 @@ def Capture(
     for name, value in shares.items():
         if not (_number(value) and 0 <= value < 1):
             raise _wrong(id, f"{name} is {value!r}; it is a share from 0 to less than 1, 0.05 for 5 %")
-    if wavelength is not None and not _WAVELENGTHS[0] <= wavelength <= _WAVELENGTHS[1]:
+    if wavelength is not None and not units.WAVELENGTHS[0] <= wavelength <= units.WAVELENGTHS[1]:
         raise _wrong(id, f"wavelength is {wavelength!r} m; give it in m, 500e-9 for 500 nm")
     light = _light(id, wavelength, irradiance, lux, dark, relative_uncertainty, own_uncertainty)
     if modality == "tr":
@@ -346,6 +346,12 @@ def _stamps(capture: recordings.Capture, layout: Layout, data: Any) -> Recording
         raise _wrong(capture.id, f"times are {times.dtype}; give seconds (float) or ticks (integers)")
     if whole and tick is None:
         raise _wrong(capture.id, "times are whole ticks; give the Capture its tick (s), or times in s (float)")
+    if not whole and times.dtype.itemsize < 8:
+        coarse = float(np.spacing(np.abs(times).max())) if times.size else 0.0
+        if coarse > (tick or _FINE) / 2:
+            least = units.show(coarse, "s", 2)
+            raise _wrong(capture.id, f"times are {times.dtype}, which says no less than {least} apart; give float64")
+        times = times.astype(np.float64)
     seconds = times * float(tick or 1.0) if whole else times
     if times.size and not (np.isfinite(seconds).all() and seconds.min() >= 0 and seconds.max() < end):
         first, last = units.show(float(seconds.min()), "s"), units.show(float(seconds.max()), "s")

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from ..errors import SpadError
 from ..section import Section
-from ..validated import Irradiance, Length, Lux, Mean, Time, Uncertainty, brief
+from ..validated import Irradiance, Lux, Mean, Time, Uncertainty, Wavelength, brief
 
 FORMAT = "spadmnist-measurement/1"
 FILE = "measurement.yaml"
@@ -97,7 +97,7 @@ class Flat(_Light):
     """The same light on all pixels. Without irradiance and lux its level is fitted."""
 
     kind: Literal["flat"]
-    wavelength: Length | None = Field(default=None, description=_WAVELENGTH)
+    wavelength: Wavelength | None = Field(default=None, description=_WAVELENGTH)
     irradiance: Irradiance | None = Field(default=None, description="irradiance of the sensor")
     lux: Lux | None = Field(default=None, description="illuminance of the sensor, instead of irradiance")
 
@@ -112,7 +112,7 @@ class Image(_Light):
         description="JSON file of the tiles of a chart: size, [rows, columns]; corners, the first row and column of "
         "each; numbers of the images; labels",
     )
-    wavelength: Length | None = Field(default=None, description=_WAVELENGTH)
+    wavelength: Wavelength | None = Field(default=None, description=_WAVELENGTH)
     irradiance: Irradiance | None = Field(default=None, description="irradiance of the sensor where the image is white")
     lux: Lux | None = Field(default=None, description="illuminance there, instead of irradiance")
 

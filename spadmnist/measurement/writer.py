@@ -36,8 +36,9 @@ def write(
 
     Every file appears by one rename, `measurement.yaml` last. A file that is there and has the same bytes stays; a
     folder that holds anything else is refused. Raises SpadError where it cannot be written, and for a capture that
-    could not be opened again. Where a recording is refused (InputError) the files of this call go again: with other
-    words the same files may be right, and would not be those that lie there.
+    could not be opened again. Where a recording is refused (InputError), or something else lies in the folder, the
+    files of this call go again: with other words the same files may be right, and in a plan's folder they would stand
+    for its data.
     """
     root = Path(path)
     for capture in captures:
@@ -62,7 +63,15 @@ def write(
                     known = final.exists()
                     _commit_recording(root, final.name, one)
                     made += [] if known else [final]
-        except InputError:
+            others = {} if layout.positions is None else {_POSITIONS: positions_text(layout.positions).encode()}
+            others |= {file: shown.file() for shown, file in _scenes(done).items()}
+            others |= {file: laid for laid, file in _tiles(done).items()}
+            _check_place(root, done, layout)
+            for file, data in {**others, FILE: _yaml(name, layout, done).encode()}.items():
+                known = (root / file).exists()
+                _commit(root, file, data)
+                made += [] if known else [root / file]
+        except (InputError, _Another):
             for final in made:
                 final.unlink(missing_ok=True)
             _clear(root)
@@ -70,14 +79,6 @@ def write(
                 with contextlib.suppress(OSError):
                     root.rmdir()
             raise
-        if layout.positions is not None:
-            _commit(root, _POSITIONS, positions_text(layout.positions).encode())
-        for shown, file in _scenes(done).items():
-            _commit(root, file, shown.file())
-        for laid, file in _tiles(done).items():
-            _commit(root, file, laid)
-        _check_place(root, done, layout)
-        _commit(root, FILE, _yaml(name, layout, done).encode())
         _clear(root)
     return root
 
@@ -222,7 +223,7 @@ def _commit(root: Path, name: str, data: bytes) -> None:
     final = root / name
     if final.exists():
         if not final.is_file() or final.stat().st_size != len(data) or final.read_bytes() != data:
-            raise _another(final)
+            raise _Another(final)
         return
     disk.commit_file(final, data, disk.temporary(root))
 
@@ -244,14 +245,18 @@ def _commit_recording(root: Path, name: str, one: Recording, planned: str | None
                     f"{final}: the capture {planned} has other data already; remove this file to import them anew, or "
                     "say with --capture which capture the new file is"
                 )
-            raise _another(final)
+            raise _Another(final)
 
 
-def _another(final: Path) -> SpadError:
-    return SpadError(
-        f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another folder "
-        f"with -o, or remove {final.parent}"
-    )
+class _Another(SpadError):
+    """A file that is there is of something else."""
+
+    def __init__(self, final: Path):
+        or_remove = "" if final.name == FILE else f", or remove {final.parent}"  # it may be a plan, or describe data
+        super().__init__(
+            f"{final}: belongs to another measurement, or was made from another sensor or seed; choose another folder "
+            f"with -o{or_remove}"
+        )
 
 
 def _yaml(name: str, layout: Layout, captures: Sequence[Capture]) -> str:
