@@ -157,7 +157,9 @@ def _diagnosed(
         _renew_setup(path, notes)
     verdict = verdict_of(path, left_over(path, notes), notes)
     if not path.steps:
-        path.evaluation, path.fit, path.values = as_compared(replicates, start), None, {}
+        # what a nonlinearity may explain as well is not excused
+        path.evaluation = start if notes.bent else as_compared(replicates, start)
+        path.fit, path.values = None, {}
         path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
     rungs = [path.ladder[0], *([notes.placebo] if notes.placebo else []), *path.ladder[1:]]
     null_95 = _measured(path, rungs)
