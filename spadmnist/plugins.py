@@ -178,10 +178,19 @@ def _is_angle(one: Parameter) -> bool:
 
 @dataclass(frozen=True)
 class ByWavelength:
-    """A table over the wavelength (m), interpolated linearly between its entries."""
+    """A table over the wavelength (m, ascending), interpolated linearly between its entries."""
 
     wavelengths: tuple[float, ...]
     values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.wavelengths) != len(self.values) or not len(self.values):
+            raise InputError(
+                f"a table over the wavelength has {len(self.wavelengths)} wavelengths and {len(self.values)} values; "
+                "it needs one for each"
+            )
+        if any(b <= a for a, b in zip(self.wavelengths, self.wavelengths[1:], strict=False)):
+            raise InputError(f"the wavelengths {list(self.wavelengths)} of a table do not ascend; sort its entries")
 
     def at(self, wavelength: float) -> float:
         """Raises InputError outside the table."""
@@ -517,7 +526,10 @@ def check_values(plugin: Plugin) -> None:
                 raise InputError(f"{place} is {value!r}; it is True or False")
             continue
         if isinstance(value, Mapping):
-            raise InputError(f"{place}: give a table over the wavelength as ByWavelength(wavelengths, values)")
+            how = "a map of the pixels is an array"
+            if declared.by_wavelength:
+                how = "a table over the wavelength is spadmnist.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))"
+            raise InputError(f"{place} is {value!r:.80}; in Python it is a number, and {how}")
         numbers = np.asarray(value.values if isinstance(value, ByWavelength) else value)
         if numbers.dtype.kind not in "fiu":
             raise InputError(f"{place} is {value!r}; it is a number in {declared.unit or 'units of 1'}")

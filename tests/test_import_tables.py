@@ -305,3 +305,14 @@ def test_pieces_of_any_size(tmp_path: Path, size: int, monkeypatch: pytest.Monke
     (tmp_path / "a.csv").write_text(text.replace("\n", "\n\n", 5))
     made = run(tmp_path / "a.csv", replace(LONG, rows=5, columns=8))
     assert taken(made) == right(text, ",", Fraction(1, 10**12))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("1,2\n3\n", ":3: has 1 column, and the lines before 2"), ("0,1\n\n1,2,7\n", ":4: has 3 columns")],
+)
+def test_a_line_with_other_columns_is_named(text: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text("pixel,time (ps)\n" + text)
+    message = refusal(file)
+    assert said in message and "usecols" not in message

@@ -480,6 +480,25 @@ GRID = sp.Layout(4, 8, 25e-12, 0.5)
             r"widths is an array of shape \(5, 3\); it needs one number for each code",
         ),
         (lambda: sp.Capture("a", "tr", exposure=1.0, wavelength=500.0, lux=1.0), "wavelength is 500.0 m"),
+        (lambda: sp.Capture("a", "tr", exposure=1.0, dark="no"), "dark is 'no'; it is True or False"),  # type: ignore[arg-type]
+        (
+            lambda: sp.Capture("a", "qis", dark=True, frames=2, frame_time=1e-5, counting="counter"),
+            "counting means nothing for QIS",
+        ),
+        (
+            lambda: sp.Capture("a", "qis", dark=True, frames=2, frame_time=1e-5, tick=1e-9),
+            "tick means nothing for QIS",
+        ),
+        (lambda: sp.effects.ByWavelength((500e-9, 700e-9), (0.4,)), "2 wavelengths and 1 values"),
+        (lambda: sp.effects.ByWavelength((700e-9, 500e-9), (0.4, 0.2)), "do not ascend; sort its entries"),
+        (
+            lambda: sp.Sensor(GRID, []).with_effect(sp.effects.Detection(pdp={500e-9: 0.4})),
+            r"a table over the wavelength is spadmnist.effects.ByWavelength\(",
+        ),
+        (
+            lambda: sp.Sensor(GRID, []).with_effect(sp.effects.DarkCounts(rate={"lognormal": 1.0})),
+            "a map of the pixels is an array",
+        ),
         (
             lambda: sp.fit(sp.Sensor(GRID, []), "lab", free={"dark_counts.rate": 5.0}),
             "free is a dictionary; it is a list of names",

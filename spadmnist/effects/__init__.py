@@ -48,10 +48,10 @@ import numpy as np
 from .. import plugins
 from ..errors import did_you_mean
 from ..events import Layout
-from ..plugins import Parameter, Plugin, Registry, parameter
+from ..plugins import ByWavelength, Parameter, Plugin, Registry, parameter
 from ..scene import Scene
 
-__all__ = ["STAGES", "Chip", "Conditions", "Effect", "Parameter", "parameter"]
+__all__ = ["STAGES", "ByWavelength", "Chip", "Conditions", "Effect", "Parameter", "parameter"]
 
 # stage -> the hooks of which an effect there must have one (or all of those that are joined by "+")
 STAGES: dict[str, tuple[str, ...]] = {

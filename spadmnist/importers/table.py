@@ -223,9 +223,15 @@ def _numbers(lines: Sequence[str], line: int, path: Path, head: _Head) -> np.nda
     try:
         table = np.loadtxt(lines, delimiter=head.separator, ndmin=2, comments=None)
     except ValueError as error:
-        raise InputError(
-            f"{path}: {image_files.reason(error)}, from line {line} on; a line is {'1250' if head.alone else '3,1250'}"
-        ) from None
+        like = "1250" if head.alone else "3,1250"
+        for number, text in enumerate(lines, line):
+            if text.strip() and len(text.strip().split(head.separator)) != head.columns:
+                count = len(text.strip().split(head.separator))
+                raise InputError(
+                    f"{path}:{number}: has {count} column{'s' * (count != 1)}, and the lines before {head.columns}; a "
+                    f"line is {like}"
+                ) from None
+        raise InputError(f"{path}: {image_files.reason(error)}, from line {line} on; a line is {like}") from None
     if table.shape[1] != head.columns:
         what = "a pixel and a time" if head.columns == 2 else f"{head.columns} numbers, as the first line says"
         raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is {what}")

@@ -73,6 +73,12 @@ def Capture(
     if modality not in MODALITIES:
         raise _wrong(id, f"{modality!r} is not a modality; those are {', '.join(MODALITIES)}.", modality, MODALITIES)
     check_name(id, "Capture")
+    if not isinstance(dark, bool | np.bool_):
+        raise _wrong(id, f"dark is {dark!r}; it is True or False")
+    if modality != "counts" and counting != "frames":
+        raise _wrong(id, f"counting means nothing for {modality.upper()}; leave it out")
+    if modality in ("qis", "counts"):
+        _none(id, modality, tick=tick)
     numbers = {
         "wavelength": wavelength,
         "exposure": exposure,
