@@ -100,7 +100,7 @@ def _failed(error: Exception) -> int:
     elif isinstance(error, SpadError):
         terminal.say(f"Error: {error}")
     elif isinstance(error, MemoryError):
-        terminal.say("Error: there is not enough memory; give fewer --jobs or smaller images")
+        terminal.say("Error: there is not enough memory; give fewer --jobs, smaller images or shorter captures")
     elif limits.is_alone(error):
         terminal.say(f"Error: {limits.ALONE}")
     elif isinstance(error, OSError):
