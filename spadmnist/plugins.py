@@ -384,7 +384,8 @@ def resolve(declared: Parameter, value: Any, shapes: tuple[tuple[int, ...], ...]
         values = np.asarray(value, np.float64)
         if not _fits(values.shape, shapes):
             wanted = f"it needs one number for each {declared.per}: {_words(shapes)}"
-            raise InputError(f"{declared.name} is an array of shape {values.shape}; {wanted}")
+            *_, owner, name = key.split("/")
+            raise InputError(f"the effect {owner}: {name} is an array of shape {values.shape}; {wanted}")
         return values.ravel() if declared.per_pixel else value
     return value
 

@@ -459,7 +459,7 @@ def test_codes_drawn_for_a_chip() -> None:
         ([TdcNonlinearity(widths=np.array([[1.0, 2.0], [0.0, 0.0]])), Tdc()], "pixel 1 are all 0"),
         ([TdcNonlinearity(widths=0.0), Tdc()], "the widths are all 0"),
         ([TdcNonlinearity(widths=np.array([1.0, -2.0])), Tdc()], "none negative"),
-        ([TdcNonlinearity(widths=np.ones((3, 4)) * [1, 1, 1, 2]), Tdc()], "one for each of 2 pixels"),
+        ([TdcNonlinearity(widths=np.ones((3, 4)) * [1, 1, 1, 2]), Tdc()], "needs one number for each code"),
         ([TdcNonlinearity(period=1.5)], "a whole number of codes"),
         ([ReadoutLoss(queue=2.5)], "a whole number of events"),
         ([CountSaturation(bits=7.5)], "a whole number"),
