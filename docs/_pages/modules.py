@@ -32,7 +32,9 @@ _IMPORTED = re.compile(
 
 def page() -> str:
     """The page of the modules."""
-    blocks = ["Modules of the package that are imported by themselves, beside [the library](library.md)."]
+    blocks = [
+        "Modules that are imported by their own names. All else is an attribute of `spadmnist`: [the library](library.md)."
+    ]
     for name, names in public().items():
         module = imported(name)
         blocks += [f"## {name}", *md.paragraphs(inspect.getdoc(module))]
@@ -103,7 +105,7 @@ def imported(name: str) -> ModuleType:
         lacking = _lacking(error)
     with _stand_in(lacking):
         module = importlib.import_module(name)
-    del sys.modules[name]  # whoever imports it later is told what it needs
+    del sys.modules[name]  # a later import raises the error that names the missing library
     folder, _, own = name.rpartition(".")
     vars(sys.modules.get(folder, module)).pop(own, None)
     return module

@@ -43,15 +43,6 @@ class CountModel:
         events = events_in_frames(sensor, np.full((1, sensor.layout.pixels), self.level), self.conditions)[0]
         return np.asarray(np.maximum(self.waited * events, 1e-9))
 
-    def unsure(self, sensor: Sensor) -> float:
-        """The relative error of the expected detections by what events cause.
-
-        An afterpulse in the frame of its parent is no further detection; where all are counted, those that are caused
-        by what was caused are missing in the closed form.
-        """
-        caused = sum(sensor.caused().values())
-        return caused**2 if self.seen.capture.counts_events else caused
-
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
         """The log-likelihood of the measured counts, (pixels,), up to a constant.
 

@@ -24,7 +24,7 @@ from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .laws import poisson_scores
 from .levels import LEAST_P
-from .light_levels import CLOSED, closed_form, level_for
+from .light_levels import CLOSED, closed_form, error_by_causes, level_for
 from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
@@ -151,7 +151,7 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
         total, mean_total = float(counts.sum()), float(expected.sum())
         # a map of other counts has the errors of their total, and the closed forms theirs
         known = max(float(np.sum((errors * expected) ** 2)), mean_total) if np.any(errors) else 0.0
-        unsure = CLOSED**2 + line.unsure(sensor) ** 2
+        unsure = CLOSED**2 + error_by_causes(sensor, line.seen.capture) ** 2
         wider = (float(own.sum()) + known + unsure * mean_total**2) / max(mean_total, 1e-300)
         score = float(poisson_scores(np.array([total]), np.array([mean_total]))[0])
         scores.append(score / math.sqrt(max(wider, 1.0)))

@@ -1,7 +1,7 @@
 """Which pixels an effect has hit that hits them at random, by their counts.
 
-A chip that is simulated has such an effect in other pixels than the measured one. What is fitted pixel by pixel beside
-it needs the pixels that it has hit in the data.
+A simulated chip has such an effect in other pixels than the measured chip. A map of the pixels is therefore fitted with
+the pixels that the effect has hit in the data.
 """
 
 from __future__ import annotations
@@ -128,10 +128,10 @@ def drawn_effects(replicates: Replicates, values: Values) -> list[str]:
 def beside_maps(
     replicates: Replicates, values: Values, carriers: set[Key], levels: Mapping[str, float]
 ) -> dict[Key, Any]:
-    """The values of a model beside maps: each effect that hits pixels at random is in those that the counts show.
+    """The values of a model for the fit of maps, SI: an effect that hits pixels at random is in the pixels it has hit.
 
-    Where they show none it is in no pixel, and a map takes what it does: in the pixels that the model has drawn, which
-    are not those of the chip, a map would undo it.
+    These are located by the counts. Where the counts locate none, the effect is in no pixel. The pixels that the model
+    draws are not those of the measured chip: a map that is fitted with them takes the effect away there.
 
     Args:
         values: of the model, SI; carriers: (effect, parameter) of the maps.

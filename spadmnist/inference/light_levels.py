@@ -238,10 +238,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
     digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
     rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
-    # an afterpulse in the frame of its parent is no further detection: by the closed form it may be one; where all are
-    # counted, what is caused by what was caused is missing in it
-    caused = sum(sensor.caused().values())
-    caused = caused**2 if capture.counts_events else caused
+    caused = error_by_causes(sensor, capture)
     apart, unsure = (
         (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_fluctuations(sensor, capture, level)
     )
@@ -250,6 +247,16 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
     totals = mean * np.exp(apart + scatter * normal[order])
     return CaptureNull(level, stated, totals, expected, (apart, 1.0), scatter), np.ones(replicates)
+
+
+def error_by_causes(sensor: Sensor, capture: Capture) -> float:
+    """The relative error of the closed form of the mean, by what events cause; at most.
+
+    An afterpulse in the frame of its parent is no further detection, and by the closed form it may be one. Where all
+    detections are counted, the closed form lacks those that are caused by a caused one.
+    """
+    caused = sum(sensor.caused().values())
+    return caused**2 if capture.counts_events else caused
 
 
 def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:

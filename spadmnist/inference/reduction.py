@@ -21,9 +21,12 @@ _EMPTY_END = 10.0
 # share that is early. For c events in a frame, the number of frames with a detection has the information
 # c^2 exp(-c) / (1 - exp(-c)) on log c: 0.47 a frame at 0.95 (c = 3) and falling, 0.64 at 0.75; at most 0.65, at 0.80
 _FULL, _EARLY = 0.95, 0.75
-_BINS = 1 << 16  # parts of a frame among which the early ones end: fine enough for any light, and half a megabyte
-_FREE = 30.0  # detections for which there is room left: fewer of them test hardly anything; a rule of thumb
-_TOO_COARSE = 0.9  # share of frames within one tick: of more the ticks are too long for that; a rule of thumb
+_BINS = 1 << 16  # bins of a frame in which first stamps are counted, at most: they take half a megabyte
+# detections: a capture with room for fewer is full, and tests hardly anything; a rule of thumb
+_FREE = 30.0
+# share of frames with a stamp within the early ticks: with more, one tick holds most of the stamps, and their number
+# says little of the light. A rule of thumb
+_TOO_COARSE = 0.9
 
 
 def halves_of(id: str) -> tuple[str, str]:

@@ -457,7 +457,7 @@ class Diagnosis(_Found):
 class Fit(_Found):
     """The answer of `fit`: the fitted values of named parameters, with their 95 % confidence intervals.
 
-    Its `steps` are what was named. `steps[i].values` tells of each value by which method it was fitted.
+    Its `steps` are the named changes. `steps[i].values[name].method` is the method by which a value was fitted.
     """
 
     @property
