@@ -32,9 +32,7 @@ _IMPORTED = re.compile(
 
 def page() -> str:
     """The page of the modules."""
-    blocks = [
-        "Modules that are imported by their own names. All else is an attribute of `spadmnist`: [the library](library.md)."
-    ]
+    blocks = ["Modules that are imported by their own names. All else is in `spadmnist`: [the library](library.md)."]
     for name, names in public().items():
         module = imported(name)
         blocks += [f"## {name}", *md.paragraphs(inspect.getdoc(module))]
