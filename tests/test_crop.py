@@ -243,7 +243,7 @@ def test_no_more_pixels_are_simulated_than_can_matter() -> None:
             whole = chip_with(effect, Layout(40, 40, 25e-12, 1.0), rules)
             window = Window.of((40, 40), slice(10, 20), slice(0, 10))
             for readout in ("tr", "qis"):
-                numbers[rules, name, readout] = int(whole._lively(window, (readout,)).sum())
+                numbers[rules, name, readout] = int(whole.lively(window, (readout,)).sum())
     assert numbers == {
         **{(rules, "none", readout): 100 for rules in ("paper", "device") for readout in ("tr", "qis")},
         **{("paper", "near", readout): 12 * 11 for readout in ("tr", "qis")},

@@ -22,6 +22,7 @@ from spadmnist.errors import InputError
 from spadmnist.events import Events, Layout
 from spadmnist.experiment import Experiment
 from spadmnist.images import Images
+from spadmnist.line import Line
 from spadmnist.plugins import Distribution
 from spadmnist.readout import Recorded
 from spadmnist.recording import Capture, Light
@@ -81,7 +82,7 @@ def exposed(sensor: Sensor, conditions: Conditions, readouts: Collection[str], *
 def parts_of(monkeypatch: pytest.MonkeyPatch, make: Callable[[], Any]) -> tuple[Any, int]:
     """(what is made, in how many goes through the line)."""
     goes = 0
-    line = Sensor._staged
+    line = Line.run
 
     def counting(*arguments: Any) -> Recorded:
         nonlocal goes
@@ -89,7 +90,7 @@ def parts_of(monkeypatch: pytest.MonkeyPatch, make: Callable[[], Any]) -> tuple[
         return line(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Sensor, "_staged", counting)
+        patch.setattr(Line, "run", counting)
         return make(), goes
 
 

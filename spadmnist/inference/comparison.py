@@ -27,6 +27,7 @@ from ..sensor import Sensor
 from ..statistics import Summary
 from ..workers import Executor, executor
 from .candidates import with_values
+from .captures_together import Together, checks_together
 from .coordinates import Key, Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
@@ -35,8 +36,7 @@ from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .models import Model
 from .null_distribution import Judgement
 from .phases import evaluate_start
-from .repeated_cells import place, repeated
-from .replicates import REPLICATES, TOTALS, Execution, Replicates
+from .replicates import REPLICATES, TOTALS, Cell, Execution, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 # expected detections from which on, in every pixel, its ratio between two wavelengths is compared; a rule of thumb
@@ -165,11 +165,12 @@ class Comparison:
 def _deviation(check: Check) -> Deviation:
     """A check as its group needs it; of a total the excess is that of its p-value."""
     beyond = check.excess or float(stats.norm.isf(max(check.p_value, LEAST_P) / 2)) ** 2
-    worst, residuals, at = 0, np.zeros(0), None
+    worst, where, residuals, at = 0, check.where, np.zeros(0), None
     if check.judgement is not None and check.summary is not None:
         worst, residuals, axis = check.judgement.worst, check.judgement.residuals, check.summary.axis
+        where = check.summary.where(worst)  # the place alone
         at = None if axis is None or check.summary.shape is not None else float(axis[worst])
-    return Deviation(check.statistic, check.capture, beyond, worst, check.where, check.relative, residuals, at)
+    return Deviation(check.statistic, check.capture, beyond, worst, where, check.relative, residuals, at)
 
 
 def _plain(value: float) -> float:
@@ -234,28 +235,34 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     # capture, log of the light factor, its standard error, elasticity
     levels: list[tuple[Capture, float, float, float]] = []
     of_cells = misfits(evaluation.replicate_residuals, evaluation.residuals)
-    several = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, evaluation.residuals)
-    together = {check.clearest: check for check in several}
+    alone = {cell: evaluation.judgements[cell].p_value for cell in evaluation.residuals if cell != TOTALS}
+    together: dict[Cell, list[Together]] = {}
+    for one in checks_together(replicates, evaluation, evaluation.residuals, alone):
+        together.setdefault(one.clearest, []).append(one)
     for id, seen in replicates.seen.items():
         checks += _level_checks(replicates.start, seen.counted, seen.total, evaluation.rates[id], levels)
         for name, summary in seen.summaries.items():
             judged = evaluation.judgements.get((id, name))
             if judged is not None:
-                alike, number = together.get((id, name)), 1
-                if alike is not None and alike.p < judged.p_value:
-                    judged, number = replace(judged, p_value=alike.p, worst=alike.worst), alike.captures
+                here = together.get((id, name), [])
+                least = min(here, key=lambda one: one.p, default=None)
+                if least is not None and least.p >= judged.p_value:
+                    least = None
+                if least is not None:
+                    judged = replace(judged, p_value=least.p, worst=least.worst)
                 measured, expected = float(summary.values[judged.worst]), float(judged.expected[judged.worst])
                 text, relative = summary.size(judged.worst, measured, expected)
                 misfit = of_cells.get((id, name), judged.misfit)
-                where = place(summary.where(judged.worst), number)
+                where = summary.where(judged.worst)
                 p = max(judged.p_value, LEAST_P)
                 beyond = excess(summary, judged.expected, judged.residuals)
-                if alike is not None and number > 1:
-                    beyond = max(beyond, alike.z**2)
+                if least is not None:
+                    where, beyond = where + least.words, max(beyond, least.excess)
+                    relative = _relative(replicates, evaluation, least)
                 own = Check(
                     name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged
                 )
-                checks.append(replace(own, tests=1 if alike is None else 2))
+                checks.append(replace(own, tests=1 + len(here)))
     captures = [seen.capture for seen in replicates.seen.values()]
     nuisances, common = light_of(levels, captures)
     checks += common
@@ -277,6 +284,15 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         crop=str(sensor.window) if sensor.window else None,
         full=tuple(id for id, seen in replicates.seen.items() if seen.is_full(sensor)),
     )
+
+
+def _relative(replicates: Replicates, evaluation: Evaluation, check: Together) -> float:
+    """The relative deviation of several captures together: the mean of those that deviate alike, or the clearest."""
+    sizes = []
+    for cell in check.cells if check.alike else check.cells[:1]:
+        summary, expected = replicates.seen[cell[0]].summaries[cell[1]], evaluation.judgements[cell].expected
+        sizes.append(summary.size(check.worst, float(summary.values[check.worst]), float(expected[check.worst]))[1])
+    return float(np.mean(sizes))
 
 
 def nothing_to_compare(replicates: Replicates) -> str:

@@ -17,6 +17,7 @@ from ..errors import UNABLE, SpadError, why
 from ..statistics import Summary
 from . import replicate_cache
 from .candidates import with_values
+from .captures_together import Together, checks_together
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
 from .light_levels import (
@@ -32,7 +33,6 @@ from .light_levels import (
 )
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
-from .repeated_cells import Repeated, repeated
 from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, T, joined, no_size
 
 # turns: the golden ratio, by which each next light level of the replicates falls into the widest gap, for any number
@@ -440,7 +440,7 @@ class BlockCheck:
         p: two-sided p-value, of its sum of squares or its worst cell.
         worst: that cell; z: its residual.
         tests: the number of tests of which p is the smallest p-value.
-        alike: where p is that of several captures together, their check.
+        together: where p is that of several captures together, their check.
     """
 
     cell: Cell
@@ -448,7 +448,12 @@ class BlockCheck:
     worst: int
     z: float
     tests: int = 1
-    alike: Repeated | None = None
+    together: Together | None = None
+
+    @property
+    def shown(self) -> Cell:
+        """The block that shows it: of several captures together, the one in which it is clearest."""
+        return self.cell if self.together is None else self.together.clearest
 
 
 def block_checks(
@@ -459,21 +464,24 @@ def block_checks(
     Args:
         residuals: (cells,) by block.
     """
-    out = []
-    several = repeated(replicates, evaluation.nulls, evaluation.replicate_residuals, residuals)
-    together = {check.cell: check for check in several}
+    out, alone = [], dict[Cell, tuple[float, int]]()
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
                 BlockCheck(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)
             ]
-            continue
-        p, worst = evaluation.nulls[cell].p_value(z)
-        alike = together.get(cell)
-        if alike is not None and alike.p < p:
-            out.append(BlockCheck(cell, alike.p, alike.worst, alike.z, 2, alike))
         else:
-            out.append(BlockCheck(cell, p, worst, float(z[worst]), 1 if alike is None else 2))
+            alone[cell] = evaluation.nulls[cell].p_value(z)
+    several: dict[Cell, list[Together]] = {}
+    for check in checks_together(replicates, evaluation, residuals, {cell: p for cell, (p, _) in alone.items()}):
+        several.setdefault(check.cell, []).append(check)
+    for cell, (p, worst) in alone.items():
+        here = several.get(cell, [])
+        least, tests = min(here, key=lambda check: check.p, default=None), 1 + len(here)
+        if least is not None and least.p < p:
+            out.append(BlockCheck(cell, least.p, least.worst, least.z, tests, least))
+        else:
+            out.append(BlockCheck(cell, p, worst, float(residuals[cell][worst]), tests))
     out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 

@@ -17,7 +17,6 @@ from .deviations import Deviation, deviations, excess
 from .evaluation import BlockCheck, Evaluation, block_checks, failing
 from .levels import LEAST_P
 from .light_levels import LEAST_ELASTICITY, Nuisance, totals_space
-from .repeated_cells import place
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
 
@@ -61,9 +60,7 @@ def remainder(
     Args:
         residuals: (cells,) by block.
     """
-    checks = block_checks(replicates, evaluation, residuals)
-    failed = failing(checks)
-    passing = {block.cell for block in checks} - {block.cell for block in failed}
+    failed, passing = _shown(block_checks(replicates, evaluation, residuals))
     seen = [_failed(replicates, evaluation, residuals, block) for block in failed]
     groups = deviations([one for one, _ in seen], passing)
     out = []
@@ -72,7 +69,7 @@ def remainder(
             one, size = seen[i]
             significance = max(abs(failed[i].z), float(stats.norm.isf(max(failed[i].p, LEAST_P) / 2)))
             entry = {"statistic": one.statistic, "capture": one.capture, "significance": plain(significance)}
-            out.append(entry | {"where": one.where, "size": size, "deviation": number})
+            out.append(entry | {"where": one.where + _words(failed[i]), "size": size, "deviation": number})
     return out[:_ENTRIES]
 
 
@@ -85,22 +82,29 @@ def _failed(
         ids, *_ = totals_space(replicates, evaluation)
         which = ids[block.worst] if block.worst < len(ids) else None
         return Deviation("rate", which, block.z**2, 0, "all pixels", 0.0, np.zeros(0)), ""
-    cell = _shown(block)
+    cell = block.shown
     id, seen = cell[0], replicates.seen[cell[0]]
     summary, z = seen.summaries[name], residuals.get(cell, np.zeros(0))
     expected, _ = evaluation.expected(cell, seen.total)
     text, relative = summary.size(block.worst, float(summary.values[block.worst]), float(expected[block.worst]))
     at = None if summary.axis is None or summary.shape is not None else float(summary.axis[block.worst])
     beyond = excess(summary, expected, z) if z.size else block.z**2
-    where = summary.where(block.worst)
-    if block.alike is not None:
-        where, beyond = place(where, block.alike.captures), max(beyond, block.z**2)
-    return Deviation(name, id, beyond, block.worst, where, relative, z, at), text
+    if block.together is not None:
+        beyond = max(beyond, block.together.excess)
+    return Deviation(name, id, beyond, block.worst, summary.where(block.worst), relative, z, at), text
 
 
-def _shown(block: BlockCheck) -> Cell:
-    """The block that shows a failing check: of several captures together, the one in which it is clearest."""
-    return block.cell if block.alike is None else block.alike.clearest
+def _words(block: BlockCheck) -> str:
+    """The words behind a place where several captures together deviate."""
+    return block.together.words if block.together is not None else ""
+
+
+def _shown(checks: Sequence[BlockCheck]) -> tuple[list[BlockCheck], set[Cell]]:
+    """(failing checks, each block once; the blocks that show none of them)."""
+    failed: dict[Cell, BlockCheck] = {}
+    for block in failing(checks):
+        failed.setdefault(block.shown, block)  # the one with the smallest p-value
+    return list(failed.values()), {block.cell for block in checks} - failed.keys()
 
 
 def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:
@@ -113,15 +117,14 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
         start, last: the evaluations of the stated model and of the last one.
         steps: the steps between them.
     """
-    blocks = block_checks(replicates, start, start.residuals)
-    failed = [b for b in failing(blocks) if b.cell[0] and b.cell in start.residuals and b.cell in last.residuals]
+    failed, passing = _shown(block_checks(replicates, start, start.residuals))
+    failed = [b for b in failed if b.cell[0] and b.shown in start.residuals and b.shown in last.residuals]
     seen = [_failed(replicates, start, start.residuals, block) for block in failed]
-    passing = {block.cell for block in blocks} - {block.cell for block in failed}
     out: list[Trace] = []
     for number, members in enumerate(deviations([one for one, _ in seen], passing)[:_PICTURES]):
         alike = [i for i in members if seen[i][0].statistic == seen[members[0]][0].statistic][:_CAPTURES]
         for i in alike:
-            (id, name), (one, size) = _shown(failed[i]), seen[i]
+            (id, name), (one, size) = failed[i].shown, seen[i]
             total, null = replicates.seen[id].total, last.nulls[id, name]
             now = null.expected(total)[0]
             moved = [float(np.sum(step.template.get((id, name), np.zeros(1)) ** 2)) for step in steps]
@@ -135,7 +138,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
                     null.spread_at(now),
                     start.residuals[id, name],
                     last.residuals[id, name],
-                    one.where,
+                    one.where + _words(failed[i]),
                     size,
                     number,
                     i == members[0],

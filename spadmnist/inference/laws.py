@@ -216,6 +216,15 @@ class Poisson(Scaled):
         """Normal scores of the counts."""
         return np.asarray(poisson_scores(values, np.maximum(expected, self.least(n))) / _widened(leverage))
 
+    def of_their_own(
+        self, values: np.ndarray, fitted: np.ndarray, spread: np.ndarray, hat: np.ndarray, terms: int
+    ) -> np.ndarray:
+        """Each about the expectation that the others give: a rare count makes a part of its own expectation."""
+        n = len(values)
+        hat = np.where(values.mean(axis=0) < _FEW, 1 / n, np.minimum(hat, 0.9))  # few follow the mean, see `regression`
+        others = (fitted - hat * values) / (1 - hat)
+        return self.standardized(values, others, spread, hat / (1 - hat), n - 1)
+
     def spread_at(self, expected: np.ndarray, spread: np.ndarray, factor: float) -> np.ndarray:
         """The root of the expectation, times the factor."""
         return np.asarray(np.sqrt(np.maximum(expected, 0.0)) * factor)

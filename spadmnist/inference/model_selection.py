@@ -271,7 +271,7 @@ def another_step(path: ModelPath, notes: Notes) -> bool:
     asked = notes.explained or notes.taken_back is not None
     if not asked and scan.only_rates(path.evaluation) and explained_by_setup(path, notes):
         return is_freed(path, notes)
-    clearest = dict.fromkeys(f"{b.cell[1]} of {b.cell[0]}" if b.cell[0] else "the rates" for b in failed)
+    clearest = dict.fromkeys(f"{b.shown[1]} of {b.shown[0]}" if b.shown[0] else "the rates" for b in failed)
     first = ", ".join(list(clearest)[:4])
     replicates.say(f"step {number}: {len(failed)} checks fail ({first}); trying every candidate")
     notes.tried = scan.scan(path.evaluation, known=notes.tried)

@@ -117,17 +117,17 @@ class Null:
         Args:
             z: (cells,) residuals.
         """
-        square = float(np.mean(z**2))
-        mean = max(float(self.own.mean()), 0.05)
-        variance = self.law.variance_of_squares(float(self.own.var(ddof=1)), z.size)
-        # the sample variance may be too small by about its standard error; rare values would then look too rare
-        variance *= 1 + math.sqrt(5 / self.recordings)
-        shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
-        p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape)) if square > mean else 1.0
+        p_sum = p_of_squares(float(np.mean(z**2)), *self.moments_of_squares(z.size))
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
         return min(1.0, 2 * min(p_sum, p_cell)), worst
+
+    def moments_of_squares(self, cells: int) -> tuple[float, float]:
+        """(mean, variance) of the mean squared residual of so many cells."""
+        mean = max(float(self.own.mean()), 0.05)
+        variance = self.law.variance_of_squares(float(self.own.var(ddof=1)), cells)
+        return mean, variance * widening(self.recordings)
 
     def residuals(self, values: np.ndarray, expected: np.ndarray, leverage: float | np.ndarray) -> np.ndarray:
         """Residuals of values about an expectation, standard normal if the model is right, in the shape of `values`.
@@ -190,12 +190,23 @@ def _terms(x: np.ndarray, terms: int) -> np.ndarray:
     return np.stack([x**k for k in range(terms)], axis=1)
 
 
+def widening(recordings: int) -> float:
+    """The factor on a sample variance: too small by its standard error, it would make rare values look too rare."""
+    return 1 + math.sqrt(5 / recordings)
+
+
+def p_of_squares(square: float, mean: float, variance: float) -> float:
+    """The one-sided p-value of a sum of squares, by the gamma law with this mean and variance."""
+    shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
+    return float(stats.gamma.sf(square, shape, scale=mean / shape)) if square > mean else 1.0
+
+
 def tail_of(z: np.ndarray) -> float:
     """The factor by which the largest residuals of replicates exceed those of a normal law; at least 1."""
     live = z.any(axis=0)  # cells without enough data are 0 in all replicates
-    magnitudes = np.sort(np.abs(z[:, live] if live.any() else z).ravel())
+    magnitudes = np.abs(z[:, live] if live.any() else z).ravel()
     beyond = 10 if magnitudes.size > 1000 else 3
-    place = magnitudes[-beyond]
+    place = np.partition(magnitudes, -beyond)[-beyond]
     normal = -float(special.ndtri((beyond - 0.5) / magnitudes.size / 2))
     return max(1.0, float(place) / normal)
 

@@ -389,9 +389,9 @@ class Scan:
         """Up to three captures that are most informative: a dark one, and those with the smallest p-values."""
         worst = dict.fromkeys(evaluation.made, 0.0)
         for block in block_checks(self.replicates, evaluation, evaluation.residuals):
-            if block.cell[0] in worst:  # a p-value above 1 % says little, but more than nothing
+            if block.shown[0] in worst:  # a p-value above 1 % says little, but more than nothing
                 surprise = -math.log10(max(block.p, LEAST_P))
-                worst[block.cell[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
+                worst[block.shown[0]] += max(surprise - 2.0, 0.0) + 0.01 * surprise
         ids = sorted(worst, key=lambda id: -worst[id])
         dark = [id for id in ids if self.replicates.seen[id].capture.light.dark][:1]
         return list(dict.fromkeys([*ids[: 3 - len(dark)], *dark]))

@@ -80,8 +80,6 @@ class Statistic(Plugin, abstract=True):
     modalities: ClassVar[tuple[str, ...]] = ()  # of "tr", "str", "qis", "counts"
     costly: ClassVar[bool] = False  # left out where very many models are looked at for the first time
     flat: ClassVar[bool] = False  # it sets pixels beside each other as if all saw the same light: not of a scene
-    # what it shows lies in the same cell of every capture: that cell of all of them together is a check, too
-    repeats: ClassVar[bool] = False
     unit: ClassVar[str] = "1"  # of its values
     # whose detections it sets beside each other: a pixel's own, those close by or far apart, all as one; "": it counts
     among: ClassVar[Literal["", "pixel", "neighbours", "far", "array"]] = ""

@@ -152,7 +152,6 @@ class FineIntervals(Statistic):
     pools = ("edge_intervals", "pixel_map")
     among = "pixel"
     unit = "detections"
-    repeats = True
 
     def reduce(self, recording: Recording) -> Summary | None:
         """Counts."""

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, special
 
-from spadmnist import kernels
+from spadmnist import hooks, kernels
 from spadmnist.effects import Chip, Conditions, Effect
 from spadmnist.effects.afterpulsing import Afterpulsing
 from spadmnist.effects.crosstalk import Crosstalk
@@ -796,14 +796,12 @@ def test_a_device_is_the_event_queue_in_short(name: str, flux: str) -> None:
 
 def _spawn_without_dead_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The releases of a pixel do not wait for its dead time."""
-    right = Sensor._spawn
+    right = hooks.spawned
 
-    def wrong(self: Sensor, effect: Effect, events: Events, *rest: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        times, rows, parents = right(self, effect, events, *rest)
-        home = events.rows[parents]
-        return times - np.where(rows == home, self.dead_times[home % events.pixels], 0.0), rows, parents
+    def wrong(effect: Effect, events: Events, dead_times: np.ndarray, *rest: Any) -> Any:
+        return right(effect, events, np.zeros_like(dead_times), *rest)
 
-    monkeypatch.setattr(Sensor, "_spawn", wrong)
+    monkeypatch.setattr(hooks, "spawned", wrong)
 
 
 def _blind_pixels_that_light_fires(monkeypatch: pytest.MonkeyPatch) -> None:
