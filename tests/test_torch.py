@@ -496,6 +496,72 @@ def test_images_of_any_kind(pictures: Any, sensor: Any) -> None:
     assert torch.equal(simulated(np.stack([grey] * 3, axis=-1), sensor)[0][0], colour)
 
 
+@pytest.mark.parametrize("lux", ["30 lux", (0.5, 50.0)])
+def test_each_image_has_its_own_white(sensor: Any, pictures: Any, lux: Any) -> None:
+    """Of several kinds together each is what it is alone, to the last photon."""
+    from PIL import Image
+
+    grey = pictures.images[0]
+    deep = grey.astype(np.uint16) * 257
+    kinds = [grey, grey / 255.0, deep, torch.from_numpy(grey)[None], Image.fromarray(grey), Image.fromarray(deep)]
+    together = simulated(kinds, sensor, lux=lux).__getitems__(range(6))
+    alone = [simulated(kinds, sensor, lux=lux)[i][0] for i in range(6)]
+    assert all(torch.equal(one, right) for (one, _), right in zip(together, alone, strict=True))
+    means = np.array([one.mean().item() for one in alone])
+    if lux == "30 lux":
+        assert means.max() < 1.1 * means.min()
+
+
+def test_pictures_are_read_as_those_of_a_folder(sensor: Any, tmp_path: Path) -> None:
+    """Palettes are their colours, what is transparent is black, 16 bits stay."""
+    from PIL import Image
+
+    from spadmnist.images import Folder
+
+    grey = np.full((28, 28), 200, np.uint8)
+    grey[:3] = 40
+    rgb = np.stack([grey, grey // 2, 255 - grey], -1)
+    clear = np.dstack([rgb, np.where(grey > 100, 0, 255).astype(np.uint8)])
+    palette = Image.fromarray(grey).quantize(4)
+    see_through = Image.fromarray(rgb).quantize(4)
+    see_through.info["transparency"] = 0
+    shown = {
+        "palette": palette, "colours": Image.fromarray(rgb).quantize(4), "clear": Image.fromarray(clear),
+        "see_through": see_through, "bits": Image.fromarray(grey > 100),
+        "deep": Image.fromarray(grey.astype(np.uint16) * 200),
+        "grey_clear": Image.fromarray(np.dstack([grey, clear[..., 3]])),
+    }  # fmt: skip
+    for name, picture in shown.items():
+        (tmp_path / name).mkdir()
+        picture.save(tmp_path / name / "a.png")
+        read = Folder(path=str(tmp_path / name)).load((28, 28))["train"]
+        right = simulated(read.pixels, sensor)[0][0]
+        assert torch.equal(simulated([picture], sensor)[0][0], right), name
+        with Image.open(tmp_path / name / "a.png") as opened:
+            assert torch.equal(simulated([opened], sensor)[0][0], right), name
+    assert torch.equal(simulated([palette], sensor)[0][0], simulated(grey[None], sensor)[0][0])
+    assert torch.equal(
+        simulated(clear[None], sensor)[0][0], simulated([Image.fromarray(clear)], sensor)[0][0]
+    )  # as an array, too
+    for mode in ("CMYK", "HSV", "YCbCr", "LAB", "F"):
+        picture = Image.new(mode, (28, 28))
+        with pytest.raises(SpadError, match=f"image 0: it has pixels of the kind {mode}; convert it to.*give an array"):
+            simulated([picture], sensor)[0]
+    with pytest.raises(SpadError, match="image 0: four channels of float64"):
+        simulated([clear / 255.0], sensor)[0]
+    with pytest.raises(SpadError, match="image 1 is of 3 channels, but image 0 grey; convert all to one kind"):
+        simulated([grey, rgb], sensor).__getitems__([0, 1])
+
+
+def test_an_index_is_a_whole_number(part: spadmnist.Part, sensor: Any, pictures: Any) -> None:
+    for made in (*sets(part).values(), simulated(pictures, sensor)):
+        for wrong in (1.7, np.float64(2), "1"):
+            with pytest.raises(IndexError, match="images are chosen by a number"):
+                made[wrong]
+        with pytest.raises(IndexError, match=f"image {N} was asked for; there are {N}"):
+            made[N]
+
+
 @pytest.mark.parametrize(
     ("images", "more", "error", "says"),
     [
