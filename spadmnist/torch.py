@@ -199,6 +199,7 @@ class Stream(IterableDataset[Any]):
         self._method = method
         self._epoch = _Shared()
         self._done, self._goes_on = 0, False
+        self._cuts = part.cuts(_PIECE)
         if kind == "events":
             _ = part.tr
         elif kind == "fluxes":
@@ -227,23 +228,35 @@ class Stream(IterableDataset[Any]):
         workers, worker = (1, 0) if info is None else (info.num_workers, info.id)
         return self.rank * workers + worker, self.world * workers
 
-    def state_dict(self) -> dict[str, int]:
-        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
+    def _made_of(self) -> dict[str, Any]:
+        """All that the order of the items, and what they are, depends on, but for the epoch."""
         consumer, consumers = self._share()
         return {
+            "kind": self.kind,
+            "method": self._method,
+            "length": len(self.part),
+            "shards": hashlib.sha256(repr(self._cuts).encode()).hexdigest()[:16],
+            "buffer": self.buffer,
             "seed": self.seed,
-            "epoch": self._epoch.value,
-            "done": self._done,
             "consumer": consumer,
             "consumers": consumers,
         }
 
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on where `state` was taken. Raises SpadError where it is of another seed, worker or rank."""
-        own = self.state_dict()
-        for name in ("seed", "consumer", "consumers"):
-            if state.get(name) != own[name]:
-                raise SpadError(f"the state is of {name} {state.get(name)}, but this stream has {own[name]}")
+    def state_dict(self) -> dict[str, Any]:
+        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
+        return {**self._made_of(), "epoch": self._epoch.value, "done": self._done}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken. Raises SpadError where it is of another stream, worker or rank."""
+        own = self._made_of()
+        if missing := [name for name in (*own, "epoch", "done") if name not in state]:
+            raise SpadError(f"the state says no {missing[0]}; give one that state_dict of this version returned")
+        for name, value in own.items():
+            if state[name] != value:
+                raise SpadError(
+                    f"the state is of {name} {state[name]}, but this stream has {value}; make the stream as the one "
+                    "that the state is of, or begin anew"
+                )
         self._epoch.value, self._done, self._goes_on = int(state["epoch"]), int(state["done"]), True
 
     def _pieces(self) -> list[tuple[int, int]]:
@@ -252,7 +265,7 @@ class Stream(IterableDataset[Any]):
         The shards follow one another in an order of chance, and each consumer has an equal share of their images.
         """
         consumer, consumers = self._share()
-        cuts = self.part.cuts(_PIECE)
+        cuts = self._cuts
         order = self._random("order").permutation(len(cuts) - 1)
         total = len(self.part)
         low, high = consumer * total // consumers, (consumer + 1) * total // consumers

@@ -146,6 +146,36 @@ def test_workers_give_the_same(part: spadmnist.Part, method: str, persistent: bo
                 assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
+class Mine(torch.utils.data.Dataset[Any]):
+    """A set of somebody's that holds a whole dataset."""
+
+    def __init__(self, held: spadmnist.Dataset):
+        self.held = held
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, i: int) -> Any:
+        return torch.from_numpy(self.held["30 lux", "train"].reconstruction["counts"][i])
+
+
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_a_dataset_in_a_set_of_ones_own(folder: Path, part: spadmnist.Part, method: str) -> None:
+    for place in ("out", "lab.yaml"):
+        loader = DataLoader(Mine(spadmnist.open(folder / place)), num_workers=1, multiprocessing_context=method)
+        for i, item in enumerate(loader):
+            assert np.array_equal(item[0].numpy(), part.reconstruction["counts"][i])
+
+
+def test_tensors_choose_images(part: spadmnist.Part) -> None:
+    for index in (torch.tensor([3, 1, 2]), torch.tensor([5]), torch.arange(N) % 23 == 2):
+        assert np.array_equal(part.images[index], part.images[index.numpy()])
+    assert np.array_equal(part.images[torch.tensor(3)], part.images[3])
+    for wrong in (torch.tensor([1.5, 2.0]), torch.tensor(1.5), torch.zeros((2, 2), dtype=torch.int64)):
+        with pytest.raises(IndexError, match="images are chosen by a number"):
+            part.images[wrong]
+
+
 def test_a_worker_is_sent_kilobytes(folder: Path, part: spadmnist.Part) -> None:
     simulated = spadmnist.open(folder / "lab.yaml")["30 lux", "train"]
     for one in (part, simulated, spadmnist.concatenate([part, part])):
@@ -209,6 +239,17 @@ def test_frames_of_events_are_the_counts(part: spadmnist.Part) -> None:
     events = part.tr[7]
     for transform in (st.ToFrames((28, 28), 10, 30e-6), st.ToVoxelGrid((28, 28), 10, 30e-6)):
         assert np.allclose(transform(events).sum(0).ravel(), events.counts, atol=1e-3)
+
+
+@pytest.mark.parametrize("make", [st.ToFrames, st.ToVoxelGrid, lambda s, n, e: st.ToTimeSurface(s, 1.0, e, n)])
+def test_events_beyond_the_exposure_are_a_mistake(part: spadmnist.Part, make: Any) -> None:
+    """Of an exposure that is too short by its unit no bin would tell; a stamp at its end, rounded, is none."""
+    with pytest.raises(SpadError, match=r"exposure: 3e-06 s is not that of the events, which lie between .* s and "):
+        make((28, 28), 5, 3e-6)(part.tr[7])
+    with pytest.raises(SpadError, match="give the time that was recorded"):
+        make((1, 2), 5, 1.0)(by_hand([[-0.1, 0.5], []]))
+    assert make((1, 2), 5, 1.0)(by_hand([[np.nextafter(1.0, 2.0)], []])).shape == (5, 1, 2)
+    assert not make((1, 2), 5, 1.0)(by_hand([[], []])).any()
 
 
 def test_structured_events(part: spadmnist.Part) -> None:
@@ -323,6 +364,27 @@ def test_a_stream_goes_on_where_it_stopped(part: spadmnist.Part, after: int) -> 
     assert [known[item[0].numpy().tobytes()] for item, _ in other] == whole  # the pass after it is whole
     with pytest.raises(SpadError, match="of seed 5, but this stream has 6"):
         st.stream(part, "fluxes", seed=6).load_state_dict(state)
+
+
+def test_a_state_is_of_one_stream(part: spadmnist.Part) -> None:
+    """Nothing that changes the order, or what the items are, passes for the same."""
+    made = st.stream(part, "fluxes", seed=5)
+    state = dict(itertools.islice(((k, made.state_dict()) for k, _ in enumerate(made)), 12))[11]
+    assert state["done"] == 12
+    half = part[: N // 2]
+    for other, name in (
+        (st.stream(part, "fluxes", seed=5, buffer=1), "buffer 4, but this stream has 1"),
+        (st.stream(half, "fluxes", seed=5), f"length {N}, but this stream has {N // 2}"),
+        (st.stream(part, "events", seed=5), "kind fluxes, but this stream has events"),
+        (st.stream(part, "fluxes", "passive_free_running", seed=5), "method counts, but this stream has passive"),
+        (st.stream(part[::-1], "fluxes", seed=5), "shards"),
+        (st.stream(part, "fluxes", seed=5, rank=0, world=2), "consumers 1, but this stream has 2"),
+    ):
+        with pytest.raises(SpadError, match=f"the state is of {name}.*; make the stream as"):
+            other.load_state_dict(state)
+    del state["buffer"]
+    with pytest.raises(SpadError, match="the state says no buffer"):
+        made.load_state_dict(state)
 
 
 def test_a_stream_of_several_levels_and_of_a_config(dataset: spadmnist.Dataset, folder: Path) -> None:
