@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, overload
@@ -385,6 +386,22 @@ class Dataset:
         """Number of light levels."""
         return len(self._levels)
 
+    def keys(self) -> tuple[str, ...]:
+        """The light levels, as a mapping has them: `levels`."""
+        return self.levels
+
+    def __iter__(self) -> Iterator[str]:
+        """The light levels, as written in the config."""
+        return iter(self.levels)
+
+    def __contains__(self, key: object) -> bool:
+        """Is there a light level, or a split at a light level (`("5 mlux", "train")`)?"""
+        level, split = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
+        try:
+            return isinstance(level, str) and bool(level_of(self._levels, level)) and split in (None, *self._splits)
+        except UnknownName:
+            return False
+
     def __repr__(self) -> str:
         sizes = ", ".join(f"{n} {split}" for split, n in self._splits.items())
         return f"Dataset({self._source}: {sizes}; {', '.join(self.levels)})"
@@ -496,26 +513,46 @@ def _joined(arrays: list[np.ndarray]) -> np.ndarray:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
+class _Scene:
+    """An experiment and its images, which another process reads again when it needs them."""
+
+    def __init__(self, experiment: Experiment, images_dir: Path | None):
+        self.experiment = experiment
+        self._images_dir = images_dir
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the images."""
+        return {key: value for key, value in self.__dict__.items() if key != "splits"}
+
+    @cached_property
+    def splits(self) -> Mapping[str, Images]:
+        return self.experiment.load_images(self._images_dir)
+
+    def part(self, level: Level, split: str) -> Part:
+        """One that is simulated when it is asked for."""
+        one, images = self.experiment, self.splits[split]
+        names = one.sensor.causes if one.causes else ()
+        backend, shape = _Simulated(self, level, split), images.pixels.shape[1:]
+        return Part(one.wanted(images), backend, False, one.readouts, one.methods, shape, names)
+
+
 class _Simulated:
     """A part that is made when it is asked for; the last range is kept."""
 
-    def __init__(
-        self, experiment: Experiment, level: Level, split: str, splits: Mapping[str, Images], images_dir: Path | None
-    ):
-        self._experiment = experiment
+    def __init__(self, scene: _Scene, level: Level, split: str):
+        self._scene = scene
+        self._experiment = scene.experiment
         self._level = level
         self._split = split
-        self._splits = splits
-        self._images_dir = images_dir  # another process reads the images there again
         self._last: tuple[tuple[int, int], Recorded] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the images; with the normalisations where they are known."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_splits", "_last")}
+        """Without what was made last; with the normalisations where they are known."""
+        return {**self.__dict__, "_last": None}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _last=None)
-        self._splits = self._experiment.load_images(self._images_dir)
+    @property
+    def _splits(self) -> Mapping[str, Images]:
+        return self._scene.splits
 
     def _make(self, start: int, stop: int) -> Recorded:
         if self._last is None or self._last[0] != (start, stop):
@@ -728,18 +765,42 @@ def at(path: str | Path, cache: str | Path | None = None) -> Path | Source:
 
 def simulated(experiment: Experiment, images_dir: Path | None = None) -> Dataset:
     """The dataset of an experiment, made on demand."""
-    splits = experiment.load_images(images_dir)
-    any_split = next(iter(splits.values()))
-    shape = any_split.pixels.shape[1:]
+    scene = _Scene(experiment, images_dir)
+    sizes = {split: experiment.wanted(images) for split, images in scene.splits.items()}
+    return Dataset(experiment.levels, sizes, scene.part, experiment.name)
 
-    def part(level: Level, split: str) -> Part:
-        backend = _Simulated(experiment, level, split, splits, images_dir)
-        length = experiment.wanted(splits[split])
-        names = experiment.sensor.causes if experiment.causes else ()
-        return Part(length, backend, False, experiment.readouts, experiment.methods, shape, names)
 
-    sizes = {split: experiment.wanted(images) for split, images in splits.items()}
-    return Dataset(experiment.levels, sizes, part, experiment.name)
+@dataclass(frozen=True)
+class _Store:
+    """A finished dataset, of which only the manifest was read."""
+
+    root: Path | Source
+    manifest: Mapping[str, Any]
+    shards: Sequence[Shard]
+    encoding: Encoding
+    files: Mapping[str, Files]
+    like: Likeness
+    made: OnReading | None
+
+    def part(self, level: Level, split: str) -> Part:
+        """One that is read when it is asked for."""
+        mine = [s for s in self.shards if s.level == level.text and s.split == split]
+        originals = [s for s in self.shards if s.level is None and s.split == split]
+        manifest, like, shape = self.manifest, self.like, self.like.shape
+        of_split = manifest["images"]["splits"][split]
+        facts = {
+            "shape": shape,
+            "pixels": int(np.prod(shape)),
+            "tick": like.tick,
+            "frames": like.frames,
+            "frame_time": manifest["settings"]["frame_time"],
+            "normalisation": manifest["normalisation"][level.text],
+            "tiles": of_split.get("tiles"),
+            "size": shape[-2:],
+        }
+        backend = _Stored(self.root, self.encoding, mine, originals, self.files, like, facts, self.made)
+        readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
+        return Part(of_split["images"], backend, True, readouts, methods, shape, manifest.get("causes", ()))
 
 
 def stored(root: Path | Source) -> Dataset:
@@ -748,31 +809,12 @@ def stored(root: Path | Source) -> Dataset:
     levels = [Level(x["text"], x["kind"], x["value"]) for x in manifest["levels"]]
     shards = [Shard(**x) for x in manifest["shards"]]
     like = Likeness.of(manifest)
-    shape, encoding = like.shape, encoding_in(manifest, root)
-    files = files_by_shard(manifest["files"], encoding)
-    facts = {
-        "shape": shape,
-        "pixels": int(np.prod(shape)),
-        "tick": like.tick,
-        "frames": like.frames,
-        "frame_time": manifest["settings"]["frame_time"],
-    }
-
-    made = _on_reading(root, manifest, like)
-
-    def part(level: Level, split: str) -> Part:
-        mine = [s for s in shards if s.level == level.text and s.split == split]
-        originals = [s for s in shards if s.level is None and s.split == split]
-        own = {**facts, "normalisation": manifest["normalisation"][level.text]}
-        own |= {"tiles": manifest["images"]["splits"][split].get("tiles"), "size": shape[-2:]}
-        backend = _Stored(root, encoding, mine, originals, files, like, own, made)
-        readouts, methods = manifest["config"]["recording"]["readouts"], manifest["config"]["reconstruct"]
-        length = manifest["images"]["splits"][split]["images"]
-        return Part(length, backend, True, readouts, methods, shape, manifest.get("causes", ()))
-
+    encoding = encoding_in(manifest, root)
+    files, made = files_by_shard(manifest["files"], encoding), _on_reading(root, manifest, like)
+    store = _Store(root, manifest, shards, encoding, files, like, made)
     order = dict.fromkeys(shard.split for shard in shards)
     sizes = {split: manifest["images"]["splits"][split]["images"] for split in order}
-    return Dataset(levels, sizes, part, str(root))
+    return Dataset(levels, sizes, store.part, str(root))
 
 
 def _on_reading(root: Path | Source, manifest: Mapping[str, Any], like: Likeness) -> OnReading | None:

@@ -15,22 +15,31 @@ from .readout import Frames
 # them is unpacked with it anyway
 _NEAR = 32
 
+_CHOSEN_BY = "images are chosen by a number, a slice, a list or array of numbers, or a mask"
+
 
 def indices_of(index: Any, length: int) -> int | range | np.ndarray:
-    """What an index means among `length` images: a number, a range (of a slice), or (n,) int64 (of a list or array).
+    """What an index means among `length` images: a number, a range (of a slice), or (n,) int64 (of several numbers).
 
+    Several are a list, or an array or tensor of one axis.
     Negative numbers count from the end; a mask is (length,) bool. Raises IndexError with a sentence.
     """
     if isinstance(index, slice):
         return range(*index.indices(length))
     if isinstance(index, range):
         index = np.arange(index.start, index.stop, index.step)
-    if not isinstance(index, Sequence | np.ndarray) and hasattr(index, "__index__"):
-        one = operator.index(index)
+    if not isinstance(index, Sequence | np.ndarray) and hasattr(index, "__index__") and not getattr(index, "ndim", 0):
+        try:
+            one = operator.index(index)
+        except TypeError:  # a tensor of one number that is not whole
+            raise IndexError(_CHOSEN_BY) from None
         if not -length <= one < length:
             raise IndexError(f"image {one} was asked for; there are {length}")
         return one % length
-    found = np.asarray(index)
+    try:
+        found = np.asarray(index)
+    except (TypeError, ValueError):  # a ragged list, or a tensor that lies elsewhere than in memory
+        raise IndexError(_CHOSEN_BY) from None
     if found.ndim == 0 and found.dtype.kind in "iu":
         return indices_of(int(found), length)
     if found.ndim == 1 and found.dtype == bool:
@@ -38,11 +47,11 @@ def indices_of(index: Any, length: int) -> int | range | np.ndarray:
             raise IndexError(f"a mask of {len(found)} was given for {length} images; give one value for each")
         return np.flatnonzero(found)
     if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
-        raise IndexError("images are chosen by a number, a slice, a list or array of numbers, or a mask")
-    found = found.astype(np.int64)
+        raise IndexError(_CHOSEN_BY)
     outside = found[(found < -length) | (found >= length)]
     if len(outside):
         raise IndexError(f"image {outside[0]} was asked for; there are {length}")
+    found = found.astype(np.int64)  # only now: the largest of uint64 would be the last image
     return np.where(found < 0, found + length, found)
 
 

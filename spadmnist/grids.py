@@ -12,6 +12,8 @@ from .events import Events
 
 __all__ = ["Frames", "TimeSurface", "VoxelGrid", "structured"]
 
+_ROUNDING = 1e-9  # of the exposure: how far beyond it a stamp may lie that was rounded
+
 _jit = njit(cache=True, error_model="numpy", nogil=True)
 
 
@@ -20,7 +22,7 @@ class Grid:
 
     shape: of an image, (rows, columns), or (channels, rows, columns); exposure: s, from 0 on. Called with `Events` it
     returns (bins, rows, columns) of one image, with leading axes for several images and for channels. Raises SpadError
-    where the events are of another number of pixels.
+    where the events are of another number of pixels, or do not lie within the exposure.
     """
 
     def __init__(self, shape: Sequence[int], bins: int, exposure: float):
@@ -42,6 +44,13 @@ class Grid:
             raise SpadError(
                 f"shape: {self.shape} has {pixels} pixels, but the events are of images of {events.pixels}; correct it"
             )
+        if len(events.times):
+            first, last = float(events.times.min()), float(events.times.max())
+            if not (first >= 0 and last <= self.exposure * (1 + _ROUNDING)):
+                raise SpadError(
+                    f"exposure: {self.exposure:g} s is not that of the events, which lie between {first:g} s and "
+                    f"{last:g} s; give the time that was recorded"
+                )
         rows = len(events.offsets) - 1
         out = np.zeros((rows, self.bins), np.float32)
         self._into(events.offsets, events.times, out)
@@ -62,7 +71,8 @@ class Frames(Grid):
     for channels.
 
     Raises:
-        SpadError: for a shape, number or time that is none, and where the events are of another number of pixels.
+        SpadError: for a shape, number or time that is none, and where the events are of another number of pixels, or
+            do not lie within the exposure.
     """
 
     def __init__(self, shape: Sequence[int], frames: int, exposure: float, binary: bool = False):

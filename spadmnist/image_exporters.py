@@ -12,7 +12,7 @@ import itertools
 import json
 import tarfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -22,6 +22,7 @@ import numpy as np
 from . import dataset, disk, document, manifest_file, packing, units
 from .dataset import Part
 from .errors import SpadError
+from .events import Events
 from .experiment import Level, level_of
 from .factory import Progress
 from .plugins import discover
@@ -111,6 +112,7 @@ class Block:
                 steps = packing.row_differences(events.ticks, events.offsets)
                 about = "TR: of each pixel, as many as `counts` says, its first stamp and then the steps to the next"
                 yield Column("ticks", steps, about, units.show(events.tick, "s", 12), starts)
+            yield from self._causes(events, "TR: of each stamp", "")
         if {"str", "qis"} & set(self.readouts):
             frames = part.frames[these]
             bits = frames.bits.reshape(n, *part.shape, -1)
@@ -122,8 +124,21 @@ class Block:
                     yield Column("first_times", first.times, about, "s", starts)
                 else:
                     yield Column("first_ticks", first.ticks, about, units.show(first.tick, "s", 12), starts)
+            yield from self._causes(frames.detections, "QIS, STR: for each bit that is set", "first_")
         if "counts" in self.readouts:
             yield Column("count_frames", part.counts[these], "count frames")
+
+    def _causes(self, events: Events, each: str, prefix: str) -> Iterator[Column]:
+        """What made each detection, where that was asked for; parents count from the start of their image."""
+        if events.cause is None or events.parent is None:
+            return
+        starts = events.image_offsets
+        names = ", ".join(f"{i} {name}" for i, name in enumerate(self.part.causes))
+        yield Column(f"{prefix}cause", events.cause, f"{each}, what made it: {names}", "1", starts)
+        before = np.repeat(starts[:-1], np.diff(starts))
+        parent = np.where(events.parent >= 0, events.parent - before, events.parent).astype(np.int32)
+        about = f"{each}, the number of the one in its image that caused it; -1: none, -2: one that was not recorded"
+        yield Column(f"{prefix}parent", parent, about, "1", starts)
 
 
 @dataclass(frozen=True)
@@ -186,6 +201,11 @@ def is_of_images(path: Path, format: str, choice: Choice) -> bool:
     return source not in ("uniform", "chart")
 
 
+def has_causes(path: Path) -> bool:
+    """Does a dataset say of its detections what made them? False of what is no dataset."""
+    return (path / manifest_file.MANIFEST).is_file() and bool(manifest_file.intact_manifest(path).get("causes"))
+
+
 class ImageTarget:
     """Writes one kind of file. name: what `--format` calls it; suffix: of its files."""
 
@@ -193,6 +213,7 @@ class ImageTarget:
     name: ClassVar[str]
     suffix: ClassVar[str]
     opened_by: ClassVar[str]  # in Python
+    of_fluxes: ClassVar[bool] = False  # alone: neither streams nor what made their detections
 
     def __init_subclass__(cls) -> None:
         ImageTarget.every[cls.name] = cls
@@ -222,12 +243,17 @@ def export(root: Path, out: Path, format: str, choice: Choice, progress: Progres
 
     The folder is there as a whole or not at all. Raises SpadError with a sentence.
     """
-    target, found = ImageTarget.every[format], chosen(root, choice)
+    target, one_file = ImageTarget.every[format], out.suffix.lower() == Npz.suffix and format == Npz.name
+    if not one_file and out.suffix.lower() in {known.suffix for known in ImageTarget.every.values()}:
+        raise SpadError(
+            f"{out}: {format} is a folder with a file for each shard; name it, for example -o {out.with_suffix('')}"
+        )
+    found = chosen(root, choice)
     target.check(found)
     progress = progress or Progress()
     progress.start("exporting", sum(block.stop - block.start for block in found.blocks), 0.0)
     size = sum(facts["bytes"] for facts in found.manifest["files"].values())
-    if target is Npz and out.suffix.lower() == Npz.suffix:
+    if one_file:
         paths = [_one_file(found, out, size)]
     else:
         with disk.whole_folder(out, size) as folder:
@@ -359,6 +385,7 @@ class Png(ImageTarget):
     name = "png"
     suffix = ".png"
     opened_by = "PIL.Image.open(FILE)"
+    of_fluxes = True
 
     @classmethod
     def check(cls, found: Chosen) -> None:
@@ -435,6 +462,10 @@ class Parquet(ImageTarget):
             fields.append(pa.field(column.name, array.type, metadata=about))
             if column.starts is not None:
                 split[f"{column.name}.list.element"] = "BYTE_STREAM_SPLIT"
+        if block.part.labels is None and _labelled(found).part.labels is not None:
+            # all splits have the same columns, as a hub's loader wants them: behind the number
+            arrays.insert(1, pa.nulls(block.stop - block.start, pa.uint8()))
+            fields.insert(1, pa.field("label", pa.uint8(), metadata={"about": "label: none in this split"}))
         few = [f"{c.name}.list.element" if c.values.ndim > 1 else c.name for c in columns if c.starts is None]
         # how a hub is told that bytes are a picture
         known = {"spadmnist": json.dumps(found.facts)}
@@ -450,10 +481,15 @@ class Parquet(ImageTarget):
         """The files, then what describes them."""
         super().write(found, folder, progress)
         names = [f"{block.path}{cls.suffix}" for block in found.blocks]
-        columns = found.blocks[0].columns()
+        columns = _labelled(found).columns()
         (folder / "README.md").write_text(_card(found, columns))
         described = _croissant(found, columns, {name: folder / name for name in names})
         (folder / "croissant.json").write_text(json.dumps(described, indent=1) + "\n")
+
+
+def _labelled(found: Chosen) -> Block:
+    """A block with all columns that there are: labels may be those of one split alone."""
+    return next((block for block in found.blocks if block.part.labels is not None), found.blocks[0])
 
 
 def _is_picture(columns: Sequence[Column]) -> bool:
@@ -505,7 +541,6 @@ def _card(found: Chosen, columns: Sequence[Column]) -> str:
             head += [f"  - split: {split}", f"    path: {level}/{split}/*.parquet"]
     shape = " x ".join(map(str, found.manifest["images"]["shape"]))
     table = [f"| `{c.name}` | {c.unit} | {c.about} |" for c in columns]
-    facts = {"shape": list(found.manifest["images"]["shape"]), **found.facts}
     lines = [
         *head,
         "---",
@@ -519,28 +554,7 @@ def _card(found: Chosen, columns: Sequence[Column]) -> str:
         "| --- | --- | --- |",
         *table,
         "",
-        "A row, taken apart:",
-        "",
-        "```python",
-        "import numpy as np",
-        "",
-        f"facts = {facts!r}  # s",
-        "",
-        "",
-        "def stamps(row):  # TR: of each pixel its stamps, in ticks",
-        '    each = np.split(np.asarray(row["ticks"]), np.cumsum(row["counts"])[:-1])',
-        "    return [np.cumsum(steps, dtype=np.uint64) for steps in each]",
-        "",
-        "",
-        "def frames(row):  # QIS: (frames, *shape), 0 or 1",
-        '    packed = np.frombuffer(row["bits"], np.uint8).reshape(*facts["shape"], -1)',
-        '    return np.moveaxis(np.unpackbits(packed, axis=-1, count=facts["frames"]), -1, 0)',
-        "",
-        "",
-        "def flux(row, method):",
-        '    return np.asarray(row[f"flux_{method}"], np.float32).reshape(facts["shape"])',
-        "```",
-        "",
+        *_taken_apart(found, {column.name for column in columns}),
         "The config, with nothing left open:",
         "",
         "```yaml",
@@ -548,6 +562,35 @@ def _card(found: Chosen, columns: Sequence[Column]) -> str:
         "```",
     ]
     return "\n".join(lines) + "\n"
+
+
+_TICKS = """\
+def stamps(row):  # TR: of each pixel its stamps, in ticks
+    each = np.split(np.asarray(row["ticks"]), np.cumsum(row["counts"])[:-1])
+    return [np.cumsum(steps, dtype=np.uint64) for steps in each]
+"""
+_TIMES = """\
+def stamps(row):  # TR: of each pixel its stamps, in s
+    return np.split(np.asarray(row["times"]), np.cumsum(row["counts"])[:-1])
+"""
+_BITS = """\
+def frames(row):  # QIS: (frames, *shape), 0 or 1
+    packed = np.frombuffer(row["bits"], np.uint8).reshape(*facts["shape"], -1)
+    return np.moveaxis(np.unpackbits(packed, axis=-1, count=facts["frames"]), -1, 0)
+"""
+_FLUX = """\
+def flux(row, method):
+    return np.asarray(row[f"flux_{method}"], np.float32).reshape(facts["shape"])
+"""
+
+
+def _taken_apart(found: Chosen, columns: Set[str]) -> list[str]:
+    """Lines of Python that make stamps, frames and fluxes of the columns that there are."""
+    facts = {"shape": list(found.manifest["images"]["shape"]), **found.facts}
+    parts = [code for name, code in (("ticks", _TICKS), ("times", _TIMES), ("bits", _BITS)) if name in columns]
+    parts += [_FLUX] if any(name.startswith("flux_") for name in columns) else []
+    code = "\n\n".join([f"import numpy as np\n\nfacts = {facts!r}  # s\n", *parts])
+    return ["A row, taken apart:", "", "```python", code.rstrip("\n"), "```", ""]
 
 
 # what Croissant's words stand for, as its 1.0 prescribes it

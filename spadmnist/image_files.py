@@ -166,7 +166,7 @@ def read_image(path: Path, grey_palettes: bool = True, exif: bool = False) -> tu
                     image.verify()  # PNG's checksums, which decoding leaves out
                 file.seek(0)
                 with Image.open(file, formats=_FORMATS) as image:
-                    return _to_pixels(image, path, grey_palettes, exif)
+                    return pixels_of(image, path, grey_palettes, exif)
         except InputError:
             raise
         except UnidentifiedImageError as error:
@@ -183,21 +183,24 @@ def read_image(path: Path, grey_palettes: bool = True, exif: bool = False) -> tu
             ) from error
 
 
-def _to_pixels(image: Any, path: Path, grey_palettes: bool, exif: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """What `read_image` returns of an open Pillow image, or InputError where it would not be what the file says."""
+def pixels_of(
+    image: Any, place: object, grey_palettes: bool = True, exif: bool = False, instead: str = "use source array"
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """What `read_image` returns, of a Pillow image; InputError where it would not be what the image says.
+
+    place: the file, or what else the message names; instead: what there is for images of other kinds.
+    """
     from PIL import ImageOps
 
     # an MPO is a photograph with a preview beside it; in all other formats more frames are more images
     if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
-        raise InputError(f"{path}: it holds {image.n_frames} images; store each in a file of its own")
+        raise InputError(f"{place}: it holds {image.n_frames} images; store each in a file of its own")
     mode = image.mode
     # Pillow would quietly drop the lower eight bits
-    deep = not mode.startswith("I") and any(";16" in str(tile) for tile in image.tile)
+    deep = not mode.startswith("I") and any(";16" in str(tile) for tile in getattr(image, "tile", ()))
     if deep or mode not in ("1", "L", "LA", "I", "I;16", "I;16B", "I;16L", "P", "PA", "RGB", "RGBA"):
         kind = "more than 8 bits per channel" if deep else f"pixels of the kind {mode}"
-        raise InputError(
-            f"{path}: it has {kind}; convert it to 8-bit RGB or to 8-bit or 16-bit grey, or use source array"
-        )
+        raise InputError(f"{place}: it has {kind}; convert it to 8-bit RGB or to 8-bit or 16-bit grey, or {instead}")
     if exif:
         image = ImageOps.exif_transpose(image)
     alpha = None
@@ -207,7 +210,7 @@ def _to_pixels(image: Any, path: Path, grey_palettes: bool, exif: bool) -> tuple
     if mode.startswith("I"):
         pixels = np.asarray(image)
         if pixels.min() < 0 or pixels.max() > 65535:
-            raise InputError(f"{path}: its grey levels do not fit into 16 bits; scale them to 0 to 65535")
+            raise InputError(f"{place}: its grey levels do not fit into 16 bits; scale them to 0 to 65535")
         return pixels.astype(np.uint16), alpha
     if mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L")), alpha

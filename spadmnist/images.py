@@ -14,6 +14,7 @@ import sys
 import tempfile
 import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -64,6 +65,7 @@ class Images:
     names        the file of each image, relative to the folder, where the source is a folder
     label_names  the class folder that each label stands for, where the source is a folder with classes
     ignored      how many files of the folder were left out because they are not images
+    beside       how many pictures were left out of each folder that is no split; "" of those in none
     transparent  how many pictures of the folder had transparent parts, which are black
     tiles        where the tiles lie and which images they are, where the images are charts
     """
@@ -76,6 +78,7 @@ class Images:
     ignored: int = 0
     tiles: Tiles | None = None
     transparent: int = 0
+    beside: Mapping[str, int] = field(default_factory=dict)
     _means: dict[int, float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -165,6 +168,8 @@ class Images:
             parts.append(f"{len(np.unique(self.labels))} classes")
         if self.ignored:
             parts.append(f"{self.ignored} files that are not images left out")
+        if self.beside:
+            parts.append(f"{sum(self.beside.values())} images beside the splits left out")
         return ", ".join(parts)
 
 
@@ -177,11 +182,15 @@ def notes(splits: Mapping[str, Images]) -> list[str]:
     Nothing of other sources.
     """
     said = []
-    first = next(iter(splits.values()))
-    if first.label_names:
-        named = ", ".join(f"{i} {name}" for i, name in enumerate(first.label_names[:_NAMED]))
-        more = len(first.label_names) - _NAMED
+    classes = next((part.label_names for part in splits.values() if part.label_names), None)
+    if classes:
+        named = ", ".join(f"{i} {name}" for i, name in enumerate(classes[:_NAMED]))
+        more = len(classes) - _NAMED
         said.append(f"the labels are the class folders: {named}{f' and {more} more' if more > 0 else ''}")
+        bare = [split for split, part in splits.items() if part.labels is None]
+        said += [f"the {split} images lie in no class folders, and have no labels" for split in bare]
+    for part in splits.values():
+        said += [_left_out(place, count) for place, count in part.beside.items()]
     if ignored := sum(part.ignored for part in splits.values()):
         held = "1 file of the folder is no image and is" if ignored == 1 else f"{ignored:,} files are no images and are"
         said.append(f"{held} left out")
@@ -189,6 +198,14 @@ def notes(splits: Mapping[str, Images]) -> list[str]:
         shown = "1 picture has" if transparent == 1 else f"{transparent:,} pictures have"
         said.append(f"{shown} transparent parts, which are black")
     return said
+
+
+def _left_out(place: str, count: int) -> str:
+    """A note on pictures beside the splits."""
+    held = "1 picture is" if count == 1 else f"{count:,} pictures are"
+    if not place:
+        return f"{held} in no folder of a split, beside train/ and test/, and left out"
+    return f"{held} in {place}/, which is neither train nor test, and left out"
 
 
 def check_size(images: dict[str, Images], shape: tuple[int, int], place: str) -> None:
@@ -231,7 +248,7 @@ class _Source(Section):
         """The splits, "train" first, then "test" where there is one; a single split is "train".
 
         shape       (rows, columns) of the sensor's layout; only `uniform` makes its images by it
-        images_dir  the folder given on the command line, where image files are looked for
+        images_dir  the folder given on the command line, where image files are looked for, or a folder of pictures
         base        the folder of the config file, to which relative paths in it refer
         limit       only the first images of each split
 
@@ -242,6 +259,10 @@ class _Source(Section):
         try:
             if images_dir is not None and not images_dir.is_dir():
                 raise InputError(f"{images_dir}: there is no such folder; correct --images-dir")
+            if images_dir is not None and self.drawn() is not None:
+                raise InputError(
+                    f"--images-dir {images_dir}: {self.describe()} are made here, and no folder is read; leave it out"
+                )
             least = None if limit is None else -(-limit // self.repetitions)
             splits = self._read(shape, images_dir, base, least)
             self._check_room(splits)
@@ -297,18 +318,36 @@ def _data_dir() -> Path | None:
     return Path(value)
 
 
-def _find(path: str, folders: Sequence[Path | None], exists: Callable[[Path], bool]) -> Path:
-    """`path` in the first of the folders that has it; an absolute path stands for itself."""
-    places = list(dict.fromkeys(folder / path for folder in folders if folder is not None))
+def _find(path: str, images_dir: Path | None, folders: Sequence[Path | None]) -> Path:
+    """The file `path` of a config: in `images_dir` where that is given, else in the first of the folders that has it.
+
+    An absolute path stands for itself; where `images_dir` is given the file of its name is looked for there.
+    """
+    if images_dir is not None:
+        places = [images_dir / (Path(path).name if Path(path).is_absolute() else path)]
+    else:
+        places = list(dict.fromkeys(folder / path for folder in folders if folder is not None))
+    return _first("file", places, Path.is_file)
+
+
+def _first(what: str, places: Sequence[Path], exists: Callable[[Path], bool]) -> Path:
+    """The first of the places that is there."""
     for place in places:
         if exists(place):
             return place
-    what = "folder" if exists is Path.is_dir else "file"
     tried = " and no ".join(str(place) for place in places)
     raise InputError(
         f"scene.images: there is no {what} {tried}; "
         "a relative path refers to --images-dir or, without it, to the folder of the config"
     )
+
+
+def _find_folder(path: str, images_dir: Path | None, base: Path) -> Path:
+    """The folder `path` of a config; where `images_dir` is given the one in it of that relative path, or itself."""
+    if images_dir is None:
+        return _first("folder", [base / path], Path.is_dir)
+    inner = images_dir if Path(path).is_absolute() else images_dir / path
+    return inner if inner.is_dir() else images_dir
 
 
 # --- IDX files -------------------------------------------------------------------------------------------
@@ -327,7 +366,8 @@ def _labelled(images: np.ndarray, labels: np.ndarray | None, white: float, files
 class Idx(_Source):
     """IDX files as MNIST and its relatives use them, packed by gzip or not.
 
-    Relative paths refer to --images-dir; without it to SPADMNIST_DATA, then to the folder of the config.
+    Relative paths refer to --images-dir; without it to SPADMNIST_DATA, then to the folder of the config. With
+    --images-dir the files of absolute paths are looked for there by their names.
     """
 
     source: Literal["idx"] = "idx"
@@ -345,7 +385,7 @@ class Idx(_Source):
     ) -> dict[str, Images]:
         if self.test_labels and not self.test_images:
             raise InputError(f"scene.images.test_labels: {self.test_labels} labels nothing; give test_images too")
-        folders = [images_dir] if images_dir is not None else [_data_dir(), base]
+        folders = [] if images_dir is not None else [_data_dir(), base]
         splits = {}
         for split, images_name, labels_name in (
             ("train", self.train_images, self.train_labels),
@@ -353,8 +393,8 @@ class Idx(_Source):
         ):
             if images_name is None:
                 continue
-            images_file = _find(images_name, folders, Path.is_file)
-            labels_file = _find(labels_name, folders, Path.is_file) if labels_name else None
+            images_file = _find(images_name, images_dir, folders)
+            labels_file = _find(labels_name, images_dir, folders) if labels_name else None
             images = read_idx(images_file, 3)
             labels = read_idx(labels_file, 1) if labels_file else None
             part = _labelled(images, labels, 255.0, (images_file, labels_file)).head(limit)
@@ -540,7 +580,8 @@ class Folder(_Source):
     Pixel values are taken for light as they are stored, unless `gamma: srgb` takes them back to light: half of white
     is then 21 % of its photons, not 50 %. Transparent parts are black. EXIF orientation is ignored without `exif`,
     colour profiles always. Pictures with palettes (GIF, some PNG) are grey where none of the folder has a colour.
-    A relative path refers to --images-dir or, without it, to the folder of the config.
+    A relative path refers to the folder of the config. --images-dir stands for the path: it is the folder, or the one
+    that a relative path refers to.
     """
 
     source: Literal["folder"] = "folder"
@@ -578,7 +619,7 @@ class Folder(_Source):
     def _read(
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
-        root = _find(self.path, [images_dir if images_dir is not None else base], Path.is_dir)
+        root = _find_folder(self.path, images_dir, base)
         names, ignored = pictures_in(root)
         prefixes = {split: f"{split}/" for split in ("train", "test") if (root / split).is_dir()}
         if list(prefixes) == ["test"]:
@@ -587,7 +628,9 @@ class Folder(_Source):
             )
         prefixes = prefixes or {"train": ""}
         files = {split: [name for name in names if name.startswith(p)] for split, p in prefixes.items()}
-        ignored += len(names) - sum(map(len, files.values()))
+        taken = {name for part in files.values() for name in part}
+        folders = (PurePosixPath(name).parts[:-1] for name in names if name not in taken)
+        beside = dict(Counter(parts[0] if parts else "" for parts in folders))
         classes = {split: _classes(root, prefixes[split], part) for split, part in files.items()}
         label_names = sorted({name for part in classes.values() if part for name in part})
         if len(label_names) > 256:
@@ -612,6 +655,7 @@ class Folder(_Source):
                 None if of_part is None else tuple(label_names),
                 ignored if split == "train" else 0,
                 transparent=transparent,
+                beside=beside if split == "train" else {},
             )
         return splits
 
@@ -758,7 +802,8 @@ class Array(_Source):
 
     Images are (n, rows, columns) or (n, channels, rows, columns). The names in an `.npz` are train_images,
     train_labels, test_images, test_labels, or x_train, y_train, x_test, y_test, or images and labels.
-    A relative path refers to --images-dir or, without it, to the folder of the config.
+    A relative path refers to --images-dir or, without it, to the folder of the config. With --images-dir the file of
+    an absolute path is looked for there by its name.
     """
 
     source: Literal["array"] = "array"
@@ -775,7 +820,7 @@ class Array(_Source):
     def _read(
         self, shape: tuple[int, int], images_dir: Path | None, base: Path, limit: int | None
     ) -> dict[str, Images]:
-        path = _find(self.path, [images_dir if images_dir is not None else base], Path.is_file)
+        path = _find(self.path, images_dir, [base])
         with disk.opened(path) as file:
             head = file.read(image_files.HEAD)
             file.seek(0)

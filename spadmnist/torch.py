@@ -30,8 +30,10 @@ from .dataset import Part
 from .errors import SpadError
 from .events import Events as EventBatch
 from .experiment import Experiment, Level
-from .gather import join
+from .gather import indices_of, join
 from .grids import structured
+from .image_files import pixels_of
+from .photos import Making
 from .readout import READOUTS
 from .sensor import Sensor
 
@@ -57,7 +59,7 @@ class _Set(Dataset[Any]):
         raise TypeError(f"{type(self).__name__} must define _read")
 
     def __getitems__(self, indices: Sequence[int]) -> list[tuple[Any, int]]:
-        chosen = np.asarray(indices, np.int64)
+        chosen = np.asarray(indices_of(indices, len(self)))
         return list(zip(self._read(chosen), _labels(self.part, chosen), strict=True))
 
     def __getitem__(self, index: int) -> tuple[Any, int]:
@@ -197,6 +199,7 @@ class Stream(IterableDataset[Any]):
         self._method = method
         self._epoch = _Shared()
         self._done, self._goes_on = 0, False
+        self._cuts = part.cuts(_PIECE)
         if kind == "events":
             _ = part.tr
         elif kind == "fluxes":
@@ -225,23 +228,35 @@ class Stream(IterableDataset[Any]):
         workers, worker = (1, 0) if info is None else (info.num_workers, info.id)
         return self.rank * workers + worker, self.world * workers
 
-    def state_dict(self) -> dict[str, int]:
-        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
+    def _made_of(self) -> dict[str, Any]:
+        """All that the order of the items, and what they are, depends on, but for the epoch."""
         consumer, consumers = self._share()
         return {
+            "kind": self.kind,
+            "method": self._method,
+            "length": len(self.part),
+            "shards": hashlib.sha256(repr(self._cuts).encode()).hexdigest()[:16],
+            "buffer": self.buffer,
             "seed": self.seed,
-            "epoch": self._epoch.value,
-            "done": self._done,
             "consumer": consumer,
             "consumers": consumers,
         }
 
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on where `state` was taken. Raises SpadError where it is of another seed, worker or rank."""
-        own = self.state_dict()
-        for name in ("seed", "consumer", "consumers"):
-            if state.get(name) != own[name]:
-                raise SpadError(f"the state is of {name} {state.get(name)}, but this stream has {own[name]}")
+    def state_dict(self) -> dict[str, Any]:
+        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
+        return {**self._made_of(), "epoch": self._epoch.value, "done": self._done}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken. Raises SpadError where it is of another stream, worker or rank."""
+        own = self._made_of()
+        if missing := [name for name in (*own, "epoch", "done") if name not in state]:
+            raise SpadError(f"the state says no {missing[0]}; give one that state_dict of this version returned")
+        for name, value in own.items():
+            if state[name] != value:
+                raise SpadError(
+                    f"the state is of {name} {state[name]}, but this stream has {value}; make the stream as the one "
+                    "that the state is of, or begin anew"
+                )
         self._epoch.value, self._done, self._goes_on = int(state["epoch"]), int(state["done"]), True
 
     def _pieces(self) -> list[tuple[int, int]]:
@@ -250,7 +265,7 @@ class Stream(IterableDataset[Any]):
         The shards follow one another in an order of chance, and each consumer has an equal share of their images.
         """
         consumer, consumers = self._share()
-        cuts = self.part.cuts(_PIECE)
+        cuts = self._cuts
         order = self._random("order").permutation(len(cuts) - 1)
         total = len(self.part)
         low, high = consumer * total // consumers, (consumer + 1) * total // consumers
@@ -481,7 +496,8 @@ class Simulated(Dataset[Any]):
 
     Args:
         images: items of an image, or of (image, label): PIL images, arrays or tensors of (rows, columns), (channels,
-            rows, columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1.
+            rows, columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1. PIL images are read
+            as a folder's pictures are: palettes are their colours, what is transparent is black.
         sensor: as `read_sensor` gives it.
         recording: a mapping, as in a config.
         lux: a level (lux, or as "5 mlux"), or (low, high): then each image has a level of its own in each epoch, drawn
@@ -542,10 +558,7 @@ class Simulated(Dataset[Any]):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[tuple[Any, int]]:
-        chosen = np.asarray(indices, np.int64)
-        outside = chosen[(chosen < 0) | (chosen >= len(self))]
-        if len(outside):
-            raise IndexError(f"image {outside[0]} was asked for; there are {len(self)}")
+        chosen = np.asarray(indices_of(indices, len(self)))
         epoch = self._epoch.value
         again = [int(i) for i in chosen if self._seen[int(i)]]
         if again or len(set(chosen.tolist())) < len(chosen):
@@ -566,26 +579,33 @@ class Simulated(Dataset[Any]):
 
     def _simulated(self, numbers: np.ndarray, wanted: np.ndarray, epoch: int) -> list[tuple[Any, int]]:
         """The items `wanted` of the images `numbers`, which are simulated together."""
-        shown = [_image(self.images[int(i)]) for i in numbers]
-        pixels, white = np.stack([image for image, _, _ in shown]), shown[0][1]
-        layout = self.experiment.sensor.layout
-        if pixels.shape[-2:] != layout.shape:
-            size = " x ".join(map(str, pixels.shape[-2:]))
-            raise SpadError(
-                f"the images are {size} pixels, but the sensor {layout.rows} x {layout.columns}; resize them"
-            )
+        shown = [_image(self.images[int(i)], f"image {i}") for i in numbers]
+        layout, first = self.experiment.sensor.layout, shown[0].pixels
+        for i, one in zip(numbers, shown, strict=True):
+            if one.pixels.shape[-2:] != layout.shape:
+                size = " x ".join(map(str, one.pixels.shape[-2:]))
+                raise SpadError(
+                    f"the images are {size} pixels, but the sensor {layout.rows} x {layout.columns}; resize them"
+                )
+            if one.pixels.shape != first.shape:
+                raise SpadError(
+                    f"image {i} is {_kind(one.pixels)}, but image {numbers[0]} {_kind(first)}; convert all to one kind"
+                )
         # in the first epoch the streams are those of `generate`
         split = self.split if epoch == 0 else f"{self.split}/epoch {epoch}"
-        if self.range is None:
-            made = self.experiment.simulate_numbered(self.experiment.levels[0], split, pixels, white, numbers)
-        else:
+        images, level = [one.pixels for one in shown], self.experiment.levels[0]
+        if self.range is not None:
             brightest = self.range[1]
             level = Level(f"{self.range[0].text} to {brightest.text}", "lux", brightest.value)
-            share = self._levels(numbers, epoch) / brightest.value
-            dimmed = pixels * share.reshape(-1, *[1] * (pixels.ndim - 1))
-            made = self.experiment.simulate_numbered(level, f"{split}/{self.range[0].key}", dimmed, white, numbers)
-        labels = [shown[int(i)][2] for i in wanted]
-        channels = pixels.shape[1:-2]
+            split = f"{split}/{self.range[0].key}"
+            shares = self._levels(numbers, epoch) / brightest.value
+            images = [image * share for image, share in zip(images, shares, strict=True)]
+        white = shown[0].white
+        if any(one.white != white for one in shown):
+            images, white = [image / one.white for image, one in zip(images, shown, strict=True)], 1.0
+        made = self.experiment.simulate_numbered(level, split, np.stack(images), white, numbers)
+        labels = [shown[int(i)].label for i in wanted]
+        channels = first.shape[:-2]
         if self.returns in reconstruct.Method.registry:
             values, _ = self.experiment.image(reconstruct.find(self.returns), made)
             images = values.reshape(len(numbers), *(channels or (1,)), *layout.shape)[wanted] / np.float32(self.scale)
@@ -622,23 +642,52 @@ class Simulated(Dataset[Any]):
         return out
 
 
-def _image(item: Any) -> tuple[np.ndarray, float, int]:
-    """(grey levels, white, label) of an item of somebody's set of images."""
+class _Shown(NamedTuple):
+    """An item of somebody's set: grey levels, (rows, columns) or (channels, rows, columns); white; label."""
+
+    pixels: np.ndarray
+    white: float
+    label: int
+
+
+def _kind(pixels: np.ndarray) -> str:
+    return "grey" if pixels.ndim == 2 else f"of {len(pixels)} channels"
+
+
+def _image(item: Any, place: str) -> _Shown:
+    """An item of somebody's set of images; place: what a message calls it. PIL's are read as a folder's pictures."""
+    from PIL import Image
+
     image, label = item if isinstance(item, tuple | list) and len(item) == 2 else (item, _NO_LABEL)
-    array = image.numpy() if isinstance(image, torch.Tensor) else np.asarray(image)
+    if isinstance(image, Image.Image):
+        array, alpha = pixels_of(image, place, instead="give an array")
+    else:
+        array, alpha = _plain(image, place)
+    if array.dtype == bool:
+        array = array.astype(np.uint8) * np.uint8(255)
+    if array.dtype in (np.uint8, np.uint16):
+        white = float(np.iinfo(array.dtype).max)
+        return _Shown(Making().image(array, alpha, white), white, int(label))
+    if array.dtype.kind != "f" or not (array.size and array.min() >= 0 and array.max() <= 1):
+        raise SpadError(
+            f"{place}: an image of {array.dtype} is not from 0 to 1; give uint8, uint16, or floats from 0 to 1"
+        )
+    return _Shown(array.astype(np.float64), 1.0, int(label))
+
+
+def _plain(image: Any, place: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """(rows, columns) or (channels, rows, columns) of an array or tensor; and how opaque it is, where it says so."""
+    array, alpha = image.numpy() if isinstance(image, torch.Tensor) else np.asarray(image), None
     if array.ndim == 3 and array.shape[-1] in (3, 4) and not isinstance(image, torch.Tensor):
+        if array.shape[-1] == 4 and array.dtype != np.uint8:
+            raise SpadError(f"{place}: four channels of {array.dtype} are not taken for RGBA; give uint8, or RGB alone")
+        alpha = array[..., 3] if array.shape[-1] == 4 else None
         array = np.moveaxis(array[..., :3], -1, 0)  # PIL's channels come last
     if array.ndim == 3 and len(array) == 1:
         array = array[0]
     if array.ndim not in (2, 3):
-        raise SpadError(f"an image is an array of {array.ndim} axes; give (rows, columns) or (channels, rows, columns)")
-    if array.dtype == bool:
-        array = array.astype(np.uint8) * np.uint8(255)
-    if array.dtype in (np.uint8, np.uint16):
-        return array, float(np.iinfo(array.dtype).max), int(label)
-    if array.dtype.kind != "f" or not (array.size and array.min() >= 0 and array.max() <= 1):
-        raise SpadError(f"an image of {array.dtype} is not from 0 to 1; give uint8, uint16, or floats from 0 to 1")
-    return array.astype(np.float64), 1.0, int(label)
+        raise SpadError(f"{place}: is an array of {array.ndim} axes; give (rows, columns) or (channels, rows, columns)")
+    return array, alpha
 
 
 __all__ = [

@@ -292,6 +292,111 @@ def test_without_the_library_one_line_says_what_to_install(
     assert list(tmp_path.iterdir()) == []
 
 
+# --- causes, and what some have not ---
+
+
+@pytest.fixture(scope="module")
+def caused(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    text = CONFIG.replace("tdc: {resolution: 10 ps}", "dark_counts: {rate: 2 kHz}, afterpulsing: {probability: 0.1}")
+    folder = tmp_path_factory.mktemp("caused")
+    experiment = config.build(document.parse(text, "a.yaml"), folder, causes=True)
+    factory.generate(experiment, experiment.load_images(), folder / "out", 1)
+    return folder / "out"
+
+
+def of_image(parent: np.ndarray) -> list[int]:
+    """As `Events` of one image has them."""
+    return np.asarray(parent, np.int64).tolist()  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("format", ["npz", "webdataset", "parquet"])
+def test_causes_are_written(caused: Path, tmp_path: Path, format: str) -> None:
+    """Of each stamp and of each bit: what made it, and which detection of its image caused it."""
+    part = spadmnist.open(caused)["2560 mlux", "train"]
+    export(caused, tmp_path / "rows", format, Choice())
+    path = tmp_path / "rows" / "2560_mlux" / "train" / f"00000{image_exporters.ImageTarget.every[format].suffix}"
+    rows: list[Any] = []
+    if format == "npz":
+        rows = npz_rows(path)
+    elif format == "webdataset":
+        with tarfile.open(path) as archive:
+            for i in range(len(part)):
+                with np.load(io.BytesIO(archive.extractfile(f"{i:08d}.npz").read())) as held:  # type: ignore[union-attr]
+                    rows.append({name: held[name] for name in held.files})
+    else:
+        rows = pytest.importorskip("pyarrow.parquet").read_table(path).to_pylist()
+    for i, row in enumerate(rows):
+        events, frames = part.tr[i], part.frames[i]
+        assert np.array_equal(row["cause"], events.cause) and of_image(row["parent"]) == of_image(events.parent)
+        assert np.array_equal(row["first_cause"], frames.cause)
+        assert of_image(row["first_parent"]) == of_image(frames.parent)
+    assert any(max(row["parent"], default=-1) >= 0 for row in rows)
+    names = {column.name: column.about for column in _block(caused).columns()}
+    assert all(f"{i} {name}" in names["cause"] for i, name in enumerate(part.causes))
+
+
+def _block(root: Path) -> image_exporters.Block:
+    return image_exporters.chosen(root, Choice()).blocks[0]
+
+
+def test_what_cannot_hold_causes_says_so(caused: Path, out: Path, tmp_path: Path) -> None:
+    said = "do not hold what made each detection"
+    for format, dataset, told in (("png", caused, True), ("npz", caused, False), ("png", out, False)):
+        done = run("export", dataset, "-o", tmp_path / f"{format}-{dataset.parent.name}", "--format", format)
+        assert done.exit_code == 0 and (said in done.stderr) == told, done.output
+
+
+def test_the_card_says_what_there_is(caused: Path, tmp_path: Path) -> None:
+    """Without a converter stamps are times; functions of what was not written are left out."""
+    pq = pytest.importorskip("pyarrow.parquet")
+    part, place = spadmnist.open(caused)["5 mlux", "train"], Path("5_mlux") / "train" / "00000.parquet"
+    for name, choice, there in (
+        ("all", Choice(), {"stamps", "frames", "flux"}),
+        ("tr", Choice(readouts=["tr"]), {"stamps", "flux"}),
+        ("qis", Choice(readouts=["qis"]), {"frames", "flux"}),
+    ):
+        export(caused, tmp_path / name, "parquet", choice)
+        (code,) = re.findall(r"```python\n(.*?)```", (tmp_path / name / "README.md").read_text(), re.S)
+        names: dict[str, Any] = {}
+        exec(compile(code, "README.md", "exec"), names)
+        assert names.keys() & {"stamps", "frames", "flux"} == there
+        row, events = pq.read_table(tmp_path / name / place).to_pylist()[1], part.tr[1]
+        if "stamps" in there:
+            right = [events.times[a:b].tolist() for a, b in _rows(events)]
+            assert [x.tolist() for x in names["stamps"](row)] == right
+        if "frames" in there:
+            assert np.array_equal(names["frames"](row), part.qis[1])
+
+
+@pytest.mark.parametrize("labelled", ["train", "test"])
+def test_labels_of_one_split(tmp_path: Path, labelled: str) -> None:
+    """All files have the columns that croissant.json and a hub's loader expect; where there is no label it is null."""
+    pq = pytest.importorskip("pyarrow.parquet")
+    for split in ("train", "test"):
+        for i in range(2):
+            path = tmp_path / "photos" / split / (f"c{i}" if split == labelled else "") / f"{i}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.full((9, 8), 200, np.uint8)).save(path)
+    text = CONFIG.replace("{source: digits, train: 9, test: 4, rows: 9, columns: 8}", "{source: folder, path: photos}")
+    root = made(text, tmp_path)
+    export(root, tmp_path / "rows", "parquet", Choice(["5 mlux"]))
+    held = {split: pq.read_table(tmp_path / "rows" / "5_mlux" / split / "00000.parquet") for split in ("train", "test")}
+    for split, table in held.items():
+        assert table["label"].to_pylist() == ([0, 1] if split == labelled else [None, None])
+    names = [[field.name for field in table.schema] for table in held.values()]
+    assert held["train"].schema == held["test"].schema
+    said = json.loads((tmp_path / "rows" / "croissant.json").read_text())
+    for one in said["recordSet"]:
+        assert {field["name"] for field in one["field"]} == set(names[0])
+
+
+@pytest.mark.parametrize(("format", "name"), [("webdataset", "x.tar"), ("parquet", "x.PARQUET"), ("png", "x.npz")])
+def test_a_folder_is_not_named_like_a_file(out: Path, tmp_path: Path, format: str, name: str) -> None:
+    with pytest.raises(SpadError, match=rf"{name}: {format} is a folder with a file for each shard.*-o .*/x$"):
+        export(out, tmp_path / name, format, Choice())
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- what is chosen, and mistakes --------------------------------------------------------------------------------
 
 

@@ -586,7 +586,9 @@ def test_classes_and_splits(tmp_path: Path) -> None:
     train, test = splits["train"], splits["test"]
     assert train.names == ("train/ant/1.png", "train/cat/2.png", "train/cat/deep/0.png")
     assert train.label_names == test.label_names == ("ant", "bee", "cat")
-    assert train.labels is not None and train.labels.tolist() == [0, 2, 2] and train.ignored == 1
+    assert train.labels is not None and train.labels.tolist() == [0, 2, 2]
+    assert (train.ignored, train.beside, test.beside) == (0, {"val": 1}, {})
+    assert "1 images beside the splits left out" in train.describe()
     assert test.labels is not None and test.labels.tolist() == [1]
     assert list(load_folder(tmp_path / "f" / "val")) == ["train"]
 
@@ -821,6 +823,34 @@ def test_file_name_that_is_no_text(tmp_path: Path) -> None:
     except OSError:
         pytest.skip("this file system takes no such name")
     refused(lambda: load_folder(tmp_path / "f"), tmp_path / "f", "udcff", "rename").encode()
+
+
+def test_a_given_folder_stands_for_the_path(tmp_path: Path) -> None:
+    """It is the folder that the config names, or the one that this lies in: moved, too."""
+    for i, name in enumerate(("f1", "given/f1", "moved")):
+        save(tmp_path / name / "a.png", GREY + np.uint8(i))
+
+    def level(path: str, given: str) -> int:
+        return int(Folder(path=path).load(SHAPE, tmp_path / given, tmp_path)["train"].pixels[0, 0, 0])
+
+    assert level("f1", "f1") == 0 and level("f1", "given") == 1 and level("f1", "moved") == 2
+    assert level(str(tmp_path / "f1"), "moved") == level(str(tmp_path / "gone"), "moved") == 2
+
+
+def test_a_given_folder_holds_the_files_of_absolute_paths(tmp_path: Path) -> None:
+    (tmp_path / "moved").mkdir()
+    np.save(tmp_path / "a.npy", GREY[None])
+    np.save(tmp_path / "moved" / "a.npy", GREY[None] + np.uint8(1))
+    source = Array(path=str(tmp_path / "a.npy"))
+    assert source.load(SHAPE)["train"].pixels[0, 0, 0] == 0
+    assert source.load(SHAPE, tmp_path / "moved")["train"].pixels[0, 0, 0] == 1
+    (tmp_path / "empty").mkdir()
+    refused(lambda: source.load(SHAPE, tmp_path / "empty"), tmp_path / "empty" / "a.npy", "--images-dir")
+
+
+@pytest.mark.parametrize("source", [Digits(train=2, test=1), Uniform(), Chart(of=Digits(train=2, test=0), count=1)])
+def test_what_is_made_here_refuses_a_folder(source: Any, tmp_path: Path) -> None:
+    refused(lambda: source.load(SHAPE, tmp_path), "--images-dir", tmp_path, "made here", "leave it out")
 
 
 # --- arrays ---------------------------------------------------------------------------------------------

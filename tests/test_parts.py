@@ -96,6 +96,16 @@ INDICES: list[Any] = [
 ]  # fmt: skip
 
 
+def test_the_largest_number_is_no_image() -> None:
+    for number in (2**64 - 1, 2**63, 70):
+        for index in (np.array([number], np.uint64), [number], np.uint64(number)):
+            with pytest.raises(IndexError, match=f"image {number} was asked for; there are 70"):
+                indices_of(index, 70)
+    for wrong in ([1, [2, 3]], np.array(1.5), np.array([0.5])):
+        with pytest.raises(IndexError, match="images are chosen by a number"):
+            indices_of(wrong, 70)
+
+
 @pytest.mark.parametrize("name", FIELDS)
 def test_any_index_gives_the_images_in_its_order(part: spadmnist.Part, name: str) -> None:
     field = FIELDS[name](part)
@@ -243,3 +253,24 @@ def test_a_name_that_a_dataset_has_not_is_a_sentence() -> None:
         assert str(caught.value).startswith(said)
     with pytest.raises(KeyError, match="Did you mean counts"):
         part.reconstruction["count"]
+
+
+def test_a_dataset_is_sent_without_its_images(opened: spadmnist.Dataset) -> None:
+    """With parts that were asked for already, and without."""
+    first = opened["30 lux", "train"]
+    data = pickle.dumps(opened)
+    assert len(data) < 100_000
+    again = pickle.loads(data)
+    assert again.levels == opened.levels and again.splits == opened.splits and repr(again) == repr(opened)
+    for level, split in (("30 lux", "train"), ("20 mlux", "test")):
+        for name, field in FIELDS.items():
+            assert same(field(again[level, split])[2:5], field(opened[level, split])[2:5]), name
+    assert np.array_equal(again["30 lux", "train"].labels, first.labels)
+
+
+def test_a_dataset_is_asked_like_a_mapping(opened: spadmnist.Dataset) -> None:
+    assert list(opened) == list(opened.keys()) == ["20 mlux", "30 lux"] and len(opened) == 2
+    for key in ("20 mlux", "0.02 lux", ("30 lux", "train"), ("30 lux", "test")):
+        assert key in opened, key
+    for key in ("5 mlux", "train", ("30 lux", "val"), ("5 mlux", "train"), 0, None, ("30 lux",), ("a", "b", "c")):
+        assert key not in opened, key

@@ -210,6 +210,21 @@ def test_labels_and_what_was_left_out_are_said(tmp_path: Path) -> None:
     ]
 
 
+def test_pictures_beside_the_splits_are_said_apart(tmp_path: Path) -> None:
+    root = tmp_path / "f"
+    for name in ("train/ant/a.png", "test/b.png", "val/1.png", "val/2.png", "val/bee/3.png", "cover.png"):
+        save(root / name, GREY)
+    (root / "train" / "notes.txt").write_text("no image")
+    said = module.notes(module.Folder(path="f").load((3, 4), base=tmp_path))
+    assert said == [
+        "the labels are the class folders: 0 ant",
+        "the test images lie in no class folders, and have no labels",
+        "1 picture is in no folder of a split, beside train/ and test/, and left out",
+        "3 pictures are in val/, which is neither train nor test, and left out",
+        "1 file of the folder is no image and is left out",
+    ]
+
+
 def test_a_folder_in_a_config(tmp_path: Path) -> None:
     """From photographs to a dataset; the labels are said."""
     for name, size in (("ant/a.png", (30, 40)), ("bee/b.png", (50, 20))):
@@ -227,6 +242,30 @@ def test_a_folder_in_a_config(tmp_path: Path) -> None:
     held = manifest["config"]["scene"]["images"]
     assert held == {"source": "folder", "path": "photos", "resize": [8, 8], "grey": True, "gamma": "srgb"}
     assert manifest["images"]["dtype"] == "uint16" and manifest["images"]["white"] == 65535
+
+
+def test_a_dataset_is_repaired_from_a_folder_that_moved(tmp_path: Path) -> None:
+    """The config names it by an absolute path; --images-dir stands for that."""
+    for i in range(3):
+        save(tmp_path / "photos" / f"{i}.png", GREY)
+    (tmp_path / "a.yaml").write_text(
+        "seed: 1\n"
+        f"scene: {{images: {{source: folder, path: {tmp_path / 'photos'}}}, lux: [80 mlux]}}\n"
+        "recording: {exposure: 1 ms, readouts: [tr]}\n"
+        "sensor: {layout: {rows: 6, columns: 9, pixel_area: 25 um^2}, effects: {detection: {pdp: 0.5}}}\n"
+    )
+    out = tmp_path / "out"
+    assert CliRunner().invoke(cli, ["generate", str(tmp_path / "a.yaml"), "-o", str(out)]).exit_code == 0
+    (tmp_path / "photos").rename(tmp_path / "moved")
+    lost = [path for path in out.glob("data/**/*") if path.is_file()]
+    before = [path.read_bytes() for path in lost]
+    for path in lost:
+        path.unlink()
+    repair = ["verify", str(out), "--repair"]
+    done = CliRunner().invoke(cli, repair)
+    assert isinstance(done.exception, InputError) and "there is no folder" in str(done.exception)
+    assert CliRunner().invoke(cli, [*repair, "--images-dir", str(tmp_path / "moved")]).exit_code == 0
+    assert [path.read_bytes() for path in lost] == before
 
 
 # --- mistakes ----------------------------------------------------------------------------------------------------

@@ -146,6 +146,36 @@ def test_workers_give_the_same(part: spadmnist.Part, method: str, persistent: bo
                 assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
+class Mine(torch.utils.data.Dataset[Any]):
+    """A set of somebody's that holds a whole dataset."""
+
+    def __init__(self, held: spadmnist.Dataset):
+        self.held = held
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, i: int) -> Any:
+        return torch.from_numpy(self.held["30 lux", "train"].reconstruction["counts"][i])
+
+
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_a_dataset_in_a_set_of_ones_own(folder: Path, part: spadmnist.Part, method: str) -> None:
+    for place in ("out", "lab.yaml"):
+        loader = DataLoader(Mine(spadmnist.open(folder / place)), num_workers=1, multiprocessing_context=method)
+        for i, item in enumerate(loader):
+            assert np.array_equal(item[0].numpy(), part.reconstruction["counts"][i])
+
+
+def test_tensors_choose_images(part: spadmnist.Part) -> None:
+    for index in (torch.tensor([3, 1, 2]), torch.tensor([5]), torch.arange(N) % 23 == 2):
+        assert np.array_equal(part.images[index], part.images[index.numpy()])
+    assert np.array_equal(part.images[torch.tensor(3)], part.images[3])
+    for wrong in (torch.tensor([1.5, 2.0]), torch.tensor(1.5), torch.zeros((2, 2), dtype=torch.int64)):
+        with pytest.raises(IndexError, match="images are chosen by a number"):
+            part.images[wrong]
+
+
 def test_a_worker_is_sent_kilobytes(folder: Path, part: spadmnist.Part) -> None:
     simulated = spadmnist.open(folder / "lab.yaml")["30 lux", "train"]
     for one in (part, simulated, spadmnist.concatenate([part, part])):
@@ -209,6 +239,17 @@ def test_frames_of_events_are_the_counts(part: spadmnist.Part) -> None:
     events = part.tr[7]
     for transform in (st.ToFrames((28, 28), 10, 30e-6), st.ToVoxelGrid((28, 28), 10, 30e-6)):
         assert np.allclose(transform(events).sum(0).ravel(), events.counts, atol=1e-3)
+
+
+@pytest.mark.parametrize("make", [st.ToFrames, st.ToVoxelGrid, lambda s, n, e: st.ToTimeSurface(s, 1.0, e, n)])
+def test_events_beyond_the_exposure_are_a_mistake(part: spadmnist.Part, make: Any) -> None:
+    """Of an exposure that is too short by its unit no bin would tell; a stamp at its end, rounded, is none."""
+    with pytest.raises(SpadError, match=r"exposure: 3e-06 s is not that of the events, which lie between .* s and "):
+        make((28, 28), 5, 3e-6)(part.tr[7])
+    with pytest.raises(SpadError, match="give the time that was recorded"):
+        make((1, 2), 5, 1.0)(by_hand([[-0.1, 0.5], []]))
+    assert make((1, 2), 5, 1.0)(by_hand([[np.nextafter(1.0, 2.0)], []])).shape == (5, 1, 2)
+    assert not make((1, 2), 5, 1.0)(by_hand([[], []])).any()
 
 
 def test_structured_events(part: spadmnist.Part) -> None:
@@ -323,6 +364,27 @@ def test_a_stream_goes_on_where_it_stopped(part: spadmnist.Part, after: int) -> 
     assert [known[item[0].numpy().tobytes()] for item, _ in other] == whole  # the pass after it is whole
     with pytest.raises(SpadError, match="of seed 5, but this stream has 6"):
         st.stream(part, "fluxes", seed=6).load_state_dict(state)
+
+
+def test_a_state_is_of_one_stream(part: spadmnist.Part) -> None:
+    """Nothing that changes the order, or what the items are, passes for the same."""
+    made = st.stream(part, "fluxes", seed=5)
+    state = dict(itertools.islice(((k, made.state_dict()) for k, _ in enumerate(made)), 12))[11]
+    assert state["done"] == 12
+    half = part[: N // 2]
+    for other, name in (
+        (st.stream(part, "fluxes", seed=5, buffer=1), "buffer 4, but this stream has 1"),
+        (st.stream(half, "fluxes", seed=5), f"length {N}, but this stream has {N // 2}"),
+        (st.stream(part, "events", seed=5), "kind fluxes, but this stream has events"),
+        (st.stream(part, "fluxes", "passive_free_running", seed=5), "method counts, but this stream has passive"),
+        (st.stream(part[::-1], "fluxes", seed=5), "shards"),
+        (st.stream(part, "fluxes", seed=5, rank=0, world=2), "consumers 1, but this stream has 2"),
+    ):
+        with pytest.raises(SpadError, match=f"the state is of {name}.*; make the stream as"):
+            other.load_state_dict(state)
+    del state["buffer"]
+    with pytest.raises(SpadError, match="the state says no buffer"):
+        made.load_state_dict(state)
 
 
 def test_a_stream_of_several_levels_and_of_a_config(dataset: spadmnist.Dataset, folder: Path) -> None:
@@ -494,6 +556,72 @@ def test_images_of_any_kind(pictures: Any, sensor: Any) -> None:
     colour = simulated(np.stack([grey] * 3, axis=1), sensor)[0][0]
     assert colour.shape == (3, 28, 28) and not torch.equal(colour[0], colour[1])
     assert torch.equal(simulated(np.stack([grey] * 3, axis=-1), sensor)[0][0], colour)
+
+
+@pytest.mark.parametrize("lux", ["30 lux", (0.5, 50.0)])
+def test_each_image_has_its_own_white(sensor: Any, pictures: Any, lux: Any) -> None:
+    """Of several kinds together each is what it is alone, to the last photon."""
+    from PIL import Image
+
+    grey = pictures.images[0]
+    deep = grey.astype(np.uint16) * 257
+    kinds = [grey, grey / 255.0, deep, torch.from_numpy(grey)[None], Image.fromarray(grey), Image.fromarray(deep)]
+    together = simulated(kinds, sensor, lux=lux).__getitems__(range(6))
+    alone = [simulated(kinds, sensor, lux=lux)[i][0] for i in range(6)]
+    assert all(torch.equal(one, right) for (one, _), right in zip(together, alone, strict=True))
+    means = np.array([one.mean().item() for one in alone])
+    if lux == "30 lux":
+        assert means.max() < 1.1 * means.min()
+
+
+def test_pictures_are_read_as_those_of_a_folder(sensor: Any, tmp_path: Path) -> None:
+    """Palettes are their colours, what is transparent is black, 16 bits stay."""
+    from PIL import Image
+
+    from spadmnist.images import Folder
+
+    grey = np.full((28, 28), 200, np.uint8)
+    grey[:3] = 40
+    rgb = np.stack([grey, grey // 2, 255 - grey], -1)
+    clear = np.dstack([rgb, np.where(grey > 100, 0, 255).astype(np.uint8)])
+    palette = Image.fromarray(grey).quantize(4)
+    see_through = Image.fromarray(rgb).quantize(4)
+    see_through.info["transparency"] = 0
+    shown = {
+        "palette": palette, "colours": Image.fromarray(rgb).quantize(4), "clear": Image.fromarray(clear),
+        "see_through": see_through, "bits": Image.fromarray(grey > 100),
+        "deep": Image.fromarray(grey.astype(np.uint16) * 200),
+        "grey_clear": Image.fromarray(np.dstack([grey, clear[..., 3]])),
+    }  # fmt: skip
+    for name, picture in shown.items():
+        (tmp_path / name).mkdir()
+        picture.save(tmp_path / name / "a.png")
+        read = Folder(path=str(tmp_path / name)).load((28, 28))["train"]
+        right = simulated(read.pixels, sensor)[0][0]
+        assert torch.equal(simulated([picture], sensor)[0][0], right), name
+        with Image.open(tmp_path / name / "a.png") as opened:
+            assert torch.equal(simulated([opened], sensor)[0][0], right), name
+    assert torch.equal(simulated([palette], sensor)[0][0], simulated(grey[None], sensor)[0][0])
+    assert torch.equal(
+        simulated(clear[None], sensor)[0][0], simulated([Image.fromarray(clear)], sensor)[0][0]
+    )  # as an array, too
+    for mode in ("CMYK", "HSV", "YCbCr", "LAB", "F"):
+        picture = Image.new(mode, (28, 28))
+        with pytest.raises(SpadError, match=f"image 0: it has pixels of the kind {mode}; convert it to.*give an array"):
+            simulated([picture], sensor)[0]
+    with pytest.raises(SpadError, match="image 0: four channels of float64"):
+        simulated([clear / 255.0], sensor)[0]
+    with pytest.raises(SpadError, match="image 1 is of 3 channels, but image 0 grey; convert all to one kind"):
+        simulated([grey, rgb], sensor).__getitems__([0, 1])
+
+
+def test_an_index_is_a_whole_number(part: spadmnist.Part, sensor: Any, pictures: Any) -> None:
+    for made in (*sets(part).values(), simulated(pictures, sensor)):
+        for wrong in (1.7, np.float64(2), "1"):
+            with pytest.raises(IndexError, match="images are chosen by a number"):
+                made[wrong]
+        with pytest.raises(IndexError, match=f"image {N} was asked for; there are {N}"):
+            made[N]
 
 
 @pytest.mark.parametrize(

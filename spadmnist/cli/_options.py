@@ -67,7 +67,8 @@ def seed(about: str, default: int | None = 0) -> Callable[[F], F]:
 
 
 def images_dir(
-    about: str = "Folder of the images. Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
+    about: str = "Folder of the images, in place of the one that the config names, or around it. "
+    "Without it MNIST is taken from $SPADMNIST_DATA, or downloaded once.",
 ) -> Callable[[F], F]:
     """`--images-dir DIR`; about: its help."""
     return click.option("--images-dir", type=click.Path(path_type=Path), metavar="DIR", help=about)

@@ -264,12 +264,14 @@ def export(
         with terminal.progress() as progress:
             paths = image_exporters.export(dataset, output, format_, choice, progress)
         kind: Any = image_exporters.ImageTarget.every[format_]
+        without_causes = kind.of_fluxes
     else:
         _check_captures(dataset, format_, choice)
         opened = library.open(dataset, readouts[0] if readouts else None)
         with terminal.progress() as progress:
             paths = exporters.export(opened, output, format_, ids, progress)
         kind = exporters.Target.every[format_]
+        without_causes = True
         if opened.layout.positions is not None:
             terminal.say(
                 "Note: these files do not hold where the pixels lie; to import them again, give --positions FILE.csv."
@@ -279,6 +281,11 @@ def export(
                 "Note: these files do not hold the scene that was seen; to import them again, give --light "
                 "image:FILE.npy."
             )
+    if without_causes and image_exporters.has_causes(dataset):
+        terminal.say(
+            "Note: these files do not hold what made each detection (--causes of generate); take the images as npz, "
+            "parquet or webdataset."
+        )
     if as_json:
         terminal.print_json({"files": [str(path) for path in paths]})
         return
