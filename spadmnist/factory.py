@@ -426,6 +426,24 @@ def generate(
     return Outcome(root, len(missing), len(mine) - len(missing), time.monotonic() - started, manifest)
 
 
+def standing(experiment: Experiment, splits: Mapping[str, Images], root: Path) -> str:
+    """What `generate` would find in a folder, in a sentence; "" where nothing is there yet. Nothing is changed."""
+    try:
+        kept, finished = _there(root)
+        experiment = written_as(experiment, kept) if kept else experiment
+        wanted = identity(experiment, splits)
+        _refuse_another(root, wanted, kept, finished)
+        if finished and (begun := _begun(root, kept)):
+            raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, kept, begun)}")
+        if finished:
+            manifest_file.check_there(root, kept["files"])
+    except SpadError as error:
+        return f"generate would stop: {error}."
+    if finished:
+        return f"{root} is complete already: generate would do nothing."
+    return f"{root} was begun already: generate would go on with it, and make what is missing." if kept else ""
+
+
 def _refuse_another(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any], finished: bool) -> None:
     """Raise SpadError where a folder holds another dataset, and where it is not about to become the wanted one.
 
