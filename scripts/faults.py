@@ -38,8 +38,8 @@ _WHAT = {
     "second time the run that goes on is killed, too: every file in its place is whole, reading gives right values or "
     "one sentence, and the same command ends with the bytes of an undisturbed run and nothing else",
     "full": "no space from each step on: one sentence, nothing torn, and with space again the same bytes",
-    "damaged": "each file with a flipped bit, cut, emptied, removed, replaced by another one or by a folder: reading "
-    "gives right values or one sentence; `verify` names the file, `--repair` makes the same bytes",
+    "damaged": "each file with a flipped bit, cut, emptied, removed, replaced by another one of it or by a "
+    "folder: reading gives right values or one sentence; `verify` names the file, `--repair` makes the same bytes",
     "hostile": "changed bytes, numbers and words in files that the program reads: it ends in time and memory, with "
     "status 0 or one sentence",
 }

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import hashlib
 import json
 import os
 import platform
@@ -20,6 +21,7 @@ import shutil
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +47,7 @@ from .compiled import compiling
 from .disk import Files
 from .errors import InputError, SpadError
 from .experiment import Experiment
-from .foreign import from_json
+from .foreign import from_json, quoted
 from .golden import versions
 from .identity import FORMAT, STREAM, held, identity, plugin_sources, portable, refuse_other, written_as
 from .images import Images
@@ -54,7 +56,8 @@ from .reconstruct import median_of_nonzero
 from .sensor import BYTES_PER_EVENT
 from .shard_columns import OnReading
 from .shard_facts import Facts
-from .shard_plan import Likeness, Shard
+from .shard_plan import PLAN, Likeness, Shard
+from .sources import is_as_listed
 from .workers import Executor, Serial, executor
 
 _LARGEST_NOTE = 1 << 30  # bytes; what is read of a plan or a record
@@ -305,11 +308,39 @@ def clear_records(root: Path) -> None:
     (root / STATE / "plan.json").unlink(missing_ok=True)
 
 
-def tidy(root: Path) -> None:
-    """Remove what a kill at the very end of a run has left beside a finished dataset."""
+def tidy(root: Path, manifest: Mapping[str, Any]) -> None:
+    """Remove what a kill at the very end of a run has left beside a finished dataset.
+
+    Raises SpadError where methods are being added to it: what is left is then needed to go on.
+    """
+    if (root / STATE).is_dir():
+        with locked(root):
+            if begun := _begun(root, manifest):
+                raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, manifest, begun)}")
+            clear_state(root)
+
+
+def forget(root: Path) -> None:
+    """Remove what any run has left beside a dataset that is as its manifest says."""
     if (root / STATE).is_dir():
         with locked(root):
             clear_state(root)
+
+
+def _begun(root: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The plan of a run that turns a finished dataset into another one; {} where there is none."""
+    plan = _plan(root) if (root / PLAN).exists() else {}
+    return {} if held(plan) == held(manifest) else plan
+
+
+def _go_on(root: Path, manifest: Mapping[str, Any], begun: Mapping[str, Any]) -> str:
+    """What to do where a run that adds methods was interrupted. begun: its plan."""
+    methods = [str(m) for m in begun["config"].get("reconstruct", ()) if m not in manifest["config"]["reconstruct"]]
+    chosen = "".join(f" --method {quoted(method)}" for method in methods)
+    return (
+        f"`spadmnist reconstruct {quoted(root)}{chosen}` goes on where that was interrupted, and `spadmnist verify "
+        f"{quoted(root)} --repair` takes it back: type one of them first"
+    )
 
 
 def _remove_empty(folder: Path) -> None:
@@ -365,34 +396,61 @@ def generate(
     kept, finished = _there(root)
     experiment = written_as(experiment, kept) if kept else experiment
     wanted = identity(experiment, splits)
-    refuse_other(root, wanted, kept or wanted)
+    _refuse_another(root, wanted, kept, finished)
     if finished:
-        tidy(root)
+        tidy(root, kept)
+        manifest_file.check_there(root, kept["files"])
         return Outcome(root, 0, 0, time.monotonic() - started, kept)
     with locked(root, part):
         kept, finished = _there(root)  # another run has begun or finished it meanwhile
-        refuse_other(root, wanted, kept or wanted)
+        _refuse_another(root, wanted, kept, finished)
         if finished:
             return Outcome(root, 0, 0, time.monotonic() - started, kept)
         begin(root, wanted, part)
         greet(workers, experiment)
         like = _likeness(experiment, wanted)
         made = {s: noted for s in shards if (noted := _made(root, s, experiment.encoding, like)) is not None}
+        mine = shards[part.number - 1 :: part.of] if part else shards
+        for shard in _changed(root, {s: made[s] for s in mine if s in made}, progress):
+            del made[shard]
         _check_space(root, experiment, splits, sum(noted.bytes for noted in made.values()))
 
         def again(shard: Shard) -> dict[str, bytes]:
             return encode_shard(task_of(experiment, job_of(experiment), root, shard, splits[shard.split]))
 
         check_bytes(root, experiment, {s: noted.made_by for s, noted in made.items()}, again, progress)
-        if part:
-            shards = shards[part.number - 1 :: part.of]
-        missing = [s for s in shards if s not in made]
+        missing = [s for s in mine if s not in made]
         del made  # of many shards it is much
-        _make(experiment, splits, root, shards, missing, workers, progress)
-        if part:
-            return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, {})
-        manifest = finish(experiment, root, wanted, shards, workers, progress)
-    return Outcome(root, len(missing), len(shards) - len(missing), time.monotonic() - started, manifest)
+        _make(experiment, splits, root, mine, missing, workers, progress)
+        manifest = {} if part else finish(experiment, root, wanted, shards, workers, progress)
+    return Outcome(root, len(missing), len(mine) - len(missing), time.monotonic() - started, manifest)
+
+
+def standing(experiment: Experiment, splits: Mapping[str, Images], root: Path) -> str:
+    """What `generate` would find in a folder, in a sentence; "" where nothing is there yet. Nothing is changed."""
+    try:
+        kept, finished = _there(root)
+        experiment = written_as(experiment, kept) if kept else experiment
+        wanted = identity(experiment, splits)
+        _refuse_another(root, wanted, kept, finished)
+        if finished and (begun := _begun(root, kept)):
+            raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, kept, begun)}")
+        if finished:
+            manifest_file.check_there(root, kept["files"])
+    except SpadError as error:
+        return f"generate would stop: {error}."
+    if finished:
+        return f"{root} is complete already: generate would do nothing."
+    return f"{root} was begun already: generate would go on with it, and make what is missing." if kept else ""
+
+
+def _refuse_another(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any], finished: bool) -> None:
+    """Raise SpadError where a folder holds another dataset, and where it is not about to become the wanted one.
+
+    kept, finished: see `_there`.
+    """
+    if not (finished and held(_begun(root, kept)) == wanted):
+        refuse_other(root, wanted, kept or wanted)
 
 
 def check_bytes(
@@ -511,7 +569,7 @@ def _there(root: Path) -> tuple[dict[str, Any], bool]:
         if not root.is_dir():
             raise SpadError(f"{root} is a file; choose another place with -o")
         if (root / MANIFEST).exists():
-            return manifest_file.read_manifest(root)[0], True
+            return manifest_file.intact_manifest(root), True
         content = set(os.listdir(root))
         plan = root / STATE / "plan.json"
         if not plan.exists():
@@ -531,7 +589,7 @@ def _plan(root: Path) -> dict[str, Any]:
         found = from_json(disk.read_file(path, _LARGEST_NOTE))
     except (OSError, ValueError):
         found = None
-    if not isinstance(found, dict):
+    if not isinstance(found, dict) or not isinstance(found.get("config"), dict):
         again = "remove it" if os.path.lexists(root / MANIFEST) else f"remove {root}"
         raise SpadError(f"{path}: is damaged; {again} and begin again")
     return found
@@ -581,9 +639,9 @@ def _likeness(experiment: Experiment, wanted: Mapping[str, Any]) -> Likeness:
 def _made(root: Path, shard: Shard, encoding: store.Encoding, like: Likeness) -> Note | None:
     """What was noted of a shard that is there as it was made, else None.
 
-    Its attributes and the sizes of its files say so; its data are not read.
+    Its attributes and the sizes of its files say so; its data are not read (see `_changed`).
     """
-    noted = _noted(root, shard)
+    noted = _noted(root, shard, encoding)
     if noted.files is None or not encoding.exists(root, shard.path):
         return None
     reader = shard.reader(root, encoding, like)
@@ -595,6 +653,21 @@ def _made(root: Path, shard: Shard, encoding: store.Encoding, like: Likeness) ->
         return noted if reader.attributes else None
     except (InputError, OSError, KeyError, TypeError):
         return None
+
+
+def _changed(root: Path, made: Mapping[Shard, Note], progress: Progress) -> list[Shard]:
+    """The shards whose files are not those that were noted. Every byte is read: the manifest will vouch for it."""
+
+    def changed(shard: Shard) -> bool:
+        return not all(is_as_listed(root, name, facts) for name, facts in (made[shard].files or {}).items())
+
+    found = []
+    if made:
+        progress.start("reading", sum(noted.bytes for noted in made.values()), 0)
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            found = [shard for shard, other in zip(made, pool.map(changed, made), strict=True) if other]
+        progress.stop()
+    return found
 
 
 @dataclass(frozen=True)
@@ -611,8 +684,8 @@ class Note:
         return sum(facts["bytes"] for facts in (self.files or {}).values())
 
 
-def _noted(root: Path, shard: Shard) -> Note:
-    """What was noted of a shard, as far as that can be read."""
+def _noted(root: Path, shard: Shard, encoding: store.Encoding) -> Note:
+    """What was noted of a shard, as far as that can be read and is of this shard."""
     try:
         found = from_json(disk.read_file(_record_path(root, shard), _LARGEST_NOTE))
     except (OSError, ValueError):
@@ -620,10 +693,11 @@ def _noted(root: Path, shard: Shard) -> Note:
     if not isinstance(found, dict):
         return Note(None, None)
     if not {"files", "made_by"} <= set(found):  # spadmnist 0.1.0 noted the files alone
-        return Note(found, None)
+        found = {"files": found, "made_by": None}
     files, made_by = found["files"], found["made_by"]
-    facts = Facts.noted(found.get("facts"))
-    return Note(files if isinstance(files, dict) else None, made_by if isinstance(made_by, dict) else None, facts)
+    if not encoding.are_files_of(shard.path, files):
+        return Note(None, None)
+    return Note(files, made_by if isinstance(made_by, dict) else None, Facts.noted(found.get("facts")))
 
 
 def _make(
@@ -767,11 +841,43 @@ def add_methods(addition: Addition) -> tuple[str, Files]:
     root, shard = Path(addition.root), addition.shard
     encoding = experiment.encoding
     reader = shard.reader(root, encoding, addition.like, addition.files)
+    _check_own(reader, experiment, addition)
     recorded, shape = shard_columns.read_shard(reader, experiment)
     columns = shard_columns.reconstruction_columns(experiment, recorded, shape, addition.methods)
     labels = next((reader.read(name) for name in reader.names if name.endswith("/label")), None)
     files = encoding.append(root, shard.path, _described(experiment, shard, columns, labels))
     return shard.path, files
+
+
+def _check_own(reader: store.ShardReader, experiment: Experiment, addition: Addition) -> None:
+    """Raise InputError where a shard is not the one that the manifest lists.
+
+    It may be that one with the methods, which a run added that was killed before it could note so.
+    """
+    root, encoding, path = Path(addition.root), experiment.encoding, addition.shard.path
+    listed = addition.files[encoding.location(path)]
+    for name, facts in listed.items():
+        if is_as_listed(root, name, facts):
+            continue
+        if encoding.one_file:
+            older = [method for method in experiment.methods if method not in addition.methods]
+            kept = [n for n in reader.names if not n.startswith("reconstruction/") or _is_older(n, older, addition)]
+            columns = {n: reader.column(n) for n in kept}
+            before = hashlib.sha256()
+            for pieces in encoding.encoded(path, columns, reader.attributes).values():
+                for piece in pieces:
+                    before.update(piece)
+            if before.hexdigest() == facts["sha256"]:
+                continue
+        raise InputError(
+            f"{root / name}: this is not the file that was made, and nothing was added to it; "
+            f"`spadmnist verify {quoted(root)} --repair` makes it again"
+        )
+
+
+def _is_older(name: str, older: Sequence[str], addition: Addition) -> bool:
+    """Was an array of the group of reconstructions there before some were added? Without an older one none was."""
+    return bool(older) and name.removeprefix("reconstruction/") not in addition.methods
 
 
 def _as_read(root: Path, shard: Shard, experiment: Experiment, like: Likeness) -> dict[str, bytes]:
@@ -814,7 +920,7 @@ def add_reconstructions(
             raise InputError(f"{root}: {name} needs {', '.join(sorted(lacking))}, which was not recorded")
     new = tuple(dict.fromkeys(m for m in chosen if m not in before.methods))
     if not new:
-        tidy(root)
+        tidy(root, manifest)
         return [], manifest
     after = before.with_methods((*before.methods, *new))
     refuse_other(root, {**held(manifest), "stream": STREAM}, manifest)
@@ -827,15 +933,16 @@ def add_reconstructions(
             if held(there) == held(manifest):
                 clear_records(root)  # of the run that made what is here, and was killed at its very end
             else:
-                refuse_other(root, wanted, there)
+                refuse_other(root, wanted, there, _go_on(root, manifest, there))
         begun = plan.exists()  # records without a plan are those of a run that has finished
-        by_path = {s.path: s for s in shards if not begun or _noted(root, s).files is None}
+        by_path = {s.path: s for s in shards if not begun or _noted(root, s, encoding).files is None}
+        files = shard_plan.files_by_shard(manifest["files"], encoding)
+        _check_ready(root, shards, by_path, files, encoding, begun, progress)
         job, like = job_of(after), Likeness.of(manifest)
         greet(workers, after)
-        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s).made_by for s in shards}
+        makers = {s: golden.maker(manifest) if s.path in by_path else _noted(root, s, encoding).made_by for s in shards}
         check_bytes(root, after, makers, lambda shard: _as_read(root, shard, after, like), progress)
         begin(root, wanted)
-        files = shard_plan.files_by_shard(manifest["files"], encoding)
 
         def files_of(shard: Shard) -> dict[str, Files]:
             place = encoding.location(shard.path)
@@ -860,6 +967,37 @@ def add_reconstructions(
                 workers.run(add_methods, additions, list(by_path), done)
         progress.stop()
         return list(new), finish(after, root, wanted, shards, workers, progress)
+
+
+def _check_ready(
+    root: Path,
+    shards: Sequence[Shard],
+    by_path: Mapping[str, Shard],
+    files: Mapping[str, Files],
+    encoding: store.Encoding,
+    begun: bool,
+    progress: Progress,
+) -> None:
+    """Raise InputError where a shard is missing, or one that was noted is not as it was made.
+
+    by_path: those that are not noted. files: what the manifest lists of each shard. begun: is it an interrupted run?
+    """
+    noted: dict[Shard, Note] = {}
+    for shard in shards:
+        listed = files.get(encoding.location(shard.path), {})
+        if shard.path not in by_path:
+            note_of = _noted(root, shard, encoding)
+            listed = note_of.files or {}
+            if shard.level is not None:
+                noted[shard] = note_of
+        elif begun and encoding.one_file and encoding.exists(root, shard.path):
+            continue  # it may have been changed, and the run been killed before that was noted; see `_check_own`
+        manifest_file.check_there(root, listed)
+    for shard in _changed(root, noted, progress):
+        raise InputError(
+            f"{root / encoding.location(shard.path)}: was changed after reconstructions were added to it; "
+            f"`spadmnist verify {quoted(root)} --repair` makes it again, without them"
+        )
 
 
 # --- finishing ----------------------------------------------------------------------------------------------------
@@ -915,8 +1053,13 @@ def finish(
     files: Files = {}
     facts: dict[str, Facts] = {}
     for shard in shards:
-        noted = _noted(root, shard)
-        files |= noted.files or {}
+        noted = _noted(root, shard, experiment.encoding)
+        if noted.files is None:
+            raise SpadError(
+                f"{_record_path(root, shard)}: what was noted of a shard is missing or damaged; type the same command "
+                "again, which makes that shard anew"
+            )
+        files |= noted.files
         if noted.facts is not None:
             facts[shard.path] = noted.facts
     small, groups = small_files(experiment, shards, normalisation)

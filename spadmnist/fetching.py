@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from . import dataset, disk, manifest_file, remote, verify
+from . import dataset, disk, manifest_file, remote, sources, verify
 from .errors import InputError, SpadError
 from .manifest_file import MANIFEST
 from .remote import Remote
@@ -129,7 +129,7 @@ def _bring(source: Source, part: Path, files: Mapping[str, Mapping[str, Any]], s
 
 def _bring_one(source: Source, part: Path, name: str, facts: Mapping[str, Any], number: str) -> int:
     place, coming = disk.inside(part, name), part / _COMING / number
-    if not verify.is_as_listed(part, name, facts):
+    if not sources.is_as_listed(part, name, facts):
         digest, size = hashlib.sha256(), 0
         try:
             with open(coming, "wb") as file:

@@ -73,14 +73,18 @@ def written_as(experiment: Experiment, kept: Mapping[str, Any]) -> Experiment:
     return replace(experiment, encoding=store.encoding(experiment.format, held(kept)["encoding"]))
 
 
-def refuse_other(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any]) -> None:
-    """Raise SpadError where what a manifest or a plan holds is another identity than the wanted one."""
+_ELSEWHERE = "choose another folder with -o, or remove it"
+
+
+def refuse_other(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any], do: str = _ELSEWHERE) -> None:
+    """Raise SpadError where what a manifest or a plan holds is another identity than the wanted one.
+
+    do: what the user can do then.
+    """
     lines = _difference(wanted, held(kept))
     if lines:
         more = f" (and {len(lines) - 4} more)" if len(lines) > 4 else ""
-        raise SpadError(
-            f"{root} holds another dataset: {'; '.join(lines[:4])}{more}; choose another folder with -o, or remove it"
-        )
+        raise SpadError(f"{root} holds another dataset: {'; '.join(lines[:4])}{more}; {do}")
 
 
 def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:

@@ -21,10 +21,11 @@ import numpy as np
 
 from . import dataset, disk, document, manifest_file, packing, units
 from .dataset import Part
-from .errors import SpadError
+from .errors import InputError, SpadError
 from .events import Events
 from .experiment import Level, level_of
 from .factory import Progress
+from .foreign import quoted
 from .plugins import discover
 from .reconstruct import find
 
@@ -185,6 +186,19 @@ def _of(option: str, wanted: Sequence[str], there: Sequence[str]) -> list[str]:
         if name not in there:
             raise SpadError(f"{option} {name}: the dataset has none of it; there are {', '.join(there) or 'none'}")
     return [name for name in there if not wanted or name in wanted]
+
+
+def check_source(path: Path) -> None:
+    """Raise InputError where there is nothing at a path, or a zip or an unfinished dataset, which are not exported."""
+    if not path.exists():
+        raise InputError(f"{path}: there is nothing of that name; name the folder of a dataset or of a measurement")
+    if path.is_file() and zipfile.is_zipfile(path):
+        raise InputError(
+            f"{path} is a zip, and export reads a folder: unpack it (python -m zipfile -e {quoted(path)} FOLDER), and "
+            "name the dataset in it"
+        )
+    if (path / manifest_file.STATE).is_dir() and not (path / manifest_file.MANIFEST).exists():
+        manifest_file.read_manifest(path)  # raises, and says how it is finished
 
 
 def is_of_images(path: Path, format: str, choice: Choice) -> bool:

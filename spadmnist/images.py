@@ -338,7 +338,8 @@ def _first(what: str, places: Sequence[Path], exists: Callable[[Path], bool]) ->
     tried = " and no ".join(str(place) for place in places)
     raise InputError(
         f"scene.images: there is no {what} {tried}; "
-        "a relative path refers to --images-dir or, without it, to the folder of the config"
+        "a relative path refers to --images-dir or, without it, to the folder of the config: give --images-dir DIR, or "
+        "write another path"
     )
 
 

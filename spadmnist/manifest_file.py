@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from . import disk, store
 from . import manifest as manifests
+from .disk import Files
 from .errors import InputError
 from .foreign import from_json, quoted, short
 from .identity import FORMAT, held
@@ -109,6 +112,22 @@ def intact_manifest(root: Path | Source) -> dict[str, Any]:
         mended = "" if isinstance(root, Source) else f"; spadmnist verify {quoted(root)} --repair makes it again"
         raise InputError(f"{root / MANIFEST}: was changed{mended}")
     return manifest
+
+
+def check_there(root: Path, files: Files) -> None:
+    """Raise InputError where a listed file is not there, is no file or has another size. No data are read."""
+    mended = f"spadmnist verify {quoted(root)} names every such file, and with --repair it makes them again"
+    for name, facts in files.items():
+        try:
+            found = os.lstat(root / name)
+        except (FileNotFoundError, NotADirectoryError):
+            raise InputError(f"{root / name}: this file is missing; {mended}") from None
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{root / name}: this is not a file; {mended}")
+        if found.st_size != facts["bytes"]:
+            raise InputError(
+                f"{root / name}: this file has {found.st_size} bytes, and it had {facts['bytes']}; {mended}"
+            )
 
 
 def encoding_in(manifest: Mapping[str, Any], root: Path | Source) -> Encoding:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 DPI = 128  # a power of two: a size in points comes out whole
 PAGE = "#d6dfec"  # behind pictures in grey: no grey, so that every pixel stands out from it
+_PNG = b"\x89PNG\r\n\x1a\n"  # with which a PNG begins
 _REACH = 0.5**0.5  # pitches from its centre to where a pixel ends at the latest: the corner of a square
 _SAME = 50  # parts of a pitch, to which two steps to a neighbour are the same
 _POINTS = 480  # of the longer side of a map of pixels that are no grid
@@ -33,6 +34,17 @@ _STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+
+
+def is_other(path: Path) -> bool:
+    """Is there something else than a PNG in a picture's place? An empty file, which somebody made for it, is not."""
+    try:
+        if not path.is_file():
+            return False  # writing it tells why not
+        with open(path, "rb") as file:
+            return file.read(len(_PNG)) not in (_PNG, b"")
+    except OSError:
+        return False
 
 
 def words(text: str) -> str:

@@ -16,6 +16,7 @@ from .images import Images
 from .sources import Source
 from .store import Encoding, Expected, ShardReader
 
+PLAN = ".spadmnist/plan.json"  # there as long as a run makes a dataset, or adds to it
 _EVENTS_PER_SHARD = 9_000_000
 _BYTES_PER_SHARD = 84 * 2**20  # before compression
 _IMAGES_PER_SHARD = 4096
@@ -54,8 +55,8 @@ class Shard:
         stamps = {"tick_s": like.tick} if like.tick > 0 else {}
         sizes = {"image": n, "event_start": n + 1, "first_event_start": n + 1, "line": n * (pixels // columns)}
         sizes |= {"frame_byte": -(-columns * like.frames // 8), **dict(zip(like.dims, like.shape, strict=True))}
-        # a shard that is one file changes where reconstructions are added; its attributes do not
-        known = files if not encoding.one_file or self.level is None else None
+        # a shard that is one file changes while reconstructions are added; its attributes do not
+        grows = encoding.one_file and self.level is not None
         expected = Expected(
             {
                 "": {"level": None, **self.attributes},
@@ -64,7 +65,8 @@ class Shard:
                 "frames/ticks": stamps,
             },
             sizes,
-            None if known is None else known.get(encoding.location(self.path), {}),
+            None if files is None else files.get(encoding.location(self.path), {}),
+            PLAN if grows else "",
         )
         return encoding.reader(root, self.path, expected)
 

@@ -11,6 +11,7 @@ Nothing that a source gives is executed or unpickled.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import stat
@@ -177,6 +178,33 @@ class Unreadable(InputError):
 
 class NotAFile(OSError):
     """A pipe, a device, a socket or a folder in place of a file."""
+
+
+OTHER, ABSENT = -1, -2
+
+
+def compare(source: Source, name: str, listed: Mapping[str, Any]) -> int:
+    """The bytes of a file that has the size and SHA-256 that are listed of it, else OTHER or ABSENT.
+
+    A link is OTHER, wherever it leads. Raises InputError where the file cannot be reached.
+    """
+    digest, size = hashlib.sha256(), 0
+    try:
+        for piece in source.whole(name):
+            digest.update(piece)
+            size += len(piece)
+            if size > listed["bytes"]:
+                return OTHER
+    except FileNotFoundError:
+        return ABSENT
+    except (OSError, Unreadable):
+        return OTHER
+    return size if size == listed["bytes"] and digest.hexdigest() == listed["sha256"] else OTHER
+
+
+def is_as_listed(root: Path, name: str, listed: Mapping[str, Any]) -> bool:
+    """Is a file below a folder the one whose size and SHA-256 are listed? A link is not, wherever it leads."""
+    return compare(Local(root), name, listed) >= 0
 
 
 def tree(names: Iterable[str]) -> dict[str, set[str]]:

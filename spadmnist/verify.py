@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import os
 import re
@@ -25,7 +24,7 @@ from .identity import POSITIONS, held, identity
 from .images import Images
 from .manifest_file import CONFIG, MANIFEST, STATE
 from .shard_plan import Shard
-from .sources import Local, Source, Unreadable
+from .sources import ABSENT, OTHER, Local, Source, compare, is_as_listed
 from .tiles import of_facts
 from .workers import Executor, executor
 
@@ -70,13 +69,13 @@ def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # n
     progress.start("reading", sum(int(listed[name]["bytes"]) for name in present), 0)
     started, read = time.monotonic(), 0
     with ThreadPoolExecutor(max_workers=2) as pool:
-        for name, size in zip(present, pool.map(lambda n: _size(source, n, listed[n]), present), strict=True):
+        for name, size in zip(present, pool.map(lambda n: compare(source, n, listed[n]), present), strict=True):
             read += max(0, size)
             rate = read / 1e6 / (time.monotonic() - started)
             progress.advance(int(listed[name]["bytes"]), f"{rate:,.0f} MB/s")
-            if size == _ABSENT:
+            if size == ABSENT:
                 missing.append(name)
-            elif size == _OTHER:
+            elif size == OTHER:
                 changed.append(name)
     progress.stop()
     if not changed and not missing and not _adds_up(root, manifest):
@@ -117,30 +116,6 @@ def _was_dataset(root: Path) -> bool:
     return any(folder.is_dir() for folder in data)
 
 
-_OTHER, _ABSENT = -1, -2
-
-
-def _size(source: Source, name: str, listed: Mapping[str, Any]) -> int:
-    """The bytes of a file that is as it was made; _OTHER, _ABSENT. Raises InputError where it cannot be reached."""
-    digest, size = hashlib.sha256(), 0
-    try:
-        for piece in source.whole(name):
-            digest.update(piece)
-            size += len(piece)
-            if size > listed["bytes"]:
-                return _OTHER
-    except FileNotFoundError:
-        return _ABSENT
-    except (OSError, Unreadable):
-        return _OTHER
-    return size if size == listed["bytes"] and digest.hexdigest() == listed["sha256"] else _OTHER
-
-
-def is_as_listed(root: Path, name: str, listed: Mapping[str, Any]) -> bool:
-    """Is a file below a folder the one whose size and SHA-256 a manifest lists? A link is not, wherever it leads."""
-    return _size(Local(root), name, listed) >= 0
-
-
 # --- repair -------------------------------------------------------------------------------------------------------
 
 
@@ -159,7 +134,7 @@ def repair(
     """
     workers = executor(jobs)
     if not damage:
-        factory.tidy(root)
+        factory.forget(root)
         return []
     manifest = _manifest(root)
     if manifest is None and not (root / CONFIG).is_file():

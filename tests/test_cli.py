@@ -261,6 +261,35 @@ def test_dry_run_for_people(made: tuple[Path, Path], tmp_path: Path) -> None:
     assert tree(tmp_path) == {}
 
 
+def test_dry_run_says_what_is_there(made: tuple[Path, Path], tmp_path: Path) -> None:
+    file, root = made
+    shutil.copytree(root, tmp_path / "out")
+    before = tree(tmp_path)
+
+    def said(*options: object) -> str:
+        result = run("generate", file, "-o", tmp_path / "out", "--dry-run", *options)
+        assert result.returncode == 0 and tree(tmp_path) == before, result.stderr
+        return result.stderr
+
+    assert "out is complete already: generate would do nothing." in said()
+    assert "generate would stop" in said("--seed", 77) and "holds another dataset: config.seed" in said("--seed", 77)
+    (tmp_path / "out" / "config.yaml").unlink()
+    before = tree(tmp_path)
+    assert "generate would stop" in said() and "config.yaml: this file is missing" in said()
+
+
+def test_a_sheet_replaces_pictures_alone(made: tuple[Path, Path], tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    for content in (None, b""):
+        if content is not None:
+            sheet.write_bytes(content)
+        for _ in range(2):
+            assert run("inspect", made[1], "--plot", sheet).returncode == 0
+    sheet.write_bytes(b"my only copy")
+    assert_sentence(run("inspect", made[1], "--plot", sheet), "--plot", "sheet.png", "no PNG picture", "another file")
+    assert sheet.read_bytes() == b"my only copy"
+
+
 # --- wrong input --------------------------------------------------------------------------------------------------
 
 WRONG = {

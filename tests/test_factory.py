@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import pickle
@@ -383,6 +384,13 @@ def made_elsewhere(root: Path, plant: bool) -> None:
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 1
             path.write_bytes(content)
+            noted["files"] |= {next(iter(noted["files"])): put(path)}
+            record.write_text(json.dumps(noted))
+
+
+def put(path: Path) -> dict[str, Any]:
+    """What is noted of a file."""
+    return {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 @pytest.mark.parametrize("shards", [1, 3])
@@ -790,6 +798,51 @@ def test_a_damaged_record_is_made_again(made: tuple[Path, Path], tmp_path: Path)
         path.write_bytes(b"")
     make(made[0], tmp_path / "out")
     assert_same(tmp_path / "out", tree(made[1]))
+
+
+@pytest.mark.parametrize("said", ["{}", '{"files": {}, "made_by": {}}', '{"files": {"config.yaml": 1}, "made_by": {}}'])
+def test_a_record_that_does_not_name_its_shard_is_made_again(
+    said: str, made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The manifest would be sealed without it."""
+    interrupted(made[0], tmp_path / "out", 3)
+    for path in (tmp_path / "out" / ".spadmnist" / "shards").rglob("*.json"):
+        path.write_text(said)
+    assert make(made[0], tmp_path / "out").kept == 0
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_a_shard_that_was_changed_before_the_end_is_made_again(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """Wherever the byte lies: what is sealed is what was made."""
+    interrupted(made[0], tmp_path / "out", 5)
+    shards = sorted(path for path in (tmp_path / "out" / "data").rglob("0*") if path.is_file())
+    for shard, at in zip(shards, (0.1, 0.3, 0.5, 0.7, 0.9), strict=False):
+        content = bytearray(shard.read_bytes())
+        content[int(len(content) * at)] ^= 1
+        shard.write_bytes(content)
+    outcome = make(made[0], tmp_path / "out")
+    assert outcome.kept == max(0, len(shards) - 5)
+    assert_same(tmp_path / "out", tree(made[1]))
+
+
+def test_a_finished_dataset_that_lacks_a_file_is_not_called_complete(made: tuple[Path, Path], tmp_path: Path) -> None:
+    shutil.copytree(made[1], tmp_path / "out")
+    shard = next(path for path in (tmp_path / "out" / "data" / "5_mlux").rglob("0*") if path.is_file())
+    content = shard.read_bytes()
+    for change, says in (
+        (shard.unlink, "is missing"),
+        (lambda: shard.write_bytes(content + b"x"), "bytes, and it had"),
+        (shard.write_bytes, ""),
+    ):
+        change(*[content] if not says else [])  # type: ignore[operator]
+        if says:
+            with pytest.raises(SpadError, match=rf"{shard.name}: this file .*{says}.*spadmnist verify .* --repair"):
+                make(made[0], tmp_path / "out")
+    assert make(made[0], tmp_path / "out").made == 0
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"detections": ', '"detections": 1', 1))
+    with pytest.raises(SpadError, match=r"manifest\.json: was changed; spadmnist verify .* --repair"):
+        make(made[0], tmp_path / "out")
 
 
 def test_an_effect_with_blocks_of_images(format: str, tmp_path: Path) -> None:

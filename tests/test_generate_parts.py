@@ -53,6 +53,17 @@ def test_parts_of_other_numbers_overlap_without_harm(whole: tuple[Path, Path], t
     assert_same(tmp_path / "out", tree(whole[1]))
 
 
+def test_what_was_changed_between_the_parts_and_the_end_is_made_again(whole: tuple[Path, Path], tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    one(whole[0], root, "1/1")
+    shard = sorted(path for path in (root / "data").rglob("0*") if path.is_file())[0]
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    assert make(whole[0], root).made == 1
+    assert_same(root, tree(whole[1]))
+
+
 def test_parts_that_hold_their_locks(whole: tuple[Path, Path], tmp_path: Path) -> None:
     """Beside a part another one is made, not the same one, and not the whole."""
     root = tmp_path / "out"

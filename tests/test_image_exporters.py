@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import sys
 import tarfile
 import zipfile
@@ -453,6 +454,21 @@ def test_mistakes(out: Path, tmp_path: Path, words: list[str], parts: list[str])
     for part in parts:
         assert part in str(done.exception), done.exception
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("format", ["png", "npz", "hdf5"])
+def test_what_is_no_finished_folder_is_said(out: Path, tmp_path: Path, format: str) -> None:
+    shutil.copytree(out, tmp_path / "unfinished")
+    (tmp_path / "unfinished" / "manifest.json").unlink()
+    (tmp_path / "unfinished" / ".spadmnist").mkdir()
+    shutil.make_archive(str(tmp_path / "out"), "zip", out.parent, out.name)
+    for name, says in (
+        ("nothing", "there is nothing of that name"),
+        ("out.zip", "is a zip, and export reads a folder: unpack it"),
+        ("unfinished", "is not finished: type the command that makes it again"),
+    ):
+        done = run("export", tmp_path / name, "-o", tmp_path / "rows", "--format", format)
+        assert isinstance(done.exception, SpadError) and says in str(done.exception), done.exception
 
 
 def test_what_is_there_is_left_alone(out: Path, tmp_path: Path) -> None:

@@ -790,7 +790,7 @@ def test_brighter_than_white(tmp_path: Path) -> None:
 
 def test_folders_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "f"
-    refused(lambda: load_folder(root), "no folder", root, "--images-dir")
+    refused(lambda: load_folder(root), "no folder", root, "give --images-dir DIR")
     root.mkdir()
     refused(lambda: load_folder(root), root, "no image", ".png")
     save(root / "test" / "a.png", GREY)

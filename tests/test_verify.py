@@ -572,6 +572,128 @@ def test_reconstruct_of_damaged_data_is_refused(few: dict[int, Path], made: Path
             assert_sentence(result, "train/00000")
 
 
+def shards_at(root: Path, level: str = "5_mlux") -> list[Path]:
+    """The shards of a light level."""
+    return sorted(path for path in (root / "data" / level).rglob("0*") if path.is_file())
+
+
+def test_reconstruct_does_not_vouch_for_a_shard_of_another_dataset(few: dict[int, Path], tmp_path: Path) -> None:
+    """Nor for one that is missing; nothing is changed then."""
+    root, other = tmp_path / "out", tmp_path / "other"
+    shutil.copytree(few[2], root)
+    make(few[2].parent / "2.yaml", other, seed=4)
+    shutil.copyfile(shards_at(other)[-1], shards_at(root)[-1])
+    before, damage = tree(root), verify.verify(root)
+    again = r"spadmnist verify .* --repair"
+    with pytest.raises(SpadError, match=again):
+        factory.add_reconstructions(root, METHODS[2:3], 1)
+    assert verify.verify(root).changed == damage.changed == (str(shards_at(root)[-1].relative_to(root)),)
+    assert_same(root, before)
+    shards_at(root, "2560_mlux")[-1].unlink()
+    before = tree(root)
+    with pytest.raises(SpadError, match=again):
+        factory.add_reconstructions(root, METHODS[2:3], 1)
+    assert_same(root, before)
+    verify.repair(root, verify.verify(root), 1)
+    assert_same(root, tree(few[2]))
+
+
+def test_reconstruct_compares_more_than_the_size(
+    few: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, other = tmp_path / "out", tmp_path / "other"
+    shutil.copytree(few[2], root)
+    make(few[2].parent / "2.yaml", other, seed=4)
+    shutil.copyfile(shards_at(other)[-1], shards_at(root)[-1])
+    monkeypatch.setattr(manifest_file, "check_there", lambda *_: None)  # as if it had the same size
+    with pytest.raises(SpadError, match=r"this is not the file that was made.*spadmnist verify .* --repair"):
+        factory.add_reconstructions(root, METHODS[2:3], 1)
+    verify.repair(root, verify.verify(root), 1)
+    assert_same(root, tree(few[2]))
+
+
+@pytest.mark.parametrize("n", [0, 2])
+def test_a_shard_that_was_added_to_and_not_noted_is_known(
+    n: int, few: dict[int, Path], made: Path, tmp_path: Path
+) -> None:
+    """Killed between the shard and its note: the same command goes on."""
+    root = tmp_path / "out"
+    shutil.copytree(few[n], root)
+    note, levels = factory.note, []
+
+    def killed(root: Path, shard: Any, *more: Any) -> None:
+        levels.append(shard.level)
+        if len([level for level in levels if level is not None]) == 2:
+            raise Stop
+        note(root, shard, *more)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(factory, "note", killed)
+        factory.add_reconstructions(root, METHODS[n:], 1)
+    factory.add_reconstructions(root, METHODS[n:], 1)
+    assert_same(root, tree(made))
+
+
+@pytest.fixture
+def begun(few: dict[int, Path], tmp_path: Path) -> Path:
+    """A dataset to some of whose shards a method was added."""
+    root = tmp_path / "begun"
+    shutil.copytree(few[2], root)
+    stop = iter(range(2))
+
+    def advance(work: float, note: str) -> None:
+        if next(stop, None) is None:
+            raise Stop
+
+    with pytest.raises(Stop):
+        factory.add_reconstructions(root, METHODS[2:], 1, Progress(advance=advance))
+    return root
+
+
+def test_no_other_command_ends_an_interrupted_reconstruct(begun: Path, few: dict[int, Path], made: Path) -> None:
+    before, chosen = tree(begun), " ".join(f"--method {name}" for name in METHODS[2:])
+    again = rf"`spadmnist reconstruct \S+ {chosen}` goes on"
+    for file in (few[2].parent / "2.yaml", made.parent / "small.yaml"):
+        with pytest.raises(SpadError, match=again):
+            make(file, begun)
+    for name in (METHODS[0], METHODS[3]):
+        with pytest.raises(SpadError, match=again):
+            factory.add_reconstructions(begun, [name], 1)
+    with pytest.raises(SpadError, match=r"holds another dataset: config\.seed"):
+        make(few[2].parent / "2.yaml", begun, seed=4)
+    assert_same(begun, before)
+    factory.add_reconstructions(begun, METHODS[2:], 1)
+    assert_same(begun, tree(made))
+
+
+def test_an_interrupted_reconstruct_does_not_vouch_for_what_was_changed_meanwhile(
+    begun: Path, few: dict[int, Path]
+) -> None:
+    shard = shards_at(begun)[0]
+    assert shard.read_bytes() != shards_at(few[2])[0].read_bytes()
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(SpadError, match=r"spadmnist verify .* --repair"):
+        factory.add_reconstructions(begun, METHODS[2:], 1)
+    verify.repair(begun, verify.verify(begun), 1)
+    assert_same(begun, tree(few[2]))
+
+
+def test_a_shard_of_another_dataset_is_not_read_as_its_own(few: dict[int, Path], tmp_path: Path) -> None:
+    root, other = tmp_path / "out", tmp_path / "other"
+    shutil.copytree(few[2], root)
+    make(few[2].parent / "2.yaml", other, seed=4)
+    mine, theirs = shards_at(root)[-1], shards_at(other)[-1]
+    if mine.stat().st_size == theirs.stat().st_size:
+        pytest.skip("they have one size")
+    opened = spadmnist.open(root)
+    shutil.copyfile(theirs, mine)
+    with pytest.raises(SpadError, match=rf"this file has {theirs.stat().st_size} bytes, and it had"):
+        opened["5 mlux", "train"].reconstruction["counts"][:]
+    assert_sentence(run("export", root, "-o", tmp_path / "e", "--format", "png"), "spadmnist verify")
+
+
 def test_damage_that_reconstruct_does_not_read_stays_visible(few: dict[int, Path], tmp_path: Path) -> None:
     """The new manifest must not vouch for what was damaged before."""
     root = tmp_path / "out"

@@ -118,6 +118,8 @@ def generate(
                 terminal.print_json(estimate)
             else:
                 terminal.print_lines(plan.text(estimate, root))
+            if there := factory.standing(experiment, images, root):
+                terminal.say(f"Note: {there}")
             return
         workers = workers if jobs else workers.limited(most)
         if jobs is None and workers.local and factory.is_small(experiment, images):

@@ -35,11 +35,13 @@ def inspect(dataset: Path | str, plot: Path | None, as_json: bool) -> None:
     spadmnist inspect out --plot sheet.png
     """
     from .. import dataset as library
-    from .. import disk, measurement, report
+    from .. import disk, measurement, pictures, report
     from ..errors import SpadError
 
     if plot is not None and plot.suffix.lower() != ".png":
         raise SpadError(f"--plot: {plot} is no PNG file; name one that ends in .png")
+    if plot is not None and pictures.is_other(plot):
+        raise SpadError(f"--plot: {plot} is there and is no PNG picture, and is not written over; name another file")
     root = library.at(dataset)
     if isinstance(root, Path) and measurement.is_measurement(root):
         _inspect_measurement(root, plot, as_json)
@@ -256,6 +258,7 @@ def export(
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
     choice = image_exporters.Choice(levels, splits, limit, methods, readouts)
+    image_exporters.check_source(dataset)
     if image_exporters.is_of_images(dataset, format_, choice):
         if ids:
             raise SpadError(f"--capture: belongs to a measurement, and these are images of {dataset}: leave it out")

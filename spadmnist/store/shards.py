@@ -71,6 +71,18 @@ class Encoding(ABC):
             return False
         return stat.S_ISREG(mode) if self.one_file else stat.S_ISDIR(mode)
 
+    def are_files_of(self, path: str, files: Any) -> bool:
+        """Is this what `write` returns for a shard: its own files alone, the one that tells it there is among them?"""
+        place = self.location(path)
+        first = place if self.one_file else f"{place}/zarr.json"
+        return (
+            isinstance(files, dict)
+            and first in files
+            and all(name == first or (name.startswith(f"{place}/") and not self.one_file) for name in files)
+            and all(isinstance(one, dict) and set(one) == {"bytes", "sha256"} for one in files.values())
+            and all(type(one["bytes"]) is int and type(one["sha256"]) is str for one in files.values())
+        )
+
     def count(self, root: str | os.PathLike[str]) -> int:
         """How many shards of a dataset lie there, as it seems."""
         folders = Path(root).glob(f"{self.folder}/*/*/*{self.suffix}")
@@ -177,12 +189,14 @@ class Expected:
 
     attributes: by array, those of the shard itself under ""; None stands for one that must not be there.
     sizes: of dimensions, by name. files: what is known of each file, or None where nothing is; one that is not listed
-    does not belong there.
+    does not belong there. growing: a file below the root, by its name: as long as it is there, arrays are added to the
+    shard's files, which may then have other sizes; "" for files that nothing is added to.
     """
 
     attributes: Mapping[str, Mapping[str, Any]]
     sizes: Mapping[str, int]
     files: Files | None = None
+    growing: str = ""
 
 
 _numbers = itertools.count()  # of the readers of this process
@@ -249,9 +263,9 @@ class ShardReader(ABC):
     def has(self, name: str) -> bool:
         """Whether there is such an array. Raises InputError where it was written and is there no more."""
         there = name in self.names
-        known = None if self._expected is None else self._expected.files
-        if not there and known is not None:
-            self._refuse_lost(name, known)
+        expected = self._expected
+        if not there and expected is not None and expected.files is not None and not expected.growing:
+            self._refuse_lost(name, expected.files)
         return there
 
     def _refuse_lost(self, name: str, known: Files) -> None:
@@ -455,8 +469,12 @@ class ShardReader(ABC):
             known = self._expected.files.get(file)
             if known is None:
                 raise self._refuse(file, "this file does not belong here")
-            if size != known["bytes"]:
+            if size != known["bytes"] and not self._is_growing():
                 raise self._refuse(file, f"this file has {size} bytes, and it had {known['bytes']}")
+
+    def _is_growing(self) -> bool:
+        growing = self._expected.growing if self._expected is not None else ""
+        return bool(growing) and isinstance(self.root, Path) and os.path.lexists(self.root / growing)
 
     def _tail(self, file: str, size: int) -> tuple[bytes, int]:
         """The last `size` bytes of a file (fewer where it is smaller), and its length."""
