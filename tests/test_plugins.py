@@ -478,6 +478,17 @@ def test_a_parameter_is_moved_as_its_kind_says_whatever_its_unit(tmp_path: Path)
     assert not is_edge(depth) and len(first_strengths(depth)) == 1
 
 
+def test_a_phase_needs_no_range(tmp_path: Path) -> None:
+    """`rad` without `off` is a phase, with `search` and without: it is another one in each capture all the same."""
+    turned = 'turn = parameter(0.0, "", "phase in turns", search=(0, 1), kind="phase")'
+    assert turned in BEAT
+    plugins.load_file(written(tmp_path, BEAT.replace(turned, 'turn = parameter(0.0, "rad", "phase", needs="depth")')))
+    sensor = Sensor(Layout(2, 2, 1e-10, 1.0), [Effect.registry.find("detection")(pdp=0.5)], "device").resolved()
+    (added,) = [c for c in candidates(sensor) if c.name == "add beat"]
+    assert added.phases == (("beat", "turn"),)
+    assert [d.key for d in added.shapes] == [("beat", "kilohertz"), ("beat", "ticks")]
+
+
 def test_kinds_are_told_by_units_where_nothing_is_declared() -> None:
     kinds = {f"{e}.{name}": p.kind for e in Effect.registry for name, p in Effect.registry.find(e).parameters.items()}
     assert all(kind in plugins.KINDS for kind in kinds.values())
