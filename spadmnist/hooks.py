@@ -1,4 +1,8 @@
-"""Calls of the hooks of effects: what a hook returns is checked, and an error names the effect and its file."""
+"""Calls of the hooks of effects: what a hook returns is checked, and an error names the effect and its file.
+
+A hook of a user's effect cannot change what it is given, which others use as well: it gets arrays that cannot be
+written. What it returns can be written again, as kernels are compiled for such arrays.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,38 @@ import numpy as np
 
 from .effects import Conditions, Effect
 from .errors import EffectError, InputError, SpadError
-from .events import Children, Events
-from .plugins import blame, source_file
+from .events import Children, Events, SealedEvents, read_only
+from .plugins import blame, is_built_in, source_file
 from .streams import Streams
 
 
 def call(effect: Effect, hook: str, *arguments: Any) -> Any:
     """What a hook returns. Raises EffectError where its code fails."""
     method: Callable[..., Any] = getattr(effect, hook)
+    own = is_built_in(type(effect))
     try:
-        return method(*arguments)
+        return method(*arguments) if own else _opened(method(*map(_sealed, arguments)))
     except (SpadError, InputError):
         raise
     except Exception as error:
         raise blame(type(effect), error) from error
+
+
+def _sealed(argument: Any) -> Any:
+    """What a hook is given, so that it cannot change it."""
+    if isinstance(argument, np.ndarray):
+        return read_only(argument)
+    return SealedEvents(argument) if isinstance(argument, Events) else argument
+
+
+def _opened(found: Any) -> Any:
+    """What a hook returns, so that it can be written."""
+    if isinstance(found, SealedEvents):
+        return found.whole
+    if isinstance(found, Events):
+        for name in ("_times", "offsets", "ticks", "row_pixel", "cause", "parent", "_image_offsets"):
+            setattr(found, name, _opened(getattr(found, name)))
+    return found.copy() if isinstance(found, np.ndarray) and not found.flags.writeable else found
 
 
 def wrong(effect: Effect, what: str) -> EffectError:
@@ -43,12 +65,26 @@ def rng(effect: Effect, streams: Streams, events: Events, suffix: str = "") -> A
 
 def rate(effect: Effect, before: np.ndarray, conditions: Conditions) -> np.ndarray:
     """The rates after an effect of the light, the detection or the dark, 1/s, in the shape of those before."""
-    after = call(effect, "apply", before, conditions)
-    if not isinstance(after, np.ndarray) or after.shape != before.shape or after.dtype != np.float64:
-        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
-        raise wrong(effect, f"apply must return float64 rates of shape {before.shape}, not {what}")
+    after = _rates(effect, "apply", before, conditions)
     if after.size and not 0 <= after.min() <= after.max() < np.inf:
         raise wrong(effect, "apply returns a rate that is negative or not finite")
+    return after
+
+
+def expected(effect: Effect, before: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The mean rates behind an effect by its closed form, 1/s, in the shape of those before it."""
+    after = _rates(effect, "expected_rate", before, conditions)
+    # a difference of rates may be a rounding error below 0
+    if not is_built_in(type(effect)) and not np.all((after >= np.minimum(before, 0.0)) & (after < np.inf)):
+        raise wrong(effect, "expected_rate returns a rate that is negative or not finite")
+    return after
+
+
+def _rates(effect: Effect, hook: str, before: np.ndarray, conditions: Conditions) -> np.ndarray:
+    after = call(effect, hook, before, conditions)
+    if not isinstance(after, np.ndarray) or after.shape != before.shape or after.dtype != np.float64:
+        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
+        raise wrong(effect, f"{hook} must return float64 rates of shape {before.shape}, not {what}")
     return after
 
 

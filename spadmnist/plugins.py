@@ -756,7 +756,14 @@ def blaming(cls: type[Plugin]) -> Iterator[None]:
 
 
 def _what(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    if _CHANGED.search(said):
+        said += "; what it is given is not its own to change: write `x = x + more`, not `x += more`, or copy it"
+    return said
+
+
+# what numpy, and `events.SealedEvents`, say where somebody changes what can only be read
+_CHANGED = re.compile("read-only|of these events cannot be set")
 
 
 def _place(error: BaseException, file: Path) -> str:
