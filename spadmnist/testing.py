@@ -1,4 +1,4 @@
-"""The contract that every effect keeps, and the reconstruction methods; for us and for anybody's own file.
+"""The contract that effects, statistics and reconstruction methods keep; for us and for anybody's own file.
 
     from spadmnist.testing import check_effect
 
@@ -23,18 +23,22 @@ from typing import Any
 
 import numpy as np
 
-from . import config, document, signatures, units
+from . import config, document, hooks, signatures, units
 from .effects import STAGES, Conditions, Effect
 from .errors import ConfigError, SpadError
 from .events import Events, Layout
+from .inference.reduction import reduce_with
+from .inference.replicates import simulated
 from .plugins import Distribution, Parameter, source_file
 from .readout import READOUTS, Recorded
 from .reconstruct import Method, Settings
+from .recording import Capture, Light
 from .sensor import Sensor
 from .signatures import BLOCKS, Shots
+from .statistics import Statistic
 from .streams import BLOCK, Streams
 
-__all__ = ["Report", "check_effect", "check_method", "strong"]
+__all__ = ["Report", "check_effect", "check_method", "check_statistic", "strong"]
 
 MOVED = 6.0  # by so many standard errors the first block of `moves` must change at least
 STAYED = 5.5  # and by no more a block that is not named
@@ -57,6 +61,8 @@ sensor:
 """
 _CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photons/s, exposures of one repetition
 _REPETITIONS = 32
+_RECORDINGS = 24  # of a capture, by which a statistic is checked
+_SCATTER = 8.0  # by such a factor the variance of its cells may differ from their law's: a rule of thumb
 _UNSTATED = 0.01  # relative: a smaller change of the mean need not be stated
 Lights = Mapping[str, tuple[float, int]]
 # what share of white each of its pixels sees, where the effect is one of scenes
@@ -139,6 +145,80 @@ def check_method(method: type[Method] | str) -> None:
         assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
         parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
         assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+
+
+def check_statistic(statistic: type[Statistic] | str) -> None:
+    """Does a statistic keep the contract?
+
+    It reduces recordings of a small sensor, dark and lit, of each of its modalities. It finds the same twice, with no
+    random numbers and without a change of the recording; it has the same cells in each recording of a capture; and they
+    scatter about as their law says.
+
+    Args:
+        statistic: the class or its name.
+
+    Raises:
+        AssertionError: with one sentence, where it does not.
+    """
+    kind: type[Statistic] = Statistic.registry.find(statistic) if isinstance(statistic, str) else statistic
+    if not __debug__:
+        raise AssertionError("Python runs without assertions (-O), which the contract is made of")
+    place = f"{source_file(kind)}: the statistic {kind.name}"
+    assert (kind.__doc__ or "").strip().split("\n")[0].endswith("."), (
+        f"{place}: the docstring must begin with one sentence on one line"
+    )
+    said = 0
+    for modality in kind.modalities:
+        for name, photons in {"dark": 0.0, "dim": 6e4, "bright": 1.2e6}.items():
+            try:
+                said += _reduced(kind, modality, name, photons)
+            except SpadError as error:
+                raise AssertionError(str(error)) from error
+            except AssertionError as error:
+                raise AssertionError(f"{place}, {modality}, {name} light: {error}") from error
+    assert said, f"{place}: it has nothing to say of any recording; reduce returned None for all of them"
+
+
+def _reduced(kind: type[Statistic], modality: str, name: str, photons: float) -> int:
+    """How many recordings of a capture have a summary. Raises AssertionError where one of them is wrong."""
+    sensor = _sensor(None, "device")
+    conditions = _conditions(photons, bits=4 if modality == "counts" else 0)
+    capture = Capture(name, modality, Light(555e-9, 1.0, "lux") if photons else Light(), conditions)
+    numbers = np.arange(_RECORDINGS, dtype=np.uint64)
+    found = []
+    for recording in simulated(sensor, capture, np.full(_RECORDINGS, photons), numbers, seed=1):
+        one, other = (reduce_with(kind(), again) for again in (recording, pickle.loads(pickle.dumps(recording))))
+        assert (one is None) == (other is None), "it has a summary of a recording at one time, and none at another"
+        if one is None or other is None:
+            continue
+        assert np.shape(one.values) == np.shape(other.values) and np.allclose(
+            one.values, other.values, equal_nan=True
+        ), "it finds other values in the same recording at another time; it may draw no random numbers"
+        found.append(one)
+        cells = found[0].values.size
+        assert one.values.size == cells, (
+            f"it has {cells} cells in one recording and {one.values.size} in another of the same capture; their number "
+            "may depend on the conditions and the layout alone"
+        )
+    if found:
+        _as_its_law(found[0].law, np.array([one.values for one in found], np.float64))
+    return len(found)
+
+
+def _as_its_law(law: str, values: np.ndarray) -> None:
+    """Raises AssertionError where the cells of (recordings, cells) scatter otherwise by far."""
+    if len(values) < _RECORDINGS:
+        return
+    mean, variance = values.mean(axis=0), values.var(axis=0, ddof=1)
+    seen = mean > 5 if law == "poisson" else mean > 0
+    if law == "exact":
+        assert not np.ptp(values, axis=0).any(), "its law is exact, but its cells differ from recording to recording"
+    elif law in ("poisson", "exponential") and seen.any():
+        ratio = float(np.mean(variance[seen] / (mean[seen] if law == "poisson" else mean[seen] ** 2)))
+        assert 1 / _SCATTER < ratio < _SCATTER, (
+            f"by the law {law} the variance of a cell is its mean{' squared' * (law == 'exponential')}, but here it is "
+            f"{ratio:.2g} times that; normal is the law of values whose spread is not known"
+        )
 
 
 def captured() -> list[str]:
@@ -473,7 +553,10 @@ def _expected_rate(trial: _Trial) -> str | None:
 
     Within 5 standard errors and 2 % of the change that the effect makes: some laws are first orders or bounds.
     """
-    stated = trial.kind.expected_rate is not Effect.expected_rate or trial.kind.has_mean
+    written = trial.kind.expected_rate is not Effect.expected_rate
+    if trial.kind.stage in ("light", "detection", "dark"):
+        return _as_applied(trial) if written else "it has none of its own, and needs none: it is apply"
+    stated = written or trial.kind.has_mean
     lacking = ("correlated", "dead_time")
     sensor, plain = trial.sensor("device", lacking=lacking), _sensor(None, "device", None, trial.kind.name, lacking)
     for name, (light, _) in _CAPTURES.items():
@@ -494,6 +577,23 @@ def _expected_rate(trial: _Trial) -> str | None:
             "and 2 % of the change"
         )
     return None if stated else "it has none of its own"
+
+
+def _as_applied(trial: _Trial) -> str | None:
+    """The closed form of an effect on rates is what it does to them, in every pixel."""
+    effect = trial.sensor("device").effect(trial.kind.name)
+    assert effect is not None
+    pixels = _base().sensor.layout.pixels
+    for name, (light, _) in _CAPTURES.items():
+        before = light * np.linspace(0.5, 1.5, pixels)[None]
+        conditions = _conditions(light)
+        after, told = (hook(effect, before, conditions) for hook in (hooks.rate, hooks.expected))
+        pixel = int(np.argmax(np.abs(told - after)))
+        assert np.allclose(told, after, rtol=1e-6), (
+            f"in the {name} capture apply makes {after[0, pixel]:.6g}/s of {before[0, pixel]:.6g}/s in pixel {pixel}, "
+            f"but expected_rate {told[0, pixel]:.6g}/s; leave it out, or write expected_rate = apply"
+        )
+    return None
 
 
 def _moves(trial: _Trial) -> str | None:
