@@ -100,7 +100,7 @@ def added(effect: Effect, shape: tuple[int, ...], conditions: Conditions) -> np.
 def maximum(effect: Effect, conditions: Conditions) -> float:
     """The largest factor by which an arrival effect multiplies its part of the rate."""
     top = call(effect, "maximum", conditions)
-    if not isinstance(top, (int, float, np.floating)) or not 0 <= top < np.inf:
+    if not isinstance(top, int | float | np.integer | np.floating) or not 0 <= top < np.inf:
         raise wrong(effect, f"maximum must return one finite number, not negative; it returns {top!r}")
     return float(top)
 
@@ -142,6 +142,8 @@ def spawned(
     if not isinstance(children, Children):
         raise wrong(effect, f"spawn must return Children, not {type(children).__name__}")
     parent, delay = np.asarray(children.parent), np.asarray(children.delay, np.float64)
+    if parent.dtype == bool:
+        raise wrong(effect, "the parents of children are a mask; give their indices: parent = np.flatnonzero(mask)")
     good = parent.ndim == 1 and parent.shape == delay.shape and (parent.dtype.kind in "iu" or not len(parent))
     if not good or (len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0))):
         raise wrong(effect, f"children need a parent among the {len(events)} events and a delay that is not negative")
@@ -173,7 +175,7 @@ def blind_time(effect: Effect, pixels: int) -> np.ndarray:
 def carried(effect: Effect) -> float:
     """The share of the remaining blind time with which a pixel enters the next frame."""
     share = call(effect, "carried")
-    if not isinstance(share, (int, float, np.floating)) or not 0 <= share <= 1:
+    if not isinstance(share, int | float | np.integer | np.floating) or not 0 <= share <= 1:
         raise wrong(effect, f"carried must return a share from 0 to 1, not {share!r}")
     return float(share)
 
@@ -201,7 +203,7 @@ def recovered(effect: Effect, chance: np.ndarray) -> np.ndarray:
 def influence(effect: Effect) -> float:
     """How far an effect's events matter, pitches."""
     reach = call(effect, "influence")
-    if not isinstance(reach, (int, float, np.floating)) or not reach >= 0:
+    if not isinstance(reach, int | float | np.integer | np.floating) or not reach >= 0:
         raise wrong(effect, f"influence must return pitches, not negative, or inf; it returns {reach!r}")
     return float(reach)
 
@@ -210,7 +212,8 @@ def limit(effect: Effect, counts: np.ndarray) -> np.ndarray:
     """The counts that a readout effect leaves, in the shape and type of those before."""
     after = call(effect, "limit", counts)
     if not isinstance(after, np.ndarray) or (after.shape, after.dtype) != (counts.shape, counts.dtype):
-        raise wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}")
+        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
+        raise wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}, not {what}")
     return after
 
 
@@ -221,6 +224,9 @@ def applied(effect: Effect, events: Events, streams: Streams, suffix: str = "") 
 
 def checked(effect: Effect, after: Any, events: Events) -> Events:
     """What a hook has made of events; it is looked at where the hook's draws are not counted, as in plug-ins."""
+    if effect.stage == "timing" and isinstance(after, Events) and len(after) != len(events):
+        made = f"apply must not add or remove stamps, but it makes {len(after)} of {len(events)}"
+        raise wrong(effect, f"{made}; an effect of the stage readout may lose some")
     if not effect.counted:
         end = events.end
         if end is not None and len(events):  # a clock that rounds to the nearest tick may have reached the end
@@ -228,6 +234,8 @@ def checked(effect: Effect, after: Any, events: Events) -> Events:
         what = after.problem(end) if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
         if not what and len(after.offsets) != len(events.offsets):
             what = f"it has {len(after.offsets) - 1} rows, not {len(events.offsets) - 1}"
+        if not what and effect.stage == "timing" and not np.array_equal(after.offsets, events.offsets):
+            what = "its rows have other numbers of stamps; apply must leave each stamp in its row"
         if not what and events.cause is not None and (after.cause is None or len(after.cause) != len(after)):
             what = "the causes of the events are gone; use events.keep, events.moved or events.stamped"
         if what:

@@ -25,7 +25,7 @@ import numpy as np
 
 from . import config, document, hooks, signatures, units
 from .effects import STAGES, Conditions, Effect
-from .errors import ConfigError, SpadError
+from .errors import ConfigError, SpadError, did_you_mean
 from .events import Events, Layout
 from .inference.reduction import reduce_with
 from .inference.replicates import simulated
@@ -63,6 +63,7 @@ _CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photon
 _REPETITIONS = 32
 _RECORDINGS = 24  # of a capture, by which a statistic is checked
 _SCATTER = 8.0  # by such a factor the variance of its cells may differ from their law's: a rule of thumb
+_CHILDREN, _MOST_EVENTS = 4000, 400_000  # by so many a `hazard` is checked, of so many events at most
 _UNSTATED = 0.01  # relative: a smaller change of the mean need not be stated
 Lights = Mapping[str, tuple[float, int]]
 # what share of white each of its pixels sees, where the effect is one of scenes
@@ -411,8 +412,22 @@ def _declarations(trial: _Trial) -> None:
         trial.warnings.append(f"{where}: its docstring does not say where it is known from; add a line Source: ...")
     have = [all(callable(getattr(kind, hook, None)) for hook in way.split("+")) for way in STAGES[kind.stage]]
     assert any(have), f"it must define {' or '.join(STAGES[kind.stage])}"
+    assert not isinstance(kind.moves, str), f"moves is {kind.moves!r}; write moves = ({kind.moves!r},)"
     unknown = sorted(set(kind.moves) - set(BLOCKS))
     assert not unknown, f"moves names {', '.join(unknown)}, but the statistics are {', '.join(BLOCKS)}"
+    if kind.after is not None:
+        near = did_you_mean(kind.after, Effect.registry)
+        assert kind.after in set(Effect.registry), f"after names {kind.after!r}, which is not an effect.{near}"
+        other = Effect.registry.find(kind.after).stage
+        assert other == kind.stage, f"after names {kind.after}, which is of the stage {other}, and not of {kind.stage}"
+    for name, p in kind.parameters.items():
+        if p.informed_by:
+            near = did_you_mean(p.informed_by, Statistic.registry)
+            said = f"informed_by of {name} names {p.informed_by!r}"
+            assert p.informed_by in set(Statistic.registry), f"{said}, which is not a statistic that is loaded.{near}"
+            teller: type[Statistic] = Statistic.registry.find(p.informed_by)
+            tells = teller.unit_likelihood is not Statistic.unit_likelihood
+            assert tells, f"{said}, which defines no unit_likelihood"
     for name in trial.values:
         assert name in kind.parameters, f"it has no parameter {name}"
     for name, p in kind.parameters.items():
@@ -426,6 +441,14 @@ def _declarations(trial: _Trial) -> None:
             except ValueError as error:
                 raise AssertionError(f"{where} of {name}: {error}") from None
         assert p.search is None or p.search[0] < p.search[1], f"search of {name} ends before it begins: {p.search}"
+
+
+def _is_looked_for(trial: _Trial) -> str | None:
+    """Whether a diagnosis may add it: some parameter says where the effect vanishes, and where it is looked for."""
+    declared = trial.kind.parameters.values()
+    if any(p.off is not None and (p.search is not None or p.per in ("row", "column", "code")) for p in declared):
+        return None
+    return "no parameter has both `off` and `search`: diagnose never adds it, though a sensor may have it"
 
 
 def _bounds(trial: _Trial) -> None:
@@ -530,6 +553,62 @@ def _edge_cases(trial: _Trial) -> None:
             _sound(_expose(sensor, photons, conditions), sensor, conditions, what)
 
 
+def _never_falling(trial: _Trial) -> str | None:
+    """A pixel's sensitivity rises, or stays, with the time since its blind time; a number drawn for an event says when
+    it is high enough."""
+    if not hasattr(trial.kind, "sensitivity"):
+        return "it has no sensitivity"
+    effect = trial.sensor("device").effect(trial.kind.name)
+    assert effect is not None
+    times = np.append(0.0, np.geomspace(1e-12, 10.0, 4000))
+    found = np.asarray(hooks.call(effect, "sensitivity", times))
+    assert found.shape == times.shape, f"sensitivity returns the shape {found.shape} for times {times.shape}"
+    assert np.all((found >= 0) & (found <= 1)), "sensitivity returns numbers that are not between 0 and 1"
+    falls = np.diff(found) < -1e-9
+    at = int(np.argmax(falls))
+    assert not falls.any(), (
+        f"sensitivity falls from {found[at]:.4g} to {found[at + 1]:.4g} between {units.show(times[at], 's')} and "
+        f"{units.show(times[at + 1], 's')}; it must never fall"
+    )
+    return None
+
+
+def _hazard(trial: _Trial) -> str | None:
+    """What `spawn` does is what `hazard` says, within 5 standard errors and 2 %: some are first orders."""
+    if trial.kind.stage != "correlated" or trial.kind.hazard is Effect.hazard:
+        return "it has none"
+    sensor = trial.sensor("device")
+    effect = sensor.effect(trial.kind.name)
+    assert effect is not None
+    pixels = sensor.layout.pixels
+    said = hooks.call(effect, "hazard", pixels)
+    if said is None:
+        return "it has none at these values"
+    chance = np.broadcast_to(-np.expm1(-np.asarray(said[0], np.float64)), pixels)
+    assert np.all((chance >= 0) & (chance < 1)), "hazard returns -ln(1 - p) of a p that is not between 0 and 1"
+    each = int(np.clip(_CHILDREN / max(float(chance.mean()) * pixels * BLOCK, 1e-9), 1, _MOST_EVENTS / pixels / BLOCK))
+    rows = pixels * BLOCK
+    times = np.tile(np.arange(each) * 1e-3, rows)
+    events = Events(times, np.arange(rows + 1) * each, pixels, end=each * 1e-3)
+    streams = Streams(1, "contract", "hazard", np.arange(BLOCK, dtype=np.uint64))
+    late, row, parent = hooks.spawned(effect, events, np.zeros(pixels), streams, "")
+    assert np.array_equal(row, events.rows[parent]), "it has a hazard, but some of its children are in other pixels"
+    assert len(np.unique(parent)) == len(parent), "it has a hazard, but an event has several children"
+    wanted = float(chance.sum()) * BLOCK * each
+    error = 5 * math.sqrt(max(wanted, 1.0)) + 0.02 * wanted
+    assert abs(len(parent) - wanted) <= error, (
+        f"of {len(events)} events {len(parent)} have a child, but by hazard it is {wanted:.6g}; hazard returns "
+        "-ln(1 - p) and the mean time"
+    )
+    if len(parent):
+        mean, told = float(np.mean(late - events.times[parent])), float(said[1])
+        assert abs(mean - told) <= (5 / math.sqrt(len(parent)) + 0.02) * told, (
+            f"children come {units.show(mean, 's')} after their parents in the mean, but hazard says "
+            f"{units.show(told, 's')}"
+        )
+    return None
+
+
 def _influence(trial: _Trial) -> str | None:
     """No event fires a pixel that lies farther away than the effect says. What a readout shares does not show here."""
     if trial.kind.stage != "correlated":
@@ -618,11 +697,14 @@ def _moves(trial: _Trial) -> str | None:
 
 _CHECKS: tuple[Callable[[_Trial], str | None], ...] = (
     _declarations,
+    _is_looked_for,
     _bounds,
     _off_is_the_identity,
     _invariants,
     _same_stream_same_result,
     _edge_cases,
+    _never_falling,
+    _hazard,
     _influence,
     _expected_rate,
     _moves,

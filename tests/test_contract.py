@@ -156,6 +156,8 @@ def test_somebody_elses_effect_keeps_it(planted: Any, stage: str, body: str) -> 
     assert check_effect(planted(body, stage)).checks["moves"] == "kept"
 
 
+NOBODY = "declarations: after names 'illumination_gradent', which is not an effect. Did you mean illumination_gradient"
+
 # what is wrong -> (stage, body, the check that says so and what it says)
 FAULTS = {
     "an echo in the next pixel": (
@@ -302,6 +304,61 @@ FAULTS = {
 }
 
 
+RATES = """
+    def apply(self, rate, conditions):
+        return rate * (1 - self.p)
+"""
+AWAKE = """
+    p = chance()
+
+    def sensitivity(self, u):
+        return {rises}
+"""
+FAULTS |= {
+    "behind nobody": ("light", f'    after = "illumination_gradent"\n    p = chance()\n{RATES}', NOBODY),
+    "behind one of another stage": (
+        "light",
+        f'    after = "jitter"\n    p = chance()\n{RATES}',
+        "declarations: after names jitter, which is of the stage timing, and not of light",
+    ),
+    "informed by nothing": (
+        "light",
+        f'    p = chance(per_pixel=True, informed_by="pixel_map_")\n{RATES}',
+        "declarations: informed_by of p names 'pixel_map_', which is not .* Did you mean pixel_map",
+    ),
+    "informed by what tells nothing": (
+        "light",
+        f'    p = chance(per_pixel=True, informed_by="pixel_map")\n{RATES}',
+        "declarations: informed_by of p names 'pixel_map', which defines no unit_likelihood",
+    ),
+    "a word that moves": (
+        "light",
+        f'    moves = "level"\n    p = chance()\n{RATES}',
+        r"declarations: moves is 'level'; write moves = \('level',\)",
+    ),
+    "a sensitivity that falls": (
+        "dead_time",
+        AWAKE.format(rises="np.where(u < 1e-7, 1.0, 1.0 - self.p)"),
+        "never falling: sensitivity falls from 1 to .* between .* and 100.* ns; it must never fall",
+    ),
+    "a hazard of another chance": (
+        "correlated",
+        ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return 2 * self.p, 1e-6\n",
+        r"hazard: of \d+ events \d+ have a child, but by hazard it is",
+    ),
+    "a hazard of another time": (
+        "correlated",
+        ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 5e-6\n",
+        "hazard: children come .* after .* but hazard says 5 us",
+    ),
+    "a hazard in another pixel": (
+        "correlated",
+        ECHO.format(row=NEXT_PIXEL) + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 1e-6\n",
+        "hazard: it has a hazard, but some of its children are in other pixels",
+    ),
+}
+
+
 @pytest.mark.parametrize("fault", [name for name, (_, _, says) in FAULTS.items() if says])
 def test_a_fault_is_found(fault: str, planted: Any, tmp_path: Path) -> None:
     stage, body, says = FAULTS[fault]
@@ -316,6 +373,20 @@ def test_what_says_nothing_of_itself_is_only_noted(planted: Any) -> None:
     report = check_effect(planted(FAULTS["an effect that does nothing"][1], "light"))
     assert report.checks["moves"] == "no `moves` is declared; it moved nothing"
     assert not report.warnings and "warning" not in str(report)
+
+
+def test_a_hazard_that_is_right_keeps_it(planted: Any) -> None:
+    body = ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 1e-6\n"
+    assert check_effect(planted(body)).checks["hazard"] == "kept"
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [("off=None", "no parameter has both"), ("search=None", "diagnose never adds it"), ("", "kept")],
+)
+def test_what_is_never_looked_for_is_noted(how: str, says: str, planted: Any) -> None:
+    report = check_effect(planted(f"    p = chance({how})\n{RATES}", "light"))
+    assert says in report.checks["is looked for"]
 
 
 def test_an_effect_without_a_source_is_warned_of(planted: Any, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from spadmnist.effects.tdc import Tdc
 from spadmnist.errors import ConfigError, EffectError
 from spadmnist.events import Children, Events, Layout
 from spadmnist.experiment import Experiment, Level
+from spadmnist.hooks import influence
 from spadmnist.images import Images
 from spadmnist.readout import Recorded, no_detection, unsigned_for
 from spadmnist.sensor import Sensor
@@ -553,6 +554,13 @@ def _children(**bad: Any) -> Any:
     return spawn
 
 
+def _one_on(offsets: np.ndarray) -> np.ndarray:
+    """One event of the second row goes to the first."""
+    return (
+        np.append(offsets[0], np.append(offsets[1] + (len(offsets) > 2), offsets[2:])) if len(offsets) > 1 else offsets
+    )
+
+
 BAD: list[tuple[str, dict[str, Any], str]] = [
     ("light", {"apply": _raise}, "raises"),
     ("light", {"apply": lambda self, rate, c: None}, "none"),
@@ -589,6 +597,13 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("timing", {"apply": _fewer_rows}, "rows"),
     ("timing", {"apply": lambda self, e, rng: Events(e.times - 1.0, e.offsets, e.pixels)}, "before 0"),
     ("timing", {"apply": lambda self, e, rng: Events(e.times * np.nan, e.offsets, e.pixels)}, "nan"),
+    ("timing", {"apply": lambda self, e, rng: e.keep(np.arange(len(e)) % 2 > 0)}, "must not add or remove stamps"),
+    (
+        "timing",
+        {"apply": lambda self, e, rng: Events(e.times * 0, _one_on(e.offsets), e.pixels)},
+        "each stamp in its row",
+    ),
+    ("correlated", {"spawn": _children(parent=np.array([True]))}, "are a mask; give their indices"),
     ("readout", {"apply": _raise}, "raises"),
     ("readout", {"apply": _unsorted}, "unsorted"),
     ("readout", {"apply": lambda self, events, rng: None}, "none"),
@@ -608,6 +623,34 @@ def test_a_strangers_mistake_is_named(stage: str, hooks: dict[str, Any], wrong: 
         one.simulate(one.levels[0], "train", images, 0, BLOCK)
     sentence = str(caught.value)
     assert "stranger" in sentence and Path(__file__).name in sentence and "\n" not in sentence
+    assert wrong in sentence or len(wrong.split()) < 5  # the words of the longer ones are its own
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_the_effect_that_loses_first_stamps_is_named() -> None:
+    """And not the last one of its stage, the converter."""
+    define("timing", apply=lambda self, events, rng: events.keep(rng.random(len(events)) < 0.5))
+    one = experiment("detection: {}, stranger: {}, tdc: {}", readouts="[str]")
+    with pytest.raises(EffectError, match="the effect stranger: apply must not add or remove stamps, but it makes"):
+        one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK)
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_whole_numbers_of_numpy_are_numbers() -> None:
+    define("arrival", factor=lambda self, t, c: np.ones(len(t)), maximum=lambda self, c: np.int64(1))
+    one = experiment("detection: {}, stranger: {}", readouts="[tr]")
+    assert one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK).tr is not None
+    define("dead_time", carried=lambda self: np.int64(1), influence=lambda self: np.int64(2))
+    one = experiment("detection: {}, dead_time: {}, stranger: {}", readouts="[tr]")
+    assert one.sensor.carried == 1.0 and influence(one.sensor.effect("stranger")) == 2.0  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_a_limit_of_another_type_says_what_it_is() -> None:
+    define("readout", limit=lambda self, counts: counts.astype(float))
+    one = experiment("detection: {}, stranger: {}", readouts="[counts], bits: 1")
+    with pytest.raises(EffectError, match=r"limit must return counts of shape .* and type uint8, not float64 of shape"):
+        one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK)
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "readout": ("apply", "limit"),
 }
 
+ACTS_ON = ("light", "dark", "own")  # what an arrival effect may vary
 
 # number of times at which the default of `expected_rate` takes its mean. A gate that opens for a third of each of 500
 # frames comes out within 2e-3; the light of a capture is rarely known to 1e-2
@@ -186,7 +187,7 @@ class Effect(Plugin, abstract=True):
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
     # its closed forms are those of each pixel by itself, so that a part of a chip needs no other part's
     by_pixel: ClassVar[bool] = False
-    acts_on: ClassVar[str] = "light"  # arrival stage: "light", "dark" or "own"
+    acts_on: ClassVar[str] = "light"  # arrival stage: one of `ACTS_ON`
     cause: ClassVar[str] = (
         ""  # dark, arrival ("own") and correlated stage: what its events are called; default: its name
     )
@@ -207,6 +208,15 @@ class Effect(Plugin, abstract=True):
     states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
+        plugins.check_names(cls)
+        if "__init__" in vars(cls):
+            raise TypeError(
+                f"{cls.__name__}: an effect has no __init__ of its own: its parameters are set for it; what is worked "
+                "out of them belongs into made(self, chip)"
+            )
+        if cls.acts_on not in ACTS_ON:
+            near = did_you_mean(str(cls.acts_on), ACTS_ON)
+            raise TypeError(f"{cls.__name__}: acts_on is {cls.acts_on!r}; it is one of {', '.join(ACTS_ON)}.{near}")
         if stage is not None:
             cls.stage = stage
         chosen = getattr(cls, "stage", None)
