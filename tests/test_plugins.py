@@ -223,6 +223,8 @@ LINES = [
     ("acts on", PULSE.replace("PASS", "acts_on = 'drak'"), 4, "acts_on is 'drak'; it is one of light, dark, own. Did"),
     ("needs", PULSE.replace("PASS", "a = parameter(1.0, '', 'x', needs='deph')"), 4, "Did you mean depth?"),
     ("__init__", PULSE.replace("PASS", "__init__ = print"), 4, "belongs into made(self, chip)"),
+    ("own __init__", PULSE.replace("PASS", "def __init__(self): pass"), 4, "does not take the values"),
+    ("first of __init__", PULSE.replace("PASS", "def __init__(self, x, **more): pass"), 4, "leave it out"),
     *((name, PULSE.replace("depth", name).replace("PASS", ""), 4, f"cannot be called {name}, which") for name in TAKEN),
 ]  # fmt: skip
 

@@ -38,6 +38,7 @@ pixel a value that depends on that pixel alone.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -209,9 +210,9 @@ class Effect(Plugin, abstract=True):
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
         plugins.check_names(cls)
-        if "__init__" in vars(cls):
+        if "__init__" in vars(cls) and not _takes_any_values(vars(cls)["__init__"]):
             raise TypeError(
-                f"{cls.__name__}: an effect has no __init__ of its own: its parameters are set for it; what is worked "
+                f"{cls.__name__}: __init__ does not take the values of its parameters; leave it out: what is worked "
                 "out of them belongs into made(self, chip)"
             )
         if cls.acts_on not in ACTS_ON:
@@ -334,6 +335,16 @@ class Effect(Plugin, abstract=True):
         correlated events and for a readout, which pixels may share, otherwise 0.
         """
         return math.inf if self.stage in ("correlated", "readout") else 0.0
+
+
+def _takes_any_values(made: Any) -> bool:
+    """Whether a function can be called with values by name alone, whichever they are."""
+    try:
+        _, *given = inspect.signature(made).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    free = [one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL) or one.default is not one.empty for one in given]
+    return all(free) and any(one.kind is one.VAR_KEYWORD for one in given)
 
 
 def in_order(effects: list[Effect]) -> list[Effect]:
