@@ -383,6 +383,55 @@ class Events:
         return None
 
 
+def read_only(array: np.ndarray) -> np.ndarray:
+    """The same array, which cannot be written through what is returned."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class SealedEvents(Events):
+    """Events as somebody else's code gets them: neither they nor their arrays can be changed.
+
+    What is made of them can be: `keep`, `moved` and `stamped` are those of the events themselves.
+
+    whole: the events themselves.
+    """
+
+    __slots__ = ("whole",)
+
+    def __init__(self, whole: Events):
+        own = (whole.offsets, whole.ticks, whole.row_pixel, whole.cause, whole.parent, whole._image_offsets)
+        offsets, ticks, row_pixel, cause, parent, images = (None if a is None else read_only(a) for a in own)
+        assert offsets is not None
+        super().__init__(
+            None, offsets, whole.pixels, ticks, whole.tick, row_pixel, whole.end, cause, parent, image_offsets=images
+        )
+        self.whole = whole
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if hasattr(self, "whole"):
+            raise AttributeError(f"the {name} of these events cannot be set")
+        object.__setattr__(self, name, value)
+
+    @property
+    def times(self) -> np.ndarray:
+        """(events,) s."""
+        return read_only(self.whole.times)
+
+    def keep(self, mask: np.ndarray) -> Events:
+        """The events for which `mask` (events,) is true."""
+        return self.whole.keep(mask)
+
+    def moved(self, times: np.ndarray) -> Events:
+        """The same events at other times (s), see `Events.moved`."""
+        return self.whole.moved(times)
+
+    def stamped(self, ticks: np.ndarray, tick: float) -> Events:
+        """The same events with whole ticks (events,) of a converter in place of their times."""
+        return self.whole.stamped(ticks, tick)
+
+
 def longest_gap(stamps: np.ndarray, start: float, end: float) -> tuple[float, int]:
     """(the longest gap between neighbours of all stamps, in any order, with start and end; how many are before `end`).
 

@@ -1,4 +1,8 @@
-"""Calls of the hooks of effects: what a hook returns is checked, and an error names the effect and its file."""
+"""Calls of the hooks of effects: what a hook returns is checked, and an error names the effect and its file.
+
+A hook of a user's effect cannot change what it is given, which others use as well: it gets arrays that cannot be
+written. What it returns can be written again, as kernels are compiled for such arrays.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,38 @@ import numpy as np
 
 from .effects import Conditions, Effect
 from .errors import EffectError, InputError, SpadError
-from .events import Children, Events
-from .plugins import blame, source_file
+from .events import Children, Events, SealedEvents, read_only
+from .plugins import blame, is_built_in, source_file
 from .streams import Streams
 
 
 def call(effect: Effect, hook: str, *arguments: Any) -> Any:
     """What a hook returns. Raises EffectError where its code fails."""
     method: Callable[..., Any] = getattr(effect, hook)
+    own = is_built_in(type(effect))
     try:
-        return method(*arguments)
+        return method(*arguments) if own else _opened(method(*map(_sealed, arguments)))
     except (SpadError, InputError):
         raise
     except Exception as error:
         raise blame(type(effect), error) from error
+
+
+def _sealed(argument: Any) -> Any:
+    """What a hook is given, so that it cannot change it."""
+    if isinstance(argument, np.ndarray):
+        return read_only(argument)
+    return SealedEvents(argument) if isinstance(argument, Events) else argument
+
+
+def _opened(found: Any) -> Any:
+    """What a hook returns, so that it can be written."""
+    if isinstance(found, SealedEvents):
+        return found.whole
+    if isinstance(found, Events):
+        for name in ("_times", "offsets", "ticks", "row_pixel", "cause", "parent", "_image_offsets"):
+            setattr(found, name, _opened(getattr(found, name)))
+    return found.copy() if isinstance(found, np.ndarray) and not found.flags.writeable else found
 
 
 def wrong(effect: Effect, what: str) -> EffectError:
@@ -43,12 +65,26 @@ def rng(effect: Effect, streams: Streams, events: Events, suffix: str = "") -> A
 
 def rate(effect: Effect, before: np.ndarray, conditions: Conditions) -> np.ndarray:
     """The rates after an effect of the light, the detection or the dark, 1/s, in the shape of those before."""
-    after = call(effect, "apply", before, conditions)
-    if not isinstance(after, np.ndarray) or after.shape != before.shape or after.dtype != np.float64:
-        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
-        raise wrong(effect, f"apply must return float64 rates of shape {before.shape}, not {what}")
+    after = _rates(effect, "apply", before, conditions)
     if after.size and not 0 <= after.min() <= after.max() < np.inf:
         raise wrong(effect, "apply returns a rate that is negative or not finite")
+    return after
+
+
+def expected(effect: Effect, before: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The mean rates behind an effect by its closed form, 1/s, in the shape of those before it."""
+    after = _rates(effect, "expected_rate", before, conditions)
+    # a difference of rates may be a rounding error below 0
+    if not is_built_in(type(effect)) and not np.all((after >= np.minimum(before, 0.0)) & (after < np.inf)):
+        raise wrong(effect, "expected_rate returns a rate that is negative or not finite")
+    return after
+
+
+def _rates(effect: Effect, hook: str, before: np.ndarray, conditions: Conditions) -> np.ndarray:
+    after = call(effect, hook, before, conditions)
+    if not isinstance(after, np.ndarray) or after.shape != before.shape or after.dtype != np.float64:
+        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
+        raise wrong(effect, f"{hook} must return float64 rates of shape {before.shape}, not {what}")
     return after
 
 
@@ -64,7 +100,7 @@ def added(effect: Effect, shape: tuple[int, ...], conditions: Conditions) -> np.
 def maximum(effect: Effect, conditions: Conditions) -> float:
     """The largest factor by which an arrival effect multiplies its part of the rate."""
     top = call(effect, "maximum", conditions)
-    if not isinstance(top, (int, float, np.floating)) or not 0 <= top < np.inf:
+    if not isinstance(top, int | float | np.integer | np.floating) or not 0 <= top < np.inf:
         raise wrong(effect, f"maximum must return one finite number, not negative; it returns {top!r}")
     return float(top)
 
@@ -106,6 +142,8 @@ def spawned(
     if not isinstance(children, Children):
         raise wrong(effect, f"spawn must return Children, not {type(children).__name__}")
     parent, delay = np.asarray(children.parent), np.asarray(children.delay, np.float64)
+    if parent.dtype == bool:
+        raise wrong(effect, "the parents of children are a mask; give their indices: parent = np.flatnonzero(mask)")
     good = parent.ndim == 1 and parent.shape == delay.shape and (parent.dtype.kind in "iu" or not len(parent))
     if not good or (len(parent) and (parent.min() < 0 or parent.max() >= len(events) or not np.all(delay >= 0))):
         raise wrong(effect, f"children need a parent among the {len(events)} events and a delay that is not negative")
@@ -137,7 +175,7 @@ def blind_time(effect: Effect, pixels: int) -> np.ndarray:
 def carried(effect: Effect) -> float:
     """The share of the remaining blind time with which a pixel enters the next frame."""
     share = call(effect, "carried")
-    if not isinstance(share, (int, float, np.floating)) or not 0 <= share <= 1:
+    if not isinstance(share, int | float | np.integer | np.floating) or not 0 <= share <= 1:
         raise wrong(effect, f"carried must return a share from 0 to 1, not {share!r}")
     return float(share)
 
@@ -165,7 +203,7 @@ def recovered(effect: Effect, chance: np.ndarray) -> np.ndarray:
 def influence(effect: Effect) -> float:
     """How far an effect's events matter, pitches."""
     reach = call(effect, "influence")
-    if not isinstance(reach, (int, float, np.floating)) or not reach >= 0:
+    if not isinstance(reach, int | float | np.integer | np.floating) or not reach >= 0:
         raise wrong(effect, f"influence must return pitches, not negative, or inf; it returns {reach!r}")
     return float(reach)
 
@@ -174,7 +212,8 @@ def limit(effect: Effect, counts: np.ndarray) -> np.ndarray:
     """The counts that a readout effect leaves, in the shape and type of those before."""
     after = call(effect, "limit", counts)
     if not isinstance(after, np.ndarray) or (after.shape, after.dtype) != (counts.shape, counts.dtype):
-        raise wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}")
+        what = f"{after.dtype} of shape {after.shape}" if isinstance(after, np.ndarray) else type(after).__name__
+        raise wrong(effect, f"limit must return counts of shape {counts.shape} and type {counts.dtype}, not {what}")
     return after
 
 
@@ -185,6 +224,9 @@ def applied(effect: Effect, events: Events, streams: Streams, suffix: str = "") 
 
 def checked(effect: Effect, after: Any, events: Events) -> Events:
     """What a hook has made of events; it is looked at where the hook's draws are not counted, as in plug-ins."""
+    if effect.stage == "timing" and isinstance(after, Events) and len(after) != len(events):
+        made = f"apply must not add or remove stamps, but it makes {len(after)} of {len(events)}"
+        raise wrong(effect, f"{made}; an effect of the stage readout may lose some")
     if not effect.counted:
         end = events.end
         if end is not None and len(events):  # a clock that rounds to the nearest tick may have reached the end
@@ -192,6 +234,8 @@ def checked(effect: Effect, after: Any, events: Events) -> Events:
         what = after.problem(end) if isinstance(after, Events) else f"it is a {type(after).__name__}, not Events"
         if not what and len(after.offsets) != len(events.offsets):
             what = f"it has {len(after.offsets) - 1} rows, not {len(events.offsets) - 1}"
+        if not what and effect.stage == "timing" and not np.array_equal(after.offsets, events.offsets):
+            what = "its rows have other numbers of stamps; apply must leave each stamp in its row"
         if not what and events.cause is not None and (after.cause is None or len(after.cause) != len(after)):
             what = "the causes of the events are gone; use events.keep, events.moved or events.stamped"
         if what:

@@ -314,8 +314,6 @@ class Line:
             )
             for effect in self.sensor.at("timing"):
                 first = hooks.applied(effect, first, self.streams, "/frames")
-            if len(first) != len(stamps):
-                raise hooks.wrong(self.sensor.at("timing")[-1], "apply must not add or remove stamps")
             ticks, tick = first.ticks, first.tick
             if ticks is not None and tick is not None:
                 # what rounds to the end of the frame would mean 'none'

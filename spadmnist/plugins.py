@@ -140,7 +140,21 @@ def parameter(
     if choices and default not in choices:
         raise TypeError(f"{default!r} is none of the choices {', '.join(choices)}")
     if unit != "bool" and not units.is_known(unit):
-        raise TypeError(f"{unit!r} is not an SI unit that is known here")
+        known = next((si for si in units.known() if unit in units.allowed_units(si).split(", ")), None)
+        how = (
+            f"write {known!r}, and all numbers in it"
+            if known
+            else f"the units are {', '.join(filter(None, units.known()))}"
+        )
+        raise TypeError(f"{unit!r} is not an SI unit that is known here; {how}")
+    for what, pair in (("bounds", bounds), ("search", search)):
+        pairs = isinstance(pair, tuple | list) and len(pair) == 2
+        ends = [end for end in pair if end is not None] if pairs and pair is not None else []
+        numbers = all(isinstance(end, int | float | np.number) for end in ends)
+        if pair is not None and not (pairs and numbers and (what == "bounds" or len(ends) == 2)):
+            raise TypeError(f"{about}: {what} is {pair!r}; it is two numbers, (least, most)")
+        if len(ends) == 2 and ends[0] > ends[1]:
+            raise TypeError(f"{about}: {what} is {pair!r}; the least number comes first")
     if kind not in ("", *KINDS):
         raise TypeError(f"{kind!r} is none of the kinds {', '.join(KINDS)}")
     if informed_by and per != "pixel":
@@ -486,11 +500,16 @@ class Plugin:
 
     def __init_subclass__(cls, abstract: bool = False, **keywords: Any):
         super().__init_subclass__(**keywords)
+        check_names(cls)
         declared = dict(cls.parameters)
         for key, value in list(vars(cls).items()):
             if isinstance(value, Parameter):
                 declared[key] = Parameter(**{**value.__dict__, "name": key})
                 setattr(cls, key, value.default)
+        for key, p in declared.items():
+            if p.needs and p.needs not in declared and not abstract:
+                near = did_you_mean(p.needs, declared) or f" They are {', '.join(declared)}."
+                raise TypeError(f"{cls.__name__}: {key} needs {p.needs!r}, which is none of its parameters.{near}")
         kinds = {key: p.kind or _kind_of(p, declared.values()) for key, p in declared.items()}
         cls.parameters = {key: replace(p, kind=kinds[key]) for key, p in declared.items()}
         if not abstract:
@@ -508,6 +527,21 @@ class Plugin:
     def summary(cls) -> str:
         """The first line of the docstring."""
         return (inspect.cleandoc(cls.__doc__) if cls.__doc__ else "(no description)").split("\n")[0]
+
+
+def check_names(cls: type[Plugin]) -> None:
+    """Raise TypeError where a parameter in the body of a class takes the name of something else of its bases."""
+    for key, value in vars(cls).items():
+        if not isinstance(value, Parameter):
+            continue
+        for base in cls.__mro__[1:]:
+            # what a base merely announces is a parameter of each of its subclasses
+            taken = key in vars(base) or "ClassVar" in str(inspect.get_annotations(base).get(key, ""))
+            if taken and key not in getattr(base, "parameters", {}):
+                raise TypeError(
+                    f"{cls.__name__}: a parameter cannot be called {key}, which is something else of every "
+                    f"{cls.registry.kind}; take another name"
+                )
 
 
 def check_values(plugin: Plugin) -> None:
@@ -756,7 +790,14 @@ def blaming(cls: type[Plugin]) -> Iterator[None]:
 
 
 def _what(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    if _CHANGED.search(said):
+        said += "; what it is given is not its own to change: write `x = x + more`, not `x += more`, or copy it"
+    return said
+
+
+# what numpy, and `events.SealedEvents`, say where somebody changes what can only be read
+_CHANGED = re.compile("read-only|of these events cannot be set")
 
 
 def _place(error: BaseException, file: Path) -> str:

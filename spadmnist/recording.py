@@ -15,7 +15,7 @@ import numpy as np
 from . import bit_planes
 from .effects import Conditions
 from .errors import InputError
-from .events import Events, Layout
+from .events import Events, Layout, SealedEvents, read_only
 from .readout import Recorded, no_detection, unsigned_for
 from .scene import Scene
 from .units import show
@@ -248,6 +248,13 @@ class Recording:
         """The same data, beside another sensor's dead time."""
         still = {name: x for name, x in self._kept.items() if name in ("totals", "waited")}
         return replace(self, dead_time=dead_time, _kept=still)
+
+    def sealed(self) -> Recording:
+        """The same data for somebody else's code, which cannot change them."""
+        events = None if self.events is None else SealedEvents(self.events)
+        frames = read_only(self.frames) if isinstance(self.frames, np.ndarray) else self.frames
+        kept = {name: read_only(x) if isinstance(x, np.ndarray) else x for name, x in self._kept.items()}
+        return replace(self, events=events, frames=frames, _kept=kept | {"totals": read_only(self.totals)})
 
     def widened(self) -> Recording:
         """The same data with ticks of time stamps of 64 bits, of which kernels are compiled for one type alone.

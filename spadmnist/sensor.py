@@ -353,24 +353,24 @@ class Sensor:
         dark = rate - light
         for effect in self.at("arrival"):
             if effect.acts_on == "light":
-                light = hooks.call(effect, "expected_rate", light, conditions)
+                light = hooks.expected(effect, light, conditions)
             else:
-                dark = hooks.call(effect, "expected_rate", dark, conditions)
+                dark = hooks.expected(effect, dark, conditions)
         rate = light + dark if self.at("arrival") else rate
         for stage in ("gate", "correlated"):
             for effect in self.at(stage):
-                rate = hooks.call(effect, "expected_rate", rate, conditions)
+                rate = hooks.expected(effect, rate, conditions)
         candidates = rate
         for stage in ("dead_time", "timing", "readout") if stamped else ("dead_time",):
             for effect in self.at(stage):
-                rate = hooks.call(effect, "expected_rate", rate, conditions)
+                rate = hooks.expected(effect, rate, conditions)
         return candidates * conditions.live_time, rate * conditions.live_time
 
     def caused(self) -> dict[str, float]:
         """Events that come directly of one event, averaged over the array, by the effect that makes them."""
         one = np.ones((1, self.layout.pixels))
         clock = Conditions(1.0, 1, 1.0, 1.0, None)
-        return {e.name: float(np.mean(hooks.call(e, "expected_rate", one, clock))) - 1 for e in self.at("correlated")}
+        return {e.name: float(np.mean(hooks.expected(e, one, clock))) - 1 for e in self.at("correlated")}
 
     def drawn(self, photons: np.ndarray, conditions: Conditions, readouts: Collection[str]) -> float:
         """Expected candidates that `expose` has at once for such images, those around a part of a chip among them."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import keyword
 import re
 import sys
 from dataclasses import dataclass
@@ -234,6 +235,8 @@ def _class_of(name: str) -> str:
             f"{name!r} cannot be an effect's name: each word begins with a letter, and one of a single letter stands "
             "at the end only; write for example light_leak"
         )
+    if keyword.iskeyword(name):
+        raise InputError(f"{name!r} cannot be an effect's name: it is a word of Python's own; choose another name")
     if name in Effect.registry:
         place = source_file(Effect.registry.find(name))
         raise InputError(f"{name} is an effect already, in {place}; choose another name")

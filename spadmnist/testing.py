@@ -1,4 +1,4 @@
-"""The contract that every effect keeps, and the reconstruction methods; for us and for anybody's own file.
+"""The contract that effects, statistics and reconstruction methods keep; for us and for anybody's own file.
 
     from spadmnist.testing import check_effect
 
@@ -23,18 +23,22 @@ from typing import Any
 
 import numpy as np
 
-from . import config, document, signatures, units
+from . import config, document, hooks, signatures, units
 from .effects import STAGES, Conditions, Effect
-from .errors import ConfigError, SpadError
+from .errors import ConfigError, SpadError, did_you_mean
 from .events import Events, Layout
+from .inference.reduction import reduce_with
+from .inference.replicates import simulated
 from .plugins import Distribution, Parameter, source_file
 from .readout import READOUTS, Recorded
 from .reconstruct import Method, Settings
+from .recording import Capture, Light
 from .sensor import Sensor
 from .signatures import BLOCKS, Shots
+from .statistics import Statistic
 from .streams import BLOCK, Streams
 
-__all__ = ["Report", "check_effect", "check_method", "strong"]
+__all__ = ["Report", "check_effect", "check_method", "check_statistic", "strong"]
 
 MOVED = 6.0  # by so many standard errors the first block of `moves` must change at least
 STAYED = 5.5  # and by no more a block that is not named
@@ -57,6 +61,9 @@ sensor:
 """
 _CAPTURES = {"dark": (0.0, 8), "dim": (60e3, 8), "bright": (1.2e6, 2)}  # photons/s, exposures of one repetition
 _REPETITIONS = 32
+_RECORDINGS = 24  # of a capture, by which a statistic is checked
+_SCATTER = 8.0  # by such a factor the variance of its cells may differ from their law's: a rule of thumb
+_CHILDREN, _MOST_EVENTS = 4000, 400_000  # by so many a `hazard` is checked, of so many events at most
 _UNSTATED = 0.01  # relative: a smaller change of the mean need not be stated
 Lights = Mapping[str, tuple[float, int]]
 # what share of white each of its pixels sees, where the effect is one of scenes
@@ -139,6 +146,80 @@ def check_method(method: type[Method] | str) -> None:
         assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
         parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
         assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+
+
+def check_statistic(statistic: type[Statistic] | str) -> None:
+    """Does a statistic keep the contract?
+
+    It reduces recordings of a small sensor, dark and lit, of each of its modalities. It finds the same twice, with no
+    random numbers and without a change of the recording; it has the same cells in each recording of a capture; and they
+    scatter about as their law says.
+
+    Args:
+        statistic: the class or its name.
+
+    Raises:
+        AssertionError: with one sentence, where it does not.
+    """
+    kind: type[Statistic] = Statistic.registry.find(statistic) if isinstance(statistic, str) else statistic
+    if not __debug__:
+        raise AssertionError("Python runs without assertions (-O), which the contract is made of")
+    place = f"{source_file(kind)}: the statistic {kind.name}"
+    assert (kind.__doc__ or "").strip().split("\n")[0].endswith("."), (
+        f"{place}: the docstring must begin with one sentence on one line"
+    )
+    said = 0
+    for modality in kind.modalities:
+        for name, photons in {"dark": 0.0, "dim": 6e4, "bright": 1.2e6}.items():
+            try:
+                said += _reduced(kind, modality, name, photons)
+            except SpadError as error:
+                raise AssertionError(str(error)) from error
+            except AssertionError as error:
+                raise AssertionError(f"{place}, {modality}, {name} light: {error}") from error
+    assert said, f"{place}: it has nothing to say of any recording; reduce returned None for all of them"
+
+
+def _reduced(kind: type[Statistic], modality: str, name: str, photons: float) -> int:
+    """How many recordings of a capture have a summary. Raises AssertionError where one of them is wrong."""
+    sensor = _sensor(None, "device")
+    conditions = _conditions(photons, bits=4 if modality == "counts" else 0)
+    capture = Capture(name, modality, Light(555e-9, 1.0, "lux") if photons else Light(), conditions)
+    numbers = np.arange(_RECORDINGS, dtype=np.uint64)
+    found = []
+    for recording in simulated(sensor, capture, np.full(_RECORDINGS, photons), numbers, seed=1):
+        one, other = (reduce_with(kind(), again) for again in (recording, pickle.loads(pickle.dumps(recording))))
+        assert (one is None) == (other is None), "it has a summary of a recording at one time, and none at another"
+        if one is None or other is None:
+            continue
+        assert np.shape(one.values) == np.shape(other.values) and np.allclose(
+            one.values, other.values, equal_nan=True
+        ), "it finds other values in the same recording at another time; it may draw no random numbers"
+        found.append(one)
+        cells = found[0].values.size
+        assert one.values.size == cells, (
+            f"it has {cells} cells in one recording and {one.values.size} in another of the same capture; their number "
+            "may depend on the conditions and the layout alone"
+        )
+    if found:
+        _as_its_law(found[0].law, np.array([one.values for one in found], np.float64))
+    return len(found)
+
+
+def _as_its_law(law: str, values: np.ndarray) -> None:
+    """Raises AssertionError where the cells of (recordings, cells) scatter otherwise by far."""
+    if len(values) < _RECORDINGS:
+        return
+    mean, variance = values.mean(axis=0), values.var(axis=0, ddof=1)
+    seen = mean > 5 if law == "poisson" else mean > 0
+    if law == "exact":
+        assert not np.ptp(values, axis=0).any(), "its law is exact, but its cells differ from recording to recording"
+    elif law in ("poisson", "exponential") and seen.any():
+        ratio = float(np.mean(variance[seen] / (mean[seen] if law == "poisson" else mean[seen] ** 2)))
+        assert 1 / _SCATTER < ratio < _SCATTER, (
+            f"by the law {law} the variance of a cell is its mean{' squared' * (law == 'exponential')}, but here it is "
+            f"{ratio:.2g} times that; normal is the law of values whose spread is not known"
+        )
 
 
 def captured() -> list[str]:
@@ -331,8 +412,22 @@ def _declarations(trial: _Trial) -> None:
         trial.warnings.append(f"{where}: its docstring does not say where it is known from; add a line Source: ...")
     have = [all(callable(getattr(kind, hook, None)) for hook in way.split("+")) for way in STAGES[kind.stage]]
     assert any(have), f"it must define {' or '.join(STAGES[kind.stage])}"
+    assert not isinstance(kind.moves, str), f"moves is {kind.moves!r}; write moves = ({kind.moves!r},)"
     unknown = sorted(set(kind.moves) - set(BLOCKS))
     assert not unknown, f"moves names {', '.join(unknown)}, but the statistics are {', '.join(BLOCKS)}"
+    if kind.after is not None:
+        near = did_you_mean(kind.after, Effect.registry)
+        assert kind.after in set(Effect.registry), f"after names {kind.after!r}, which is not an effect.{near}"
+        other = Effect.registry.find(kind.after).stage
+        assert other == kind.stage, f"after names {kind.after}, which is of the stage {other}, and not of {kind.stage}"
+    for name, p in kind.parameters.items():
+        if p.informed_by:
+            near = did_you_mean(p.informed_by, Statistic.registry)
+            said = f"informed_by of {name} names {p.informed_by!r}"
+            assert p.informed_by in set(Statistic.registry), f"{said}, which is not a statistic that is loaded.{near}"
+            teller: type[Statistic] = Statistic.registry.find(p.informed_by)
+            tells = teller.unit_likelihood is not Statistic.unit_likelihood
+            assert tells, f"{said}, which defines no unit_likelihood"
     for name in trial.values:
         assert name in kind.parameters, f"it has no parameter {name}"
     for name, p in kind.parameters.items():
@@ -346,6 +441,14 @@ def _declarations(trial: _Trial) -> None:
             except ValueError as error:
                 raise AssertionError(f"{where} of {name}: {error}") from None
         assert p.search is None or p.search[0] < p.search[1], f"search of {name} ends before it begins: {p.search}"
+
+
+def _is_looked_for(trial: _Trial) -> str | None:
+    """Whether a diagnosis may add it: some parameter says where the effect vanishes, and where it is looked for."""
+    declared = trial.kind.parameters.values()
+    if any(p.off is not None and (p.search is not None or p.per in ("row", "column", "code")) for p in declared):
+        return None
+    return "no parameter has both `off` and `search`: diagnose never adds it, though a sensor may have it"
 
 
 def _bounds(trial: _Trial) -> None:
@@ -450,6 +553,62 @@ def _edge_cases(trial: _Trial) -> None:
             _sound(_expose(sensor, photons, conditions), sensor, conditions, what)
 
 
+def _never_falling(trial: _Trial) -> str | None:
+    """A pixel's sensitivity rises, or stays, with the time since its blind time; a number drawn for an event says when
+    it is high enough."""
+    if not hasattr(trial.kind, "sensitivity"):
+        return "it has no sensitivity"
+    effect = trial.sensor("device").effect(trial.kind.name)
+    assert effect is not None
+    times = np.append(0.0, np.geomspace(1e-12, 10.0, 4000))
+    found = np.asarray(hooks.call(effect, "sensitivity", times))
+    assert found.shape == times.shape, f"sensitivity returns the shape {found.shape} for times {times.shape}"
+    assert np.all((found >= 0) & (found <= 1)), "sensitivity returns numbers that are not between 0 and 1"
+    falls = np.diff(found) < -1e-9
+    at = int(np.argmax(falls))
+    assert not falls.any(), (
+        f"sensitivity falls from {found[at]:.4g} to {found[at + 1]:.4g} between {units.show(times[at], 's')} and "
+        f"{units.show(times[at + 1], 's')}; it must never fall"
+    )
+    return None
+
+
+def _hazard(trial: _Trial) -> str | None:
+    """What `spawn` does is what `hazard` says, within 5 standard errors and 2 %: some are first orders."""
+    if trial.kind.stage != "correlated" or trial.kind.hazard is Effect.hazard:
+        return "it has none"
+    sensor = trial.sensor("device")
+    effect = sensor.effect(trial.kind.name)
+    assert effect is not None
+    pixels = sensor.layout.pixels
+    said = hooks.call(effect, "hazard", pixels)
+    if said is None:
+        return "it has none at these values"
+    chance = np.broadcast_to(-np.expm1(-np.asarray(said[0], np.float64)), pixels)
+    assert np.all((chance >= 0) & (chance < 1)), "hazard returns -ln(1 - p) of a p that is not between 0 and 1"
+    each = int(np.clip(_CHILDREN / max(float(chance.mean()) * pixels * BLOCK, 1e-9), 1, _MOST_EVENTS / pixels / BLOCK))
+    rows = pixels * BLOCK
+    times = np.tile(np.arange(each) * 1e-3, rows)
+    events = Events(times, np.arange(rows + 1) * each, pixels, end=each * 1e-3)
+    streams = Streams(1, "contract", "hazard", np.arange(BLOCK, dtype=np.uint64))
+    late, row, parent = hooks.spawned(effect, events, np.zeros(pixels), streams, "")
+    assert np.array_equal(row, events.rows[parent]), "it has a hazard, but some of its children are in other pixels"
+    assert len(np.unique(parent)) == len(parent), "it has a hazard, but an event has several children"
+    wanted = float(chance.sum()) * BLOCK * each
+    error = 5 * math.sqrt(max(wanted, 1.0)) + 0.02 * wanted
+    assert abs(len(parent) - wanted) <= error, (
+        f"of {len(events)} events {len(parent)} have a child, but by hazard it is {wanted:.6g}; hazard returns "
+        "-ln(1 - p) and the mean time"
+    )
+    if len(parent):
+        mean, told = float(np.mean(late - events.times[parent])), float(said[1])
+        assert abs(mean - told) <= (5 / math.sqrt(len(parent)) + 0.02) * told, (
+            f"children come {units.show(mean, 's')} after their parents in the mean, but hazard says "
+            f"{units.show(told, 's')}"
+        )
+    return None
+
+
 def _influence(trial: _Trial) -> str | None:
     """No event fires a pixel that lies farther away than the effect says. What a readout shares does not show here."""
     if trial.kind.stage != "correlated":
@@ -473,7 +632,10 @@ def _expected_rate(trial: _Trial) -> str | None:
 
     Within 5 standard errors and 2 % of the change that the effect makes: some laws are first orders or bounds.
     """
-    stated = trial.kind.expected_rate is not Effect.expected_rate or trial.kind.has_mean
+    written = trial.kind.expected_rate is not Effect.expected_rate
+    if trial.kind.stage in ("light", "detection", "dark"):
+        return _as_applied(trial) if written else "it has none of its own, and needs none: it is apply"
+    stated = written or trial.kind.has_mean
     lacking = ("correlated", "dead_time")
     sensor, plain = trial.sensor("device", lacking=lacking), _sensor(None, "device", None, trial.kind.name, lacking)
     for name, (light, _) in _CAPTURES.items():
@@ -494,6 +656,23 @@ def _expected_rate(trial: _Trial) -> str | None:
             "and 2 % of the change"
         )
     return None if stated else "it has none of its own"
+
+
+def _as_applied(trial: _Trial) -> str | None:
+    """The closed form of an effect on rates is what it does to them, in every pixel."""
+    effect = trial.sensor("device").effect(trial.kind.name)
+    assert effect is not None
+    pixels = _base().sensor.layout.pixels
+    for name, (light, _) in _CAPTURES.items():
+        before = light * np.linspace(0.5, 1.5, pixels)[None]
+        conditions = _conditions(light)
+        after, told = (hook(effect, before, conditions) for hook in (hooks.rate, hooks.expected))
+        pixel = int(np.argmax(np.abs(told - after)))
+        assert np.allclose(told, after, rtol=1e-6), (
+            f"in the {name} capture apply makes {after[0, pixel]:.6g}/s of {before[0, pixel]:.6g}/s in pixel {pixel}, "
+            f"but expected_rate {told[0, pixel]:.6g}/s; leave it out, or write expected_rate = apply"
+        )
+    return None
 
 
 def _moves(trial: _Trial) -> str | None:
@@ -518,11 +697,14 @@ def _moves(trial: _Trial) -> str | None:
 
 _CHECKS: tuple[Callable[[_Trial], str | None], ...] = (
     _declarations,
+    _is_looked_for,
     _bounds,
     _off_is_the_identity,
     _invariants,
     _same_stream_same_result,
     _edge_cases,
+    _never_falling,
+    _hazard,
     _influence,
     _expected_rate,
     _moves,

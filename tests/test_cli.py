@@ -353,6 +353,11 @@ def test_a_new_effect_by_the_commands_that_are_told(made: tuple[Path, Path], tmp
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["config"]["sensor"]["effects"]["light_leak"] == {"rate": "50 Hz"}
     assert manifest["plugins"][0]["file"] == "light_leak.py"
+    (python,) = [line for line in lines if line.startswith("  python -c ")]
+    assert (
+        python.endswith('check_effect; print(check_effect(LightLeak))"')
+        and "from light_leak import LightLeak;" in python
+    )
 
 
 def test_a_new_effect_as_json_and_at_another_stage(tmp_path: Path) -> None:

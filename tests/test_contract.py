@@ -16,11 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spadmnist import plugins, signatures, template, testing
+import spadmnist as sp
+from spadmnist import plugins, reference, signatures, template, testing
 from spadmnist.effects import STAGES, Effect
+from spadmnist.errors import EffectError, SpadError
+from spadmnist.inference.reduction import reduce_with
+from spadmnist.inference.replicates import simulated
 from spadmnist.plugins import Distribution
 from spadmnist.reconstruct import Method
-from spadmnist.testing import check_effect, check_method
+from spadmnist.recording import Capture, Light
+from spadmnist.statistics import Statistic
+from spadmnist.testing import check_effect, check_method, check_statistic
 
 OURS = [name for name in Effect.registry if Effect.registry.find(name).__module__.startswith("spadmnist.")]
 
@@ -150,6 +156,8 @@ def test_somebody_elses_effect_keeps_it(planted: Any, stage: str, body: str) -> 
     assert check_effect(planted(body, stage)).checks["moves"] == "kept"
 
 
+NOBODY = "declarations: after names 'illumination_gradent', which is not an effect. Did you mean illumination_gradient"
+
 # what is wrong -> (stage, body, the check that says so and what it says)
 FAULTS = {
     "an echo in the next pixel": (
@@ -265,6 +273,19 @@ FAULTS = {
         LOSS.format(mask="rng.random(len(events)) >= self.p").replace("1 - self.p", "1 - 1.2 * self.p"),
         "expected rate: in the .* expected_rate makes it",
     ),
+    "a closed form that is not what it does to the rates": (
+        "light",
+        """
+    p = chance(search=(0.1, 0.9))
+
+    def apply(self, rate, conditions):
+        return rate * (1 - self.p)
+
+    def expected_rate(self, rate, conditions):
+        return rate * (1 + 5 * self.p)
+""",
+        "expected rate: in the dim capture apply makes .* in pixel 63, but .* write expected_rate = apply",
+    ),
     "a default out of bounds": (
         "light",
         "    p = chance(2.0)\n\n    def apply(self, rate, conditions):\n        return rate\n",
@@ -283,6 +304,61 @@ FAULTS = {
 }
 
 
+RATES = """
+    def apply(self, rate, conditions):
+        return rate * (1 - self.p)
+"""
+AWAKE = """
+    p = chance()
+
+    def sensitivity(self, u):
+        return {rises}
+"""
+FAULTS |= {
+    "behind nobody": ("light", f'    after = "illumination_gradent"\n    p = chance()\n{RATES}', NOBODY),
+    "behind one of another stage": (
+        "light",
+        f'    after = "jitter"\n    p = chance()\n{RATES}',
+        "declarations: after names jitter, which is of the stage timing, and not of light",
+    ),
+    "informed by nothing": (
+        "light",
+        f'    p = chance(per_pixel=True, informed_by="pixel_map_")\n{RATES}',
+        "declarations: informed_by of p names 'pixel_map_', which is not .* Did you mean pixel_map",
+    ),
+    "informed by what tells nothing": (
+        "light",
+        f'    p = chance(per_pixel=True, informed_by="pixel_map")\n{RATES}',
+        "declarations: informed_by of p names 'pixel_map', which defines no unit_likelihood",
+    ),
+    "a word that moves": (
+        "light",
+        f'    moves = "level"\n    p = chance()\n{RATES}',
+        r"declarations: moves is 'level'; write moves = \('level',\)",
+    ),
+    "a sensitivity that falls": (
+        "dead_time",
+        AWAKE.format(rises="np.where(u < 1e-7, 1.0, 1.0 - self.p)"),
+        "never falling: sensitivity falls from 1 to .* between .* and 100.* ns; it must never fall",
+    ),
+    "a hazard of another chance": (
+        "correlated",
+        ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return 2 * self.p, 1e-6\n",
+        r"hazard: of \d+ events \d+ have a child, but by hazard it is",
+    ),
+    "a hazard of another time": (
+        "correlated",
+        ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 5e-6\n",
+        "hazard: children come .* after .* but hazard says 5 us",
+    ),
+    "a hazard in another pixel": (
+        "correlated",
+        ECHO.format(row=NEXT_PIXEL) + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 1e-6\n",
+        "hazard: it has a hazard, but some of its children are in other pixels",
+    ),
+}
+
+
 @pytest.mark.parametrize("fault", [name for name, (_, _, says) in FAULTS.items() if says])
 def test_a_fault_is_found(fault: str, planted: Any, tmp_path: Path) -> None:
     stage, body, says = FAULTS[fault]
@@ -297,6 +373,20 @@ def test_what_says_nothing_of_itself_is_only_noted(planted: Any) -> None:
     report = check_effect(planted(FAULTS["an effect that does nothing"][1], "light"))
     assert report.checks["moves"] == "no `moves` is declared; it moved nothing"
     assert not report.warnings and "warning" not in str(report)
+
+
+def test_a_hazard_that_is_right_keeps_it(planted: Any) -> None:
+    body = ECHO.format(row="") + "\n    def hazard(self, pixels):\n        return -np.log1p(-self.p), 1e-6\n"
+    assert check_effect(planted(body)).checks["hazard"] == "kept"
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [("off=None", "no parameter has both"), ("search=None", "diagnose never adds it"), ("", "kept")],
+)
+def test_what_is_never_looked_for_is_noted(how: str, says: str, planted: Any) -> None:
+    report = check_effect(planted(f"    p = chance({how})\n{RATES}", "light"))
+    assert says in report.checks["is looked for"]
 
 
 def test_an_effect_without_a_source_is_warned_of(planted: Any, tmp_path: Path) -> None:
@@ -343,6 +433,143 @@ def test_a_method_that_does_not_keep_it(answer: float, says: str) -> None:
         check_method(kind)
 
 
+# ---- somebody else's statistic -------------------------------------------------------------------------------
+
+STATISTIC = '''"""Mine."""
+
+import random
+
+import numpy as np
+
+from spadmnist.statistics import Statistic, Summary
+
+
+class Mine(Statistic):
+    """Detections in each fifth of the exposure."""
+
+    modalities = ("tr",)
+
+    def reduce(self, recording):
+        values = np.histogram(recording.events.times, 5, (0, recording.conditions.exposure))[0].astype(float)
+        {line}
+        return {returned}
+'''
+SUMMARY = "Summary({values}, {law!r}, {where}, {size}{more})"
+WORDS = {
+    "values": "values",
+    "law": "poisson",
+    "where": "lambda c: f'fifth {c}'",
+    "size": "lambda c, m, e: (f'{m - e:.3g} more', abs(m - e) / e)",
+    "more": "",
+}
+# what is wrong -> (what the summary has, a line before it, what is said, whether only the contract's test finds it)
+WRONG: dict[str, tuple[dict[str, str], str, str, bool]] = {
+    "another law": ({"law": "gaussian"}, "", "has the law 'gaussian' in dark; the laws are poisson, normal", False),
+    "a list": ({"values": "list(values)"}, "", "has a list as values", False),
+    "words": ({"values": "values.astype(str)"}, "", "has an array of <U32 as values", False),
+    "no cells": ({"values": "values[:0]"}, "", r"has values of shape \(0,\) in dark; they are \(cells,\)", False),
+    "a table": ({"values": "values[None]"}, "", r"has values of shape \(1, 5\) in dark", False),
+    "one number": ({"values": "values.sum()"}, "", "has a float64 as values", False),
+    "no number": ({"values": "values * np.nan", "law": "normal"}, "", "has the value nan in cell 0", False),
+    "half a count": ({"values": "values + 0.5"}, "", r"cell 0 in dark; by the law poisson they are whole", False),
+    "a count below 0": ({"values": "-values - 1"}, "", "by the law poisson they are whole, from 0 on", False),
+    "a power below 0": ({"values": "-values - 1", "law": "exponential"}, "", "they are not negative", False),
+    "a short scale": ({"law": "normal", "more": ", np.ones(3)"}, "", r"has scale of shape \(3,\)", False),
+    "a scale below 0": ({"law": "normal", "more": ", -np.ones(5)"}, "", "has a scale that is negative", False),
+    "a short axis": ({"more": ", axis=np.ones(3)"}, "", r"has axis of shape \(3,\) in dark; .* \(5,\)", False),
+    "another map": ({"more": ", shape=(2, 2)"}, "", r"has the shape \(2, 2\) of a map", False),
+    "no place": ({"where": "lambda c: c"}, "", r"says 0 for where\(0\) in dark; it is text", False),
+    "few places": ({"where": "lambda c: ('a', 'b')[c]"}, "", r":\d+: .* failed: IndexError", False),
+    "a size alone": ({"size": "lambda c, m, e: m - e"}, "", r"says .* for size\(0, .* it is \(text, share", False),
+    "other data": ({}, "recording.events.times[:] = 0", r":\d+: .* not its own to change", False),
+    "other totals": ({}, "recording.totals[:] = 0", r":\d+: .* not its own to change", False),
+    "cells by chance": ({"values": "values[: 2 + len(recording.events) % 3]"}, "", "cells in one recording", True),
+    "draws": ({}, "values += np.random.poisson(1.0)", "it finds other values .* no random numbers", True),
+    "draws of Python's": (
+        {"law": "normal"},
+        "values[0] += random.random()",
+        "it finds other values .* no random numbers",
+        True,
+    ),
+    "no Poisson": ({"values": "values * 50"}, "", "by the law poisson the variance .* normal is the law", True),
+    "not exact": ({"law": "exact"}, "", "its law is exact, but its cells differ", True),
+    "nothing": ({}, "return None", "it has nothing to say of any recording", True),
+}
+
+
+def statistic_with(folder: Path, words: dict[str, str], line: str = "pass", returned: str = "") -> type[Statistic]:
+    """A statistic of somebody's file."""
+    file = folder / "mine.py"
+    text = STATISTIC.replace("{returned}", returned or SUMMARY.format(**WORDS | words)).replace(
+        "{line}", line or "pass"
+    )
+    file.write_text(text)
+    plugins.load_file(file)
+    return Statistic.registry.find("mine")
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_fault_of_a_statistic_is_found(wrong: str, tmp_path: Path) -> None:
+    words, line, says, _ = WRONG[wrong]
+    kind = statistic_with(tmp_path, words, line)
+    with pytest.raises(AssertionError, match=rf"^{re.escape(str(tmp_path))}/mine\.py.*{says}") as caught:
+        check_statistic(kind)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [name for name, (_, _, _, chance) in WRONG.items() if not chance])
+def test_a_summary_that_is_none_is_refused_wherever_it_is_used(wrong: str, tmp_path: Path) -> None:
+    words, line, says, _ = WRONG[wrong]
+    kind = statistic_with(tmp_path, words, line)
+    sensor, conditions = testing._sensor(None, "device"), testing._conditions(0.0)
+    capture = Capture("dark", "tr", Light(), conditions)
+    (recording,) = simulated(sensor, capture, np.zeros(1), np.zeros(1, np.uint64), 1)
+    with pytest.raises(SpadError, match=says):
+        reduce_with(kind(), recording)
+    assert recording.totals.any() and recording.events is not None and recording.events.times.flags.writeable
+
+
+def test_what_is_no_summary_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="returns ndarray in dark; reduce returns a Summary, or None"):
+        check_statistic(statistic_with(tmp_path, {}, returned="values"))
+
+
+def test_a_right_statistic_keeps_the_contract(tmp_path: Path) -> None:
+    check_statistic(statistic_with(tmp_path, {}))
+    check_statistic("pixel_map")
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('modalities = "tr"', r"Mine: modalities is 'tr'; it is a tuple of one or more of tr, str, qis, counts: write"),
+        ('modalities = ("TR",)', r"modalities is \('TR',\).* Did you mean tr\?"),
+        ("modalities = ()", r"modalities is \(\); it is a tuple"),
+        ("modalities = 3", "modalities is 3; it is a tuple"),
+    ],
+)
+def test_a_statistic_of_no_readout_is_refused_when_its_class_is_made(line: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(STATISTIC.replace('modalities = ("tr",)', line).replace("{line}", "pass"))
+    with pytest.raises(EffectError, match=says):
+        plugins.load_file(tmp_path / "mine.py")
+    assert reference.statistic_list()
+
+
+def test_a_statistic_that_reduces_nothing_is_refused_when_its_class_is_made(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(STATISTIC.replace("def reduce", "def reduc").replace("{line}", "pass"))
+    with pytest.raises(EffectError, match=r"Mine: a statistic must define reduce\(recording\)"):
+        plugins.load_file(tmp_path / "mine.py")
+
+
+def test_cells_that_depend_on_the_data_are_told_by_name(tmp_path: Path) -> None:
+    statistic_with(tmp_path, {"values": "values[: 2 + len(recording.events) % 3]"})
+    layout = sp.Layout(4, 4, 25e-12, 1.0)
+    sensor = sp.Sensor(layout, [sp.effects.Detection(pdp=0.5), sp.effects.DarkCounts(rate=1e4)], "device")
+    dark = sp.simulate(sensor, [sp.Capture("dark", "tr", dark=True, exposure=1e-3)], seed=1)
+    with pytest.raises(SpadError, match=r"mine\.py: the statistic mine has \d cells in one recording of dark and \d"):
+        sp.compare(sensor, dark, jobs=1)
+
+
 # ---- slow ------------------------------------------------------------------------------------------------------
 
 
@@ -352,6 +579,12 @@ def test_the_template_keeps_it(stage: str, planted: Any) -> None:
     name = f"mine_{stage}"
     text = template.text(name, stage).replace("{", "{{").replace("}", "}}")
     assert not check_effect(planted("", head=text, name=name)).warnings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(Statistic.registry))
+def test_a_statistic_keeps_the_contract(name: str) -> None:
+    check_statistic(name)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import spadmnist as sp
 from spadmnist import cli, measurement, sensor_file
-from spadmnist.errors import InputError, SpadError
+from spadmnist.errors import InputError
 from spadmnist.inference import model_selection, results
 from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.results import Step, Value
@@ -320,17 +320,3 @@ def test_one_parameter_is_fitted_once(given: dict[str, list[str]], tmp_path: Pat
     lab = sp.simulate(model, [FLAT, sp.Capture("dark", "str", frames=4, frame_time=10e-6, dark=True, tick=1e-9)], 1)
     with pytest.raises(InputError, match=r"would be fitted twice.*; name it once"):
         sp.fit(model, lab, **given)
-
-
-@pytest.mark.parametrize("values", [np.zeros(0), np.zeros((2, 2)), np.float64(3.0)])
-def test_a_statistic_without_cells_is_blamed(values: Any) -> None:
-    from spadmnist.inference.reduction import reduce_with
-
-    class Mine:
-        name = "mine"
-
-        def reduce(self, recording: Any) -> Any:
-            return SimpleNamespace(values=values)
-
-    with pytest.raises(SpadError, match=r"the statistic mine has values of shape .* in flat; they are \(cells,\)"):
-        reduce_with(Mine(), SimpleNamespace(capture=FLAT))  # type: ignore[arg-type]

@@ -188,6 +188,24 @@ def test_what_a_file_defined_before_it_failed_is_forgotten(tmp_path: Path) -> No
     assert "half_light" in set(Effect.registry)
 
 
+PULSE = (
+    HEAD
+    + """class Pulse(Effect, stage="arrival"):
+    depth = parameter(0.1, "", "depth", bounds=(0, 1), off=0.0, search=(0.01, 1))
+    PASS
+
+    def factor(self, times, conditions):
+        return 1 + 0 * times
+
+    def maximum(self, conditions):
+        return 1.0
+"""
+)
+# what every effect has, and no parameter can be called
+TAKEN = (
+    *("name", "last", "cause", "counted", "hazard", "mimic", "by_pixel", "shown", "summary", "after", "stage"),
+    *("registry", "parameters", "made", "influence", "expected_rate", "moves", "acts_on", "on_light"),
+)
 LINES = [
     ("syntax", HEAD + "class A(Effect, stage='light'\n    pass\n", 4, "SyntaxError"),
     ("indentation", HEAD + "class A(Effect, stage='light'):\npass\n", 5, "IndentationError"),
@@ -201,6 +219,13 @@ LINES = [
     ("two hooks", HEAD + "class A(Effect, stage='arrival'):\n    pass\n", 4, "factor and maximum"),
     ("no function", HEAD + "class A(Effect, stage='gate'):\n    open = 5\n", 4, "open"),
     ("unit", HALF.replace('0.5, ""', '0.5, "furlong"'), 7, "furlong"),
+    ("multiple", HALF.replace('0.5, ""', '0.5, "MHz"'), 7, "write 'Hz', and all numbers in it"),
+    ("acts on", PULSE.replace("PASS", "acts_on = 'drak'"), 4, "acts_on is 'drak'; it is one of light, dark, own. Did"),
+    ("needs", PULSE.replace("PASS", "a = parameter(1.0, '', 'x', needs='deph')"), 4, "Did you mean depth?"),
+    ("__init__", PULSE.replace("PASS", "__init__ = print"), 4, "belongs into made(self, chip)"),
+    ("own __init__", PULSE.replace("PASS", "def __init__(self): pass"), 4, "does not take the values"),
+    ("first of __init__", PULSE.replace("PASS", "def __init__(self, x, **more): pass"), 4, "leave it out"),
+    *((name, PULSE.replace("depth", name).replace("PASS", ""), 4, f"cannot be called {name}, which") for name in TAKEN),
 ]  # fmt: skip
 
 
@@ -302,6 +327,12 @@ def test_a_word_that_is_none_of_the_choices(raw: Any) -> None:
     [
         ({"choices": ("a", "b")}, "'c' is none of the choices a, b"),
         ({"per": "frame"}, "'frame' is none of '', 'pixel', 'row', 'column', 'code'"),
+        ({"search": 0.5}, r"about: search is 0\.5; it is two numbers, \(least, most\)"),
+        ({"search": (0.5, None)}, r"search is \(0\.5, None\); it is two numbers"),
+        ({"search": ("a", "b")}, "it is two numbers"),
+        ({"search": (0.5, 0.1)}, "the least number comes first"),
+        ({"bounds": (1, 0)}, r"bounds is \(1, 0\); the least number comes first"),
+        ({"bounds": 1}, "bounds is 1; it is two numbers"),
     ],
 )
 def test_a_parameter_that_cannot_be_declared(values: dict[str, Any], says: str) -> None:
@@ -476,6 +507,17 @@ def test_a_parameter_is_moved_as_its_kind_says_whatever_its_unit(tmp_path: Path)
     )
     (depth,) = moved["depth"].strengths
     assert not is_edge(depth) and len(first_strengths(depth)) == 1
+
+
+def test_a_phase_needs_no_range(tmp_path: Path) -> None:
+    """`rad` without `off` is a phase, with `search` and without: it is another one in each capture all the same."""
+    turned = 'turn = parameter(0.0, "", "phase in turns", search=(0, 1), kind="phase")'
+    assert turned in BEAT
+    plugins.load_file(written(tmp_path, BEAT.replace(turned, 'turn = parameter(0.0, "rad", "phase", needs="depth")')))
+    sensor = Sensor(Layout(2, 2, 1e-10, 1.0), [Effect.registry.find("detection")(pdp=0.5)], "device").resolved()
+    (added,) = [c for c in candidates(sensor) if c.name == "add beat"]
+    assert added.phases == (("beat", "turn"),)
+    assert [d.key for d in added.shapes] == [("beat", "kilohertz"), ("beat", "ticks")]
 
 
 def test_kinds_are_told_by_units_where_nothing_is_declared() -> None:

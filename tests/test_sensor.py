@@ -22,9 +22,10 @@ from spadmnist.effects.dark_counts import DarkCounts
 from spadmnist.effects.dead_time import DeadTime
 from spadmnist.effects.detection import Detection
 from spadmnist.effects.tdc import Tdc
-from spadmnist.errors import EffectError
+from spadmnist.errors import ConfigError, EffectError
 from spadmnist.events import Children, Events, Layout
 from spadmnist.experiment import Experiment, Level
+from spadmnist.hooks import influence
 from spadmnist.images import Images
 from spadmnist.readout import Recorded, no_detection, unsigned_for
 from spadmnist.sensor import Sensor
@@ -553,6 +554,13 @@ def _children(**bad: Any) -> Any:
     return spawn
 
 
+def _one_on(offsets: np.ndarray) -> np.ndarray:
+    """One event of the second row goes to the first."""
+    return (
+        np.append(offsets[0], np.append(offsets[1] + (len(offsets) > 2), offsets[2:])) if len(offsets) > 1 else offsets
+    )
+
+
 BAD: list[tuple[str, dict[str, Any], str]] = [
     ("light", {"apply": _raise}, "raises"),
     ("light", {"apply": lambda self, rate, c: None}, "none"),
@@ -589,6 +597,13 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("timing", {"apply": _fewer_rows}, "rows"),
     ("timing", {"apply": lambda self, e, rng: Events(e.times - 1.0, e.offsets, e.pixels)}, "before 0"),
     ("timing", {"apply": lambda self, e, rng: Events(e.times * np.nan, e.offsets, e.pixels)}, "nan"),
+    ("timing", {"apply": lambda self, e, rng: e.keep(np.arange(len(e)) % 2 > 0)}, "must not add or remove stamps"),
+    (
+        "timing",
+        {"apply": lambda self, e, rng: Events(e.times * 0, _one_on(e.offsets), e.pixels)},
+        "each stamp in its row",
+    ),
+    ("correlated", {"spawn": _children(parent=np.array([True]))}, "are a mask; give their indices"),
     ("readout", {"apply": _raise}, "raises"),
     ("readout", {"apply": _unsorted}, "unsorted"),
     ("readout", {"apply": lambda self, events, rng: None}, "none"),
@@ -608,6 +623,116 @@ def test_a_strangers_mistake_is_named(stage: str, hooks: dict[str, Any], wrong: 
         one.simulate(one.levels[0], "train", images, 0, BLOCK)
     sentence = str(caught.value)
     assert "stranger" in sentence and Path(__file__).name in sentence and "\n" not in sentence
+    assert wrong in sentence or len(wrong.split()) < 5  # the words of the longer ones are its own
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_the_effect_that_loses_first_stamps_is_named() -> None:
+    """And not the last one of its stage, the converter."""
+    define("timing", apply=lambda self, events, rng: events.keep(rng.random(len(events)) < 0.5))
+    one = experiment("detection: {}, stranger: {}, tdc: {}", readouts="[str]")
+    with pytest.raises(EffectError, match="the effect stranger: apply must not add or remove stamps, but it makes"):
+        one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK)
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_whole_numbers_of_numpy_are_numbers() -> None:
+    define("arrival", factor=lambda self, t, c: np.ones(len(t)), maximum=lambda self, c: np.int64(1))
+    one = experiment("detection: {}, stranger: {}", readouts="[tr]")
+    assert one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK).tr is not None
+    define("dead_time", carried=lambda self: np.int64(1), influence=lambda self: np.int64(2))
+    one = experiment("detection: {}, dead_time: {}, stranger: {}", readouts="[tr]")
+    assert one.sensor.carried == 1.0 and influence(one.sensor.effect("stranger")) == 2.0  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_a_limit_of_another_type_says_what_it_is() -> None:
+    define("readout", limit=lambda self, counts: counts.astype(float))
+    one = experiment("detection: {}, stranger: {}", readouts="[counts], bits: 1")
+    with pytest.raises(EffectError, match=r"limit must return counts of shape .* and type uint8, not float64 of shape"):
+        one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK)
+
+
+@pytest.mark.parametrize(
+    ("mean", "says"),
+    [
+        (lambda rate: None, r"float64 rates of shape \(1, 4\), not NoneType"),
+        (lambda rate: float(rate.mean()), r"float64 rates of shape \(1, 4\), not float"),
+        (lambda rate: rate.mean(axis=1), r"float64 rates of shape \(1, 4\), not float64 of shape \(1,\)"),
+        (lambda rate: rate.astype(np.float32), "not float32"),
+        (lambda rate: rate * np.nan, "negative or not finite"),
+        (lambda rate: rate - 1e9, "negative or not finite"),
+    ],
+)
+@pytest.mark.parametrize("stage", ["arrival", "gate", "correlated", "dead_time", "timing", "readout"])
+@pytest.mark.usefixtures("no_trace")
+def test_a_mean_that_is_none_is_named(stage: str, mean: Any, says: str) -> None:
+    define(stage, **STRANGERS[stage], expected_rate=lambda self, rate, conditions: mean(rate))
+    says = rf"{Path(__file__).name}: the effect stranger: expected_rate .*{says}"
+    with pytest.raises((EffectError, ConfigError), match=says):  # of a cascade, a config asks for it
+        one = experiment("detection: {pdp: 0.5}, stranger: {}")
+        one.sensor.expected(np.full((1, 4), 1e5), one.conditions)
+
+
+def _in_place(hook: str, operator: Any, by: float) -> Any:
+    """A hook that changes its first argument, or the times of the events that this is, and returns it."""
+
+    def changed(self: Any, given: Any, *_: Any) -> Any:
+        array = given.times if isinstance(given, Events) else given
+        operator(array, by, out=array)
+        return given if hook in ("apply", "limit") else np.ones(len(array), bool)
+
+    return {hook: changed} | ({"maximum": lambda self, c: 1.0} if hook in ("factor", "modulate") else {})
+
+
+def _other_offsets(self: Any, events: Events, rng: np.random.Generator) -> Events:
+    events.offsets = events.offsets * 0
+    return events
+
+
+IN_PLACE: list[tuple[str, dict[str, Any]]] = [
+    ("light", _in_place("apply", np.multiply, 0.5)),
+    ("detection", _in_place("apply", np.multiply, 0.5)),
+    ("dark", _in_place("apply", np.add, 1e3)),
+    ("arrival", _in_place("factor", np.divide, 1e-3)),
+    ("arrival", _in_place("modulate", np.divide, 1e-3)),
+    ("gate", _in_place("open", np.fmod, 1e-6)),
+    ("correlated", _in_place("spawn", np.add, 1e-6)),
+    ("dead_time", _in_place("sensitivity", np.multiply, 1.0)),
+    ("timing", _in_place("apply", np.add, 1e-8)),
+    ("timing", {"apply": _other_offsets}),
+    ("readout", _in_place("apply", np.add, 1e-8)),
+    ("readout", _in_place("limit", np.subtract, 1)),
+]
+
+
+@pytest.mark.parametrize(("stage", "hooks"), IN_PLACE, ids=[f"{stage}-{next(iter(h))}" for stage, h in IN_PLACE])
+@pytest.mark.usefixtures("no_trace")
+def test_a_hook_cannot_change_what_it_is_given(stage: str, hooks: dict[str, Any]) -> None:
+    """The rates before an effect, and the times of events, are others' as well: a change of them would be no error."""
+    define(stage, **hooks)
+    says = rf"{Path(__file__).name}:\d+: the effect stranger failed: .*not its own to change: write `x = x \+ more`"
+    with pytest.raises(EffectError, match=says):
+        one = experiment("detection: {}, dead_time: {duration: 20 ns}, stranger: {}", readouts="[tr, counts], bits: 1")
+        one.simulate(one.levels[0], "train", grey_images(BLOCK), 0, BLOCK)
+
+
+@pytest.mark.usefixtures("no_trace")
+def test_what_a_hook_returns_can_be_written() -> None:
+    """Also where it is what it was given, or a view of it: kernels are compiled for arrays that can be written."""
+    same = {"apply": lambda self, events, rng: events}
+    view = {
+        "apply": lambda self, events, rng: Events(events.times[:], events.offsets[:], events.pixels, end=events.end)
+    }
+    plain, images = experiment("detection: {}", readouts="[tr]"), grey_images(BLOCK)
+    before = plain.simulate(plain.levels[0], "train", images, 0, BLOCK)
+    for stage, hooks in (("timing", same), ("readout", view), ("light", {"apply": lambda self, rate, c: rate[:]})):
+        define(stage, **hooks)
+        one = experiment("detection: {}, stranger: {}", readouts="[tr]")
+        made = one.simulate(one.levels[0], "train", images, 0, BLOCK)
+        assert_same(made, before)
+        assert made.tr is not None and type(made.tr) is Events
+        assert made.tr.times.flags.writeable and made.tr.offsets.flags.writeable
 
 
 @pytest.mark.usefixtures("no_trace")

@@ -72,7 +72,10 @@ def _begin_effect(name: str, stage: str | None, as_json: bool) -> None:
     lines = [f"Wrote {path}, an effect of the stage {cls.stage} that works as it is. Read about it:", ""]
     lines += [f"  spadmnist effects {name} --plugin {quoted(path)}", "", "Put it into a config, say my.yaml:", ""]
     lines += [*reference.effect_yaml(cls), "", "And simulate it:", ""]
-    for line in [*lines, f"  spadmnist generate my.yaml -o out --plugin {quoted(path)}"]:
+    lines += [f"  spadmnist generate my.yaml -o out --plugin {quoted(path)}", ""]
+    test = f"from {name} import {cls.__name__}; from spadmnist.testing import check_effect"
+    lines += ["When you have changed it, test in Python, in this folder, that it keeps the contract of effects:", ""]
+    for line in [*lines, f'  python -c "{test}; print(check_effect({cls.__name__}))"']:
         terminal.print_line(line)
 
 

@@ -38,6 +38,7 @@ pixel a value that depends on that pixel alone.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -66,6 +67,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "readout": ("apply", "limit"),
 }
 
+ACTS_ON = ("light", "dark", "own")  # what an arrival effect may vary
 
 # number of times at which the default of `expected_rate` takes its mean. A gate that opens for a third of each of 500
 # frames comes out within 2e-3; the light of a capture is rarely known to 1e-2
@@ -186,7 +188,7 @@ class Effect(Plugin, abstract=True):
     counted: ClassVar[bool] = False  # its hook takes a `Draws` instead of a numpy generator
     # its closed forms are those of each pixel by itself, so that a part of a chip needs no other part's
     by_pixel: ClassVar[bool] = False
-    acts_on: ClassVar[str] = "light"  # arrival stage: "light", "dark" or "own"
+    acts_on: ClassVar[str] = "light"  # arrival stage: one of `ACTS_ON`
     cause: ClassVar[str] = (
         ""  # dark, arrival ("own") and correlated stage: what its events are called; default: its name
     )
@@ -207,6 +209,15 @@ class Effect(Plugin, abstract=True):
     states_mean: ClassVar[bool] = True  # `expected_rate` says what it does to the mean; False: it may change it unsaid
 
     def __init_subclass__(cls, stage: str | None = None, **keywords: Any):
+        plugins.check_names(cls)
+        if "__init__" in vars(cls) and not _takes_any_values(vars(cls)["__init__"]):
+            raise TypeError(
+                f"{cls.__name__}: __init__ does not take the values of its parameters; leave it out: what is worked "
+                "out of them belongs into made(self, chip)"
+            )
+        if cls.acts_on not in ACTS_ON:
+            near = did_you_mean(str(cls.acts_on), ACTS_ON)
+            raise TypeError(f"{cls.__name__}: acts_on is {cls.acts_on!r}; it is one of {', '.join(ACTS_ON)}.{near}")
         if stage is not None:
             cls.stage = stage
         chosen = getattr(cls, "stage", None)
@@ -324,6 +335,16 @@ class Effect(Plugin, abstract=True):
         correlated events and for a readout, which pixels may share, otherwise 0.
         """
         return math.inf if self.stage in ("correlated", "readout") else 0.0
+
+
+def _takes_any_values(made: Any) -> bool:
+    """Whether a function can be called with values by name alone, whichever they are."""
+    try:
+        _, *given = inspect.signature(made).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    free = [one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL) or one.default is not one.empty for one in given]
+    return all(free) and any(one.kind is one.VAR_KEYWORD for one in given)
 
 
 def in_order(effects: list[Effect]) -> list[Effect]:

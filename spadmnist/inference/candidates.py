@@ -142,7 +142,7 @@ def candidates(sensor: Sensor, captures: Iterable[Capture] = (), fitted: Collect
 
 def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Candidate]:
     wholes = {k: p for k, p in parameters.items() if _numeric(p) and p.per in ("", "pixel")}
-    phases = tuple((name, k) for k, p in wholes.items() if p.kind == "phase")
+    phases = tuple((name, k) for k, p in parameters.items() if p.kind == "phase")  # all round: none needs a range
     off = {k: p for k, p in wholes.items() if p.off is not None and (name, k) not in phases}
     idle = {k for k, p in off.items() if p.default == p.off}
     shapes = tuple(

@@ -11,7 +11,7 @@ from .. import plugins
 from ..errors import SpadError
 from ..recording import Capture, Recording
 from ..sensor import Sensor
-from ..statistics import Statistic, Summary
+from ..statistics import LAWS, Statistic, Summary
 from .blind_times import ShortestIntervals
 
 # in mean times between detections: a longer time after the last detection is compared with the others; one in 20,000
@@ -169,20 +169,63 @@ def reduce_with(statistic: Statistic, recording: Recording) -> Summary | None:
     Raises:
         SpadError: where a user's own statistic fails; it names the file and line.
     """
-    with plugins.blaming(type(statistic)):
-        found = statistic.reduce(recording)
-    if found is None or plugins.is_built_in(type(statistic)):
-        return found
-    if np.ndim(found.values) != 1 or not np.size(found.values):
-        raise SpadError(
-            f"{plugins.source_file(type(statistic))}: the statistic {statistic.name} has values of shape "
-            f"{np.shape(found.values)} in {recording.capture.id}; they are (cells,), and None says that there are none"
-        )
-    if not np.isfinite(found.values).all():
-        cell = int(np.argmin(np.isfinite(found.values)))
-        where = f"cell {cell} of {recording.capture.id}"
-        raise SpadError(
-            f"{plugins.source_file(type(statistic))}: the statistic {statistic.name} has the value "
-            f"{found.values[cell]} in {where}; values are finite numbers, and None says that there are none"
-        )
+    kind = type(statistic)
+    if plugins.is_built_in(kind):
+        return statistic.reduce(recording)
+    with plugins.blaming(kind):
+        found = statistic.reduce(recording.sealed())
+        what = None if found is None else _problem(found)
+    if what:
+        place = f"{plugins.source_file(kind)}: the statistic {statistic.name}"
+        raise SpadError(f"{place} {what[0]} in {recording.capture.id}; {what[1]}")
     return found
+
+
+def _problem(found: Summary) -> tuple[str, str] | None:
+    """(what is wrong with what a user's statistic returns, what is right), or None."""
+    if not isinstance(found, Summary):
+        return f"returns {type(found).__name__}", "reduce returns a Summary, or None where it has nothing to say"
+    values, law = found.values, found.law
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        what = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
+        return f"has {what} as values", "they are a numpy array of numbers, (cells,)"
+    if values.ndim != 1 or not values.size:
+        return f"has values of shape {values.shape}", "they are (cells,), and None says that there are none"
+    if law not in LAWS:
+        return f"has the law {law!r}", f"the laws are {', '.join(LAWS)}"
+    right, allowed = np.isfinite(values), "values are finite numbers, and None says that there are none"
+    if right.all() and law == "poisson":
+        right, allowed = (values >= 0) & (values == np.rint(values)), "by the law poisson they are whole, from 0 on"
+    elif right.all() and law == "exponential":
+        right, allowed = values >= 0, "by the law exponential they are not negative"
+    if not right.all():
+        cell = int(np.argmin(right))
+        return f"has the value {values[cell]} in cell {cell}", allowed
+    for name in ("scale", "axis", "nested"):
+        column = getattr(found, name)
+        if column is not None and np.shape(column) != values.shape:
+            return f"has {name} of shape {np.shape(column)}", f"it has a number for each cell, {values.shape}"
+    if found.scale is not None and not np.all((np.asarray(found.scale) >= 0) & (np.asarray(found.scale) < np.inf)):
+        return "has a scale that is negative or not finite", "it is the size of the spread of each cell"
+    if found.shape is not None and int(np.prod(found.shape)) != values.size:
+        return f"has the shape {found.shape} of a map", f"its rows times columns are the cells, {values.size}"
+    for cell in sorted({0, values.size - 1}):
+        measured = float(values[cell])
+        with np.errstate(all="ignore"):  # what is expected of a model may be 0 here alone
+            where, size = found.where(cell), found.size(cell, measured, measured or 1.0)
+        if not isinstance(where, str):
+            return f"says {where!r} for where({cell})", "it is text: what the cell looks at"
+        number = isinstance(size, tuple) and len(size) == 2 and isinstance(size[1], float | int | np.number)
+        if not number or not isinstance(size[0], str):
+            return f"says {size!r} for size({cell}, measured, expected)", "it is (text, share of the detections)"
+    return None
+
+
+def check_cells(name: str, summary: Summary, cells: int, capture: Capture) -> None:
+    """Raise SpadError where a summary has another number of cells than another recording of the capture."""
+    if summary.values.size != cells:
+        kind = Statistic.registry.find(name)
+        raise SpadError(
+            f"{plugins.source_file(kind)}: the statistic {name} has {cells} cells in one recording of {capture.id} and "
+            f"{summary.values.size} in another; their number may depend on the conditions and the layout alone"
+        )

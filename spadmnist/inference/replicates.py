@@ -25,7 +25,7 @@ from . import memory
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, maps_added
 from .models import InTheDark, Model, Packed
-from .reduction import ReducedCapture, halves_of, statistics_for, summaries_of, total_of
+from .reduction import ReducedCapture, check_cells, halves_of, statistics_for, summaries_of, total_of
 
 if TYPE_CHECKING:
     from .journal import Journal
@@ -98,6 +98,7 @@ class _Task:
         names: of the statistics; all where it is empty.
         second: of a half, whether it is of the second, fourth, ... blocks of time; None for a whole capture.
         early: ticks of a frame whose first stamps are counted in the total; None where all are.
+        cells: of the statistics of the measured capture, their number.
     """
 
     models: Sequence[Packed]
@@ -110,6 +111,7 @@ class _Task:
     names: Collection[str]
     second: bool | None
     early: int | None
+    cells: Mapping[str, int]
 
 
 def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
@@ -130,7 +132,9 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
         recording = recording.beside(task.dead)
         totals.append(total_of(recording, task.early))
         for name, summary in summaries_of(known, recording).items():
-            found.setdefault(name, []).append(summary)
+            others = found.setdefault(name, [])
+            check_cells(name, summary, task.cells.get(name) or (others or [summary])[0].values.size, capture)
+            others.append(summary)
 
     try:
         for k, model in enumerate(task.models):
@@ -324,6 +328,7 @@ class Replicates:
             tasks.append([])
             parts = np.array_split(np.arange(len(numbers)), max(1, min(pieces, len(numbers))))
             capture, second = self.seen[id].half_of or (self.seen[id].capture, None)
+            cells = {name: summary.values.size for name, summary in self.seen[id].summaries.items()}
             try:
                 sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
                 if self.journal is not None:
@@ -336,7 +341,7 @@ class Replicates:
                 del sensors  # there may be many, with a map each
                 for part in parts:
                     models = packed if model.alike else [packed[i] for i in part]
-                    rest = self.seed, self.dead, hasty, some_of[k], second, self.seen[id].early
+                    rest = self.seed, self.dead, hasty, some_of[k], second, self.seen[id].early, cells
                     tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
             except UNABLE as error:
                 tasks[k], out[k] = [], CannotSimulate.because(error)

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
+from ..errors import did_you_mean
 from ..plugins import Plugin, Registry, parameter
-from ..recording import Recording
+from ..recording import MODALITIES, Recording
 
 if TYPE_CHECKING:
     from ..sensor import Sensor
@@ -98,6 +99,15 @@ class Statistic(Plugin, abstract=True):
             raise TypeError(f"{cls.__name__}: the error {cls.error!r} is one of no statistic; take another name")
         elif cls.error and cls.physical_error.__func__ is Statistic.physical_error.__func__:  # type: ignore[attr-defined]
             raise TypeError(f"{cls.__name__}: with error = {cls.error!r} it must define physical_error")
+        if cls.reduce is Statistic.reduce and not keywords.get("abstract"):
+            raise TypeError(f"{cls.__name__}: a statistic must define reduce(recording)")
+        wrong = not isinstance(cls.modalities, tuple | list) or [m for m in cls.modalities if m not in MODALITIES]
+        if wrong or not (cls.modalities or keywords.get("abstract")):
+            near = did_you_mean(str(wrong[0]).lower(), MODALITIES) if isinstance(wrong, list) and wrong else ""
+            raise TypeError(
+                f"{cls.__name__}: modalities is {cls.modalities!r}; it is a tuple of one or more of "
+                f'{", ".join(MODALITIES)}: write modalities = ("tr",).{near}'
+            )
         super().__init_subclass__(**keywords)
 
     @classmethod
