@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
 import math
 import resource
 import shutil
@@ -109,7 +110,7 @@ class Stub:
             place = Path(task.root, name)
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(data)
-            made[name] = {"bytes": len(data), "sha256": "0" * 64}
+            made[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         factory.note(Path(task.root), task.shard, made)
         return made
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -399,6 +400,11 @@ class SealedEvents(Events):
     """
 
     __slots__ = ("whole",)
+
+    def __new__(cls, *given: Any, **named: Any) -> Any:
+        """`type(events)(times, offsets, pixels)` makes events of somebody's own, which are not sealed."""
+        sealed = len(given) == 1 and isinstance(given[0], Events)
+        return object.__new__(cls) if sealed else Events(*given, **named)
 
     def __init__(self, whole: Events):
         own = (whole.offsets, whole.ticks, whole.row_pixel, whole.cause, whole.parent, whole._image_offsets)
