@@ -5,11 +5,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
-
 import numpy as np
 
 from ..kernels import jit
@@ -148,53 +143,6 @@ def _of_blocks(series: np.ndarray, blocks: int) -> np.ndarray:
     return np.asarray(series[: blocks * size].reshape(blocks, size).sum(axis=1))
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """The detections of the array in blocks of the capture.
-
-    Attributes:
-        scores: (blocks,) normal scores of Poisson counts, given their total.
-        length: of a block, s.
-        relative: a score as a relative change of the detections.
-        unit: relative change of the detections for one standard deviation, to first order.
-    """
-
-    scores: np.ndarray
-    length: float
-    relative: Callable[[float], float]
-    unit: float
-
-
-def _scores_of_blocks(recording: Recording) -> _Blocks | None:
-    """The scores of the blocks of a recording; None where it has too little for them."""
-    blocks = blocks_of(recording)
-    if not has_data(recording) or not blocks:
-        return None
-    slots = np.inf
-    if recording.events is not None:
-        sums = _of_events(recording)[2].reshape(blocks, -1).sum(axis=1)
-    else:
-        size = recording.n_frames // blocks
-        sums = _of_blocks(frame_sums(recording), blocks)
-        if recording.waited is not None:
-            sums = in_equal_times(sums, _of_blocks(recording.waited[1], blocks))
-        else:
-            slots = slots_of_frame(recording) * size * recording.pixels
-    total = float(sums.sum())
-    # slots that are free scatter like those that are taken; where they are fewer, they are the ones to count
-    free = total > blocks * slots / 2
-    mean = slots - total / blocks if free else total / blocks
-    share = shares(sums, blocks)
-    scores = -poisson_score(slots - sums, mean, share) if free else poisson_score(sums, mean, share)
-    each = max(1.0, total / blocks)
-
-    def relative(score: float) -> float:
-        number = number_at(-score if free else score, lambda n, part: float(poisson_score(n, mean, part)), mean)
-        return (mean - number if free else number - mean) / each
-
-    return _Blocks(scores, _block_time(recording, blocks), relative, math.sqrt(max(mean, 0.0)) / each)
-
-
 class Trend(Statistic):
     """Detections of the array in 32 blocks of the capture, relative to their mean.
 
@@ -210,70 +158,45 @@ class Trend(Statistic):
     unit = "1"
 
     def reduce(self, recording: Recording) -> Summary | None:
-        """Scores of the blocks."""
-        found = _scores_of_blocks(recording)
-        if found is None:
+        blocks = blocks_of(recording)
+        if not has_data(recording) or not blocks:
             return None
+        length = _block_time(recording, blocks)
+        slots = np.inf
+        if recording.events is not None:
+            sums = _of_events(recording)[2].reshape(blocks, -1).sum(axis=1)
+        else:
+            size = recording.n_frames // blocks
+            sums = _of_blocks(frame_sums(recording), blocks)
+            if recording.waited is not None:
+                sums = in_equal_times(sums, _of_blocks(recording.waited[1], blocks))
+            else:
+                slots = slots_of_frame(recording) * size * recording.pixels
+        total = float(sums.sum())
+        # slots that are free scatter like those that are taken; where they are fewer, they are the ones to count
+        free = total > blocks * slots / 2
+        mean = slots - total / blocks if free else total / blocks
+        share = shares(sums, blocks)
+        scores = -poisson_score(slots - sums, mean, share) if free else poisson_score(sums, mean, share)
+
+        def relative(score: float) -> float:
+            number = number_at(-score if free else score, lambda n, part: float(poisson_score(n, mean, part)), mean)
+            return (mean - number if free else number - mean) / max(1.0, total / blocks)
 
         def size_of(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            seen, wanted = found.relative(measured), found.relative(expected)
-            text = f"{per_cent(seen)} from the mean rate, {per_cent(wanted)} expected"
-            return text, float(seen - wanted)
+            found, wanted = relative(measured), relative(expected)
+            text = f"{per_cent(found)} from the mean rate, {per_cent(wanted)} expected"
+            return text, float(found - wanted)
 
-        blocks = len(found.scores)
         return Summary(
-            found.scores,
+            scores,
             "normal",
-            lambda cell: f"{span(cell * found.length, (cell + 1) * found.length)} of the capture",
+            lambda cell: f"{span(cell * length, (cell + 1) * length)} of the capture",
             size_of,
             scale=np.ones(blocks),
-            axis=(np.arange(blocks) + 0.5) * found.length,
+            axis=(np.arange(blocks) + 0.5) * length,
             label="time, s",
         )
-
-
-class Course(Statistic):
-    """Rise, bend and turn of the detections in the course of a capture: a polynomial in time, up to the third degree.
-
-    Cells: the projections of the blocks of `trend` on orthonormal polynomials. A slow change of a few blocks' noise is
-    seen in one number of these, where `trend` has it spread over all blocks.
-    Law: normal, as sums of scores.
-    Shows: a light source that drifts or warms up, an ageing sample, a temperature that rises.
-    """
-
-    modalities = _ALL
-    specific = 1
-    pools = ("trend",)
-    among = "array"
-    unit = "1"
-
-    def reduce(self, recording: Recording) -> Summary | None:
-        """Projections of the scores."""
-        found = _scores_of_blocks(recording)
-        if found is None:
-            return None
-        shapes = _polynomials(len(found.scores))
-        whole = np.ptp(shapes, axis=1) * found.unit  # relative change in the course of the capture, for 1 sigma
-
-        def size_of(cell: int, measured: float, expected: float) -> tuple[str, float]:
-            seen, wanted = measured * float(whole[cell]), expected * float(whole[cell])
-            return f"{per_cent(seen)} in the course of the capture, {per_cent(wanted)} expected", seen - wanted
-
-        return Summary(
-            shapes @ found.scores,
-            "normal",
-            lambda cell: ("the rise", "the bend (ends against the middle)", "the turn (third degree)")[cell],
-            size_of,
-            scale=np.ones(len(shapes)),
-        )
-
-
-@lru_cache(maxsize=8)
-def _polynomials(blocks: int) -> np.ndarray:
-    """(degrees, blocks) orthonormal polynomials of the first to the third degree over blocks of equal length."""
-    time = np.linspace(-1.0, 1.0, blocks)
-    basis, upper = np.linalg.qr(np.stack([time**k for k in range(4)], axis=1))
-    return np.ascontiguousarray((basis * np.sign(np.diag(upper))).T[1:])
 
 
 class SlowSeries(Statistic):

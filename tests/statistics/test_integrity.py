@@ -47,7 +47,7 @@ from spadmnist.statistics.integrity import (
     chance_of_bits,
 )
 from spadmnist.statistics.maps import PixelMap, Spread, Surface
-from spadmnist.statistics.slow import Course, SlowSeries, Trend
+from spadmnist.statistics.slow import SlowSeries, Trend
 from spadmnist.streams import Streams
 
 
@@ -345,5 +345,5 @@ def test_what_the_sensor_makes_is_whole(modality: str) -> None:
             else:
                 assert np.abs(values).max() < 5 or statistic is FullCounters
             assert reduced(statistic, made[0]).values.size == values.shape[1]
-    for statistic in (PixelMap, Surface, Spread, Trend, Course, SlowSeries, PixelFano, ArrayFano):
+    for statistic in (PixelMap, Surface, Spread, Trend, SlowSeries, PixelFano, ArrayFano):
         assert reduced(statistic, made[1]).values.size == reduced(statistic, made[2]).values.size

@@ -27,7 +27,7 @@ from simple_sensor import (
 
 from spadmnist.recording import Recording
 from spadmnist.statistics import _scores as scores
-from spadmnist.statistics.slow import Course, HotSeries, SlowSeries, Trend
+from spadmnist.statistics.slow import HotSeries, SlowSeries, Trend
 
 KINDS = ("tr", "tr without ticks", "qis", "str", "counts", "counter")
 
@@ -84,35 +84,6 @@ def test_blocks_of_a_small_recording(kind: str) -> None:
     assert math.isclose(found, fano, rel_tol=0.02, abs_tol=0.02)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_course_is_what_each_degree_of_a_polynomial_takes_from_the_squares(kind: str) -> None:
-    recording = one_of_each()[kind]
-    blocks, found = reduced(Trend, recording), reduced(Course, recording)
-    time = np.arange(len(blocks.values))
-    fits = [np.polyval(np.polyfit(time, blocks.values, degree), time) for degree in range(4)]
-    left = [float(np.sum((blocks.values - fit) ** 2)) for fit in fits]
-    np.testing.assert_allclose(found.values**2, -np.diff(left), atol=1e-9)
-    # the signs: up to the end, the ends above the middle, up at the very end
-    turns = [fit[-1] for fit in np.diff(fits, axis=0)]
-    assert np.array_equal(np.sign(found.values), np.sign(turns))
-    assert [found.where(k) for k in range(3)] == [
-        "the rise",
-        "the bend (ends against the middle)",
-        "the turn (third degree)",
-    ]
-
-
-def test_the_course_in_words_is_the_change_of_the_light() -> None:
-    """A rise by 10 %, of 900,000 detections, whose error is 0.4 %; no bend and no turn."""
-    exposure = 1e-2
-    drift = tr(5, grid(8, 8), 1.47e6, exposure, change=lambda t: 0.9 + 0.1 * t / exposure)
-    summary = reduced(Course, drift)
-    relative = [summary.size(k, float(summary.values[k]), 0.0)[1] for k in range(3)]
-    # 31 of 32 blocks from the middle of the first to that of the last one
-    assert abs(relative[0] - 0.1 / 0.95 * 31 / 32) < 0.02 and max(map(abs, relative[1:])) < 0.02
-    assert summary.size(0, float(summary.values[0]), 0.0)[0].endswith("% in the course of the capture, 0 % expected")
-
-
 def test_saturated_frames_are_told_by_the_slots_that_are_free() -> None:
     recording = qis(1, (640, 8, 8), 0.98)
     counts, slots = literal_counts(recording)
@@ -150,15 +121,11 @@ def test_scores_of_steady_light_are_normal(kind: str) -> None:
     assert np.abs(z).max() < 5
     p = {"qis": 0.3, "counts": 0.3}.get(kind, 0.0)
     assert abs(trend.std() - math.sqrt((1 - p) * (1 - 1 / 32))) < 0.06
-    course = many(Course, STEADY[kind], 100)
-    laws.distribution_is((course / trend.std()).ravel(), stats.norm.cdf)
     # light that drifts by 20 % is no steady light, and the law says so
     if kind == "qis":
         drift = partial(qis, shape=(320, 8, 8), share=np.linspace(0.27, 0.33, 320)[:, None, None])
         with pytest.raises(AssertionError):
             laws.distribution_is((many(Trend, drift, 100) / trend.std())[:, ::3], stats.norm.cdf)
-        with pytest.raises(AssertionError):
-            laws.distribution_is((many(Course, drift, 100) / trend.std()).ravel(), stats.norm.cdf)
 
 
 def test_a_drift_is_seen() -> None:
@@ -169,7 +136,6 @@ def test_a_drift_is_seen() -> None:
     found = sigmas(Trend, drift, steady)
     times = np.linspace(-1, 1, 32)
     assert found @ times / np.sqrt(times @ times) > 6
-    assert sigmas(Course, drift, steady)[0] > 6
     assert np.abs(sigmas(Trend, tr(6, layout, 1.4e6, exposure), steady)).max() < 5
 
 
@@ -337,14 +303,14 @@ def test_times_and_frames_of_the_same_detections_agree() -> None:
 
 
 @pytest.mark.parametrize("kind", ["qis", "str", "counts", "counter"])
-@pytest.mark.parametrize("statistic", [Trend, Course, SlowSeries, HotSeries])
+@pytest.mark.parametrize("statistic", [Trend, SlowSeries, HotSeries])
 def test_pieces_make_no_difference(statistic: type, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = reduced(statistic, one_of_each()[kind]).values
     monkeypatch.setattr("spadmnist.recording._CHUNK", 100)
     assert np.array_equal(reduced(statistic, one_of_each()[kind]).values, whole)
 
 
-@pytest.mark.parametrize("statistic", [Trend, Course, SlowSeries])
+@pytest.mark.parametrize("statistic", [Trend, SlowSeries])
 def test_the_cells_do_not_depend_on_the_data(statistic: type) -> None:
     for layout in (grid(1, 1), grid(4, 3)):
         sizes = {len(reduced(statistic, tr(1, layout, rate, 1e-3, 50e-9)).values) for rate in (0.0, 1e3, 1e6)}
