@@ -309,7 +309,7 @@ def clear_records(root: Path) -> None:
 
 
 def tidy(root: Path, manifest: Mapping[str, Any]) -> None:
-    """Remove what a kill at the very end of a run has left beside a finished dataset.
+    """Remove what a run that was killed at its very end has left in the folder of a finished dataset.
 
     Raises SpadError where methods are being added to it: what is left is then needed to go on.
     """
@@ -321,7 +321,7 @@ def tidy(root: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def forget(root: Path) -> None:
-    """Remove what any run has left beside a dataset that is as its manifest says."""
+    """Remove what any run has left in the folder of a dataset that is as its manifest says."""
     if (root / STATE).is_dir():
         with locked(root):
             clear_state(root)

@@ -65,7 +65,7 @@ class Images:
     names        the file of each image, relative to the folder, where the source is a folder
     label_names  the class folder that each label stands for, where the source is a folder with classes
     ignored      how many files of the folder were left out because they are not images
-    beside       how many pictures were left out of each folder that is no split; "" of those in none
+    unused       how many pictures lie in each folder that is neither train nor test; "": in no folder
     transparent  how many pictures of the folder had transparent parts, which are black
     tiles        where the tiles lie and which images they are, where the images are charts
     """
@@ -78,7 +78,7 @@ class Images:
     ignored: int = 0
     tiles: Tiles | None = None
     transparent: int = 0
-    beside: Mapping[str, int] = field(default_factory=dict)
+    unused: Mapping[str, int] = field(default_factory=dict)
     _means: dict[int, float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -168,8 +168,9 @@ class Images:
             parts.append(f"{len(np.unique(self.labels))} classes")
         if self.ignored:
             parts.append(f"{self.ignored} files that are not images left out")
-        if self.beside:
-            parts.append(f"{sum(self.beside.values())} images beside the splits left out")
+        if self.unused:
+            number = sum(self.unused.values())
+            parts.append(f"{number} image{'s' * (number > 1)} in neither train nor test left out")
         return ", ".join(parts)
 
 
@@ -190,7 +191,7 @@ def notes(splits: Mapping[str, Images]) -> list[str]:
         bare = [split for split, part in splits.items() if part.labels is None]
         said += [f"the {split} images lie in no class folders, and have no labels" for split in bare]
     for part in splits.values():
-        said += [_left_out(place, count) for place, count in part.beside.items()]
+        said += [_left_out(place, count) for place, count in part.unused.items()]
     if ignored := sum(part.ignored for part in splits.values()):
         held = "1 file of the folder is no image and is" if ignored == 1 else f"{ignored:,} files are no images and are"
         said.append(f"{held} left out")
@@ -201,10 +202,10 @@ def notes(splits: Mapping[str, Images]) -> list[str]:
 
 
 def _left_out(place: str, count: int) -> str:
-    """A note on pictures beside the splits."""
+    """A note on pictures that are in no split."""
     held = "1 picture is" if count == 1 else f"{count:,} pictures are"
     if not place:
-        return f"{held} in no folder of a split, beside train/ and test/, and left out"
+        return f"{held} in the folder itself, and neither in train/ nor in test/: left out"
     return f"{held} in {place}/, which is neither train nor test, and left out"
 
 
@@ -631,7 +632,7 @@ class Folder(_Source):
         files = {split: [name for name in names if name.startswith(p)] for split, p in prefixes.items()}
         taken = {name for part in files.values() for name in part}
         folders = (PurePosixPath(name).parts[:-1] for name in names if name not in taken)
-        beside = dict(Counter(parts[0] if parts else "" for parts in folders))
+        unused = dict(Counter(parts[0] if parts else "" for parts in folders))
         classes = {split: _classes(root, prefixes[split], part) for split, part in files.items()}
         label_names = sorted({name for part in classes.values() if part for name in part})
         if len(label_names) > 256:
@@ -656,7 +657,7 @@ class Folder(_Source):
                 None if of_part is None else tuple(label_names),
                 ignored if split == "train" else 0,
                 transparent=transparent,
-                beside=beside if split == "train" else {},
+                unused=unused if split == "train" else {},
             )
         return splits
 

@@ -587,8 +587,8 @@ def test_classes_and_splits(tmp_path: Path) -> None:
     assert train.names == ("train/ant/1.png", "train/cat/2.png", "train/cat/deep/0.png")
     assert train.label_names == test.label_names == ("ant", "bee", "cat")
     assert train.labels is not None and train.labels.tolist() == [0, 2, 2]
-    assert (train.ignored, train.beside, test.beside) == (0, {"val": 1}, {})
-    assert "1 images beside the splits left out" in train.describe()
+    assert (train.ignored, train.unused, test.unused) == (0, {"val": 1}, {})
+    assert "1 image in neither train nor test left out" in train.describe()
     assert test.labels is not None and test.labels.tolist() == [1]
     assert list(load_folder(tmp_path / "f" / "val")) == ["train"]
 

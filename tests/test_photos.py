@@ -219,7 +219,7 @@ def test_pictures_beside_the_splits_are_said_apart(tmp_path: Path) -> None:
     assert said == [
         "the labels are the class folders: 0 ant",
         "the test images lie in no class folders, and have no labels",
-        "1 picture is in no folder of a split, beside train/ and test/, and left out",
+        "1 picture is in the folder itself, and neither in train/ nor in test/: left out",
         "3 pictures are in val/, which is neither train nor test, and left out",
         "1 file of the folder is no image and is left out",
     ]

@@ -536,11 +536,10 @@ def test_an_interrupted_reconstruct_goes_on(after: int, few: dict[int, Path], ma
     assert_same(root, tree(made))
 
 
-def test_repair_after_an_interrupted_reconstruct(few: dict[int, Path], tmp_path: Path) -> None:
-    """The dataset is again what it was before."""
-    root = tmp_path / "out"
-    shutil.copytree(few[2], root)
-    stop = iter(range(1))
+def interrupted_reconstruct(finished: Path, root: Path, shards: int) -> Path:
+    """A copy of a dataset, to so many of whose shards a method was added."""
+    shutil.copytree(finished, root)
+    stop = iter(range(shards))
 
     def advance(work: float, note: str) -> None:
         if next(stop, None) is None:
@@ -548,6 +547,12 @@ def test_repair_after_an_interrupted_reconstruct(few: dict[int, Path], tmp_path:
 
     with pytest.raises(Stop):
         factory.add_reconstructions(root, METHODS[2:], 1, Progress(advance=advance))
+    return root
+
+
+def test_repair_after_an_interrupted_reconstruct(few: dict[int, Path], tmp_path: Path) -> None:
+    """The dataset is again what it was before."""
+    root = interrupted_reconstruct(few[2], tmp_path / "out", 1)
     damage = verify.verify(root)
     assert damage
     verify.repair(root, damage, 1)
@@ -637,17 +642,7 @@ def test_a_shard_that_was_added_to_and_not_noted_is_known(
 @pytest.fixture
 def begun(few: dict[int, Path], tmp_path: Path) -> Path:
     """A dataset to some of whose shards a method was added."""
-    root = tmp_path / "begun"
-    shutil.copytree(few[2], root)
-    stop = iter(range(2))
-
-    def advance(work: float, note: str) -> None:
-        if next(stop, None) is None:
-            raise Stop
-
-    with pytest.raises(Stop):
-        factory.add_reconstructions(root, METHODS[2:], 1, Progress(advance=advance))
-    return root
+    return interrupted_reconstruct(few[2], tmp_path / "begun", 2)
 
 
 def test_no_other_command_ends_an_interrupted_reconstruct(begun: Path, few: dict[int, Path], made: Path) -> None:
